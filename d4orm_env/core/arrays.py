@@ -57,7 +57,7 @@ def frozen_array(
 
     Args:
         value: Anything NumPy can read as numbers.
-        name: What to call it in an error.
+        name: Its name in an error.
         shape: Expected shape; ``None`` matches any length.
         largest: Largest magnitude.
 
@@ -152,7 +152,7 @@ def positive_number(
 
     Args:
         value: Anything that is a number.
-        name: What to call it in an error.
+        name: Its name in an error.
         zero_allowed: Whether it may be zero.
         least: Least value other than zero.
         most: Largest value; by default, float32 still holds its square.

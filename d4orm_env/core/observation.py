@@ -48,7 +48,7 @@ def observe_robot(
         k: Robot.
         arrays: The problem.
         goal: ``(K, d)``.
-        sensed: What there is to see.
+        sensed: Observable state of the robots.
         time_left: Share of the time left, 1 to 0.
         out: ``(D,)``, filled as :class:`~d4orm_env.core.observation_layout.ObservationSlices` says.
     """

@@ -24,7 +24,7 @@ class BoundsSlack(NamedTuple):
         distance: Between where a robot is and where it is seen [m].
         speed: Beyond the speed limit, in what is seen [m/s].
         heading: Between true and seen [rad].
-        drift: How fast a robot may be moved beside what it does itself [m/s].
+        drift: Speed at which a robot may be moved beside what it does itself [m/s].
         radius: Of what is seen and is no robot [m].
     """
 

@@ -78,7 +78,7 @@ class Problem(Frozen):
         margin: Safety margin epsilon [m] that plans keep to everything.
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit, as in the paper.
-        name: Where the problem comes from, for tables and pictures.
+        name: Origin of the problem, for tables and pictures.
         collision_penalty: Taken off a robot's reward per step within the margin of another robot, and of an obstacle
             or a bound; 1 in the paper.
         arrival: ``"dock"``: a robot that arrives stays there for good, as in the paper. ``"stay"``: it may be moved
@@ -332,7 +332,7 @@ class Problem(Frozen):
         """Draw starts, goals and world with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
 
         Args:
-            axes: Where to draw; by default axes of a new figure of ``matplotlib.pyplot``.
+            axes: Axes to draw on; by default those of a new figure of ``matplotlib.pyplot``.
 
         Returns:
             The axes, spatial for a spatial problem.

@@ -23,7 +23,7 @@ class ProblemArrays(NamedTuple):
         inverse_initial_distance: ``(K,)`` one over the distance from start to goal (at least the goal radius).
         boxes: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`.
         triangles: ``(., 6)`` more of them.
-        grid: Where they are.
+        grid: Their index.
         bounds: ``(2, d)``, infinite where open.
         time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
         margin: ``()``.

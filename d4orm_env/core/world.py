@@ -176,7 +176,7 @@ class World(Frozen):
 
         Args:
             reach: The largest distance from an obstacle at which it counts [m].
-            nearest: How many of the nearest obstacles it is to find.
+            nearest: Number of nearest obstacles that it is to find.
             places: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m], and in
                 wider grids farther away.
         """

@@ -56,7 +56,7 @@ class Level(NamedTuple):
 
     Attributes:
         kind: The kind of disturbance.
-        attribute: What the level is of.
+        attribute: Attribute that the level is of.
         fixed: Values of other attributes.
     """
 

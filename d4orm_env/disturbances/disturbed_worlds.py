@@ -70,7 +70,7 @@ class DisturbedWorlds:
 
     Args:
         disturbances: In the order in which they act; none of them negligible.
-        problem: What the worlds share.
+        problem: Problem that the worlds share.
         num_worlds: ``B``.
         max_cycles: Steps in an episode.
     """
@@ -131,7 +131,7 @@ class DisturbedWorlds:
 
         Args:
             worlds: Their numbers, ``(b,)``.
-            seeds: What each has drawn from its environment's generator, from 0 to ``2**63 - 1``.
+            seeds: Number that each has drawn from its environment's generator, from 0 to ``2**63 - 1``.
             start: ``(b, K, n)``.
             goal: ``(b, K, d)`` [m].
         """

@@ -53,7 +53,7 @@ class Draws:
         steps: ``(B,)`` steps taken.
         stream: Number of the disturbance.
         purpose: Number of the occasion on which it draws, from 0 to 255.
-        ahead: What the episode of a single world has drawn ahead, which this adds to; ``None`` draws as it is asked.
+        ahead: Numbers that a single world has drawn ahead, which this adds to; ``None`` draws as it is asked.
     """
 
     def __init__(self, keys: Keys, steps: Steps, stream: int, purpose: int, ahead: Ahead | None = None) -> None:

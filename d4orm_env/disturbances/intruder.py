@@ -41,7 +41,7 @@ class Intruder(Disturbance[Courses]):
     that stays farthest from them.
 
     Attributes:
-        count: How many, at most 100.
+        count: Number of them, at most 100.
         speed: [m/s].
         radius: [m].
     """

@@ -182,7 +182,7 @@ def advance_worlds_kernel(
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
-        view: What an observation is made of, a :class:`ObservationSpec`.
+        view: Contents of an observation, a :class:`ObservationSpec`.
         max_cycles: Steps in an episode.
         orders: ``(B,)`` uint8, one of ``STEP``, ``RESET``, ``LOOK`` and ``SKIP`` for every world.
         batch: The worlds, a :class:`WorldBatch`.

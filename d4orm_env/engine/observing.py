@@ -121,8 +121,8 @@ def observe_worlds_kernel(
     Args:
         names: Models that the kernel is for.
         arrays: The problem that the worlds share; its starts and goals are not looked at.
-        sight: What there is to see, a :class:`~d4orm_env.engine.types.ObservationInputs`.
-        view: What an observation is made of, a :class:`ObservationSpec`.
+        sight: Inputs of the observation, a :class:`~d4orm_env.engine.types.ObservationInputs`.
+        view: Contents of an observation, a :class:`ObservationSpec`.
         tile_range: First tile of worlds and the one after the last.
     """
     read_motion = motion_reader(names)

@@ -171,9 +171,9 @@ def may_touch(
     """Check whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.simd.enclose`.
 
     Args:
-        index: Where the obstacles are; there must be some.
+        index: Index of the obstacles; there must be some.
         reach: The body's.
-        widening: By how much its lanes are wider than its places.
+        widening: Excess of its lanes over its positions.
         boxes: The lanes, those of the first axis from ``begin`` on, those of the next ``axis_step`` later.
         begin: See ``boxes``.
         axis_step: See ``boxes``.

@@ -142,7 +142,7 @@ class WorldEngine(Engine, Protocol):
 
         Args:
             arrays: The problem that the worlds share; each has its own starts and goals.
-            layout: Which components an observation has, and their bounds.
+            layout: Components of an observation, and their bounds.
             max_cycles: Steps in an episode.
             orders: ``(B,)`` one of :data:`~d4orm_env.engine.episodes.STEP` and its like for every world.
             batch: The worlds; ``batch.control`` holds what to do.

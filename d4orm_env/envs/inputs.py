@@ -32,7 +32,7 @@ def checked_states(
 
     Args:
         problem: The problem.
-        states: What was given.
+        states: States as given.
         docked: ``(..., K)`` bool.
         bounds: Lowest and highest joint state; see :func:`d4orm_env.envs.joint_state.state_bounds`.
         shape: The shape expected.

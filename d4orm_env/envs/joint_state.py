@@ -122,7 +122,7 @@ def state_bounds(
         places: ``(2, d)`` box that holds every start and goal [m].
         max_cycles: Steps in an episode.
         spare: Room beyond that, for what disturbs the motion or what is seen of it.
-        num_bodies: How many bodies there are beside the robots.
+        num_bodies: Number of bodies beside the robots.
 
     Returns:
         Lowest and highest joint state vector.

@@ -60,7 +60,7 @@ def fresh_goal(
         robot: The robot that gets the goal.
         positions: ``(K, d)`` where the robots are [m].
         goals: ``(K, d)`` present goals; ``robot``'s own is ignored.
-        random: Where the draws come from.
+        random: Generator of the draws.
 
     Returns:
         ``(d,)`` the goal, uniform over the free and reachable part of :func:`goal_region`.

@@ -35,7 +35,7 @@ class EnvOptions:
         control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
             or one per component. It is added before the control is clipped.
             It is short for ``ControlNoise(std)`` as the first of the disturbances.
-        disturbances: What goes wrong, in the order in which it acts: instances of :mod:`d4orm_env.disturbances`, or of
+        disturbances: Disturbances, in the order in which it acts: instances of :mod:`d4orm_env.disturbances`, or of
             subclasses of your own. Those at level zero leave the environment as it is.
         lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated; its info says
             ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
@@ -44,7 +44,7 @@ class EnvOptions:
             at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
         reward: ``"paper"``, ``"training"`` (:class:`~d4orm_env.envs.rewards.TrainingReward`), or a function from a
             :class:`~d4orm_env.envs.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
-        progress: What the distances of rewards are, the paper's among them: ``"straight"``, or the length of the
+        progress: Distances of rewards, the paper's among them: ``"straight"``, or the length of the
             shortest free ``"path"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles.
             Not for
             ``lifelong``.

@@ -48,7 +48,7 @@ class Simulation:
     """A team in its world, stepped with the whole team's controls.
 
     Args:
-        options: What is simulated, and how.
+        options: Options of the simulation.
 
     Raises:
         ValueError: For an argument out of range.

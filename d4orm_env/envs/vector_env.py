@@ -58,9 +58,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         num_instances: Of a scenario that draws at random, draw this many instances at the first reset and choose among
             them at every reset, instead of drawing a new one each time, which takes longer than many steps. Another
             seed draws others.
-        autoreset_mode: When a world whose episode has ended is reset, an :class:`gymnasium.vector.AutoresetMode` or
-            its value. ``"NextStep"``: by the next step, which ignores its action. ``"SameStep"``: at once, with the
-            last observation and infos kept in ``infos["final_obs"]`` and ``infos["final_info"]``. ``"Disabled"``: by
+        autoreset_mode: Moment of reset after an episode's end, an :class:`gymnasium.vector.AutoresetMode` or its value.
+            ``"NextStep"``: by the next step, which ignores its action. ``"SameStep"``: at once, with the last
+            observation and infos kept in ``infos["final_obs"]`` and ``infos["final_info"]``. ``"Disabled"``: by
             ``reset(options={"reset_mask": ...})`` only.
         copy: Return a new observation array each time. ``False`` returns the same one, overwritten by the next call.
         num_threads: Threads to spread the worlds over; all available cores unless given.

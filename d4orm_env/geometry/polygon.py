@@ -19,7 +19,7 @@ def check_polygon(corners: FloatArray, name: str) -> None:
 
     Args:
         corners: ``(v, 2)`` in order, either way round; the last is joined to the first.
-        name: What messages call it.
+        name: Its name in messages.
 
     Raises:
         ValueError: For fewer than three or more than 2,000 corners, two corners in one place, edges that meet elsewhere

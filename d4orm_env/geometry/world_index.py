@@ -97,9 +97,9 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1, lev
     Args:
         shapes: The obstacles.
         cell: Size of a cell [m]; larger where there would be more cells than is worthwhile.
-        reach: How far round the obstacles the grid reaches [m]; at least to where none of them counts.
-        nearest: How many of the nearest obstacles of any point a cell's list is sure to hold.
-        levels: How many grids, one round the other.
+        reach: Distance from the obstacles that the grid covers [m]; at least to where none of them counts.
+        nearest: Number of nearest obstacles of any point that a cell's list is sure to hold.
+        levels: Number of grids, one round the other.
     """
     if not shapes.count:
         nothing = np.zeros(0)

@@ -52,7 +52,7 @@ class TorchRLNavigation(EnvBase):
             auto-reset, which is TorchRL's.
         num_robots: ``K``.
         seed: Of the first world; the others have the numbers that follow.
-        device: Where tensors are. The worlds are stepped on the CPU.
+        device: Device of the tensors. The worlds are stepped on the CPU.
         **options: Further arguments.
 
     Attributes:

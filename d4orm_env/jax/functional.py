@@ -96,7 +96,7 @@ def step(
 
     Args:
         problem: The problem.
-        state: Where the team is.
+        state: State of the team.
         controls: ``(K, m)``, clipped here.
         reward: ``"paper"``, ``"training"``, or a function of a :class:`~d4orm_env.envs.rewards.RewardInput` that JAX
             can trace; static.
@@ -159,8 +159,8 @@ def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycle
 
     Args:
         problem: The problem.
-        state: Where the team is.
-        layout: What observations are made of, as ``ObservationLayout.for_problem(problem)``; static.
+        state: State of the team.
+        layout: Contents of observations, as ``ObservationLayout.for_problem(problem)``; static.
         max_cycles: Steps until truncation; the problem's horizon unless given.
 
     Returns:

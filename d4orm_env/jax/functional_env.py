@@ -35,7 +35,7 @@ class EnvState(NamedTuple):
     """A world in the middle of an episode.
 
     Attributes:
-        team: Where the team is.
+        team: State of the team.
         instance: ``()`` int32, which of the instances it runs.
         touched: ``(K,)`` bool: has been in contact.
     """
@@ -55,7 +55,7 @@ class Transition(NamedTuple):
         finished: ``(K,)`` bool: is done, which is terminated.
         done: ``()`` bool: the episode is over; all have finished, or the time is up.
         success: ``()`` bool: all have arrived, and none was ever in contact.
-        step: What happened, as :func:`d4orm_env.jax.functional.step` tells it.
+        step: The step, as :func:`d4orm_env.jax.functional.step` tells it.
     """
 
     observations: jax.Array
@@ -76,7 +76,7 @@ class FunctionalEnv:
     Args:
         scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all arguments not named here.
         num_robots: Size of the team.
-        num_instances: How many instances there are to choose among, for a scenario that draws at random; ``seed=``
+        num_instances: Number of instances to choose among, for a scenario that draws at random; ``seed=``
             draws others.
         **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario. Not
             ``render_mode``, ``lifelong``, ``progress="path"``, ``observed_path``, nor disturbances but
@@ -84,7 +84,7 @@ class FunctionalEnv:
 
     Attributes:
         problem: The first instance.
-        layout: What the components of one robot's observation mean.
+        layout: Layout of one robot's observation.
         max_cycles: Steps until truncation.
 
     Raises:
@@ -150,7 +150,7 @@ class FunctionalEnv:
         """One step, without reset at the end of an episode.
 
         Args:
-            key: What the noise is drawn from.
+            key: Key of the noise.
             state: The world.
             actions: ``(K, m)`` controls in physical units, clipped to the robots' limits.
         """

@@ -42,7 +42,7 @@ class TeamBodies:
 
     Args:
         problem: The problem; every robot has a body, see :func:`~d4orm_env.mujoco.scene.check_problem`.
-        physics: What they are made of.
+        physics: Their material.
         intruder_radius: ``(N,)`` of bodies that are no robots [m].
     """
 

@@ -51,7 +51,7 @@ class Camera:
 
     Args:
         model: The scene.
-        problem: What is to be in view: starts, goals and bounds.
+        problem: Problem to be in view: starts, goals and bounds.
 
     Raises:
         NoCameraError: If OpenGL cannot draw here.

@@ -27,7 +27,7 @@ class parallel_env(navigation_v0.parallel_env):
     Args:
         scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all arguments not named here.
         num_robots: Size of the team.
-        physics: What the bodies are made of.
+        physics: Material of the bodies.
         renderer: Renderer of ``"rgb_array"`` frames: ``"mujoco"``; ``"pictures"``, which are those of the other
             environments; or by default ``"auto"``, MuJoCo where EGL or OSMesa is there, else pictures. A window is
             always of pictures.

@@ -28,8 +28,8 @@ class MujocoSimulation(Simulation):
     bodies.
 
     Args:
-        options: What is simulated, and how.
-        physics: What bodies are made of.
+        options: Options of the simulation.
+        physics: Material of the bodies.
 
     Raises:
         ValueError: For an argument out of range, or a robot that has no body in MuJoCo.

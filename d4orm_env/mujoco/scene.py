@@ -76,7 +76,7 @@ def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, ste
 
     Args:
         problem: The problem.
-        physics: What bodies are made of.
+        physics: Material of the bodies.
         body_radius: ``(N,)`` of bodies that are no robots and move as they like [m].
         step: Of MuJoCo [s].
 

@@ -67,7 +67,7 @@ class WheelControl:
         """``(D, 2)`` torques of left and right wheels for the next step [N m].
 
         Args:
-            commands: What the drives are to do.
+            commands: Commands of the drives.
             time: Since the commands were given, at the end of the step [s].
             step: [s].
             spin: ``(D, 2)`` present speeds of the wheels [rad/s].

@@ -187,7 +187,7 @@ def observe_paths(observations: FloatArray, layout: ObservationLayout, direction
 
     Args:
         observations: ``(..., K, D)``.
-        layout: What is in them.
+        layout: Their layout.
         direction: ``(..., K, d)`` of the ways, unit vectors.
         length: ``(..., K)`` of the ways [m].
     """
@@ -218,11 +218,11 @@ def lay_lattice(
     Args:
         problem: The starts, goals and bounds.
         space: Its obstacles; ``None`` where there are none.
-        reach: What must fit at a node [m].
+        reach: Radius that must fit at a node [m].
         step: Distance of neighbouring nodes [m], at least: that of the lattice is said by its ``step``.
         most: Most nodes.
         most_points: Most points, blocked ones included.
-        pad: How far beyond starts, goals and obstacles ways may lead, at least twice the reach [m].
+        pad: Distance beyond starts, goals and obstacles that paths may lead, at least twice the reach [m].
     """
     low, high = _where_ways_lead(problem, space, max(pad, 2 * reach))
     most_points = most if space is None else most_points

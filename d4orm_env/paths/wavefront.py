@@ -45,7 +45,7 @@ class Space(NamedTuple):
         cell: Size of its cells [m].
         scale: One over that [1/m].
         size: ``(3,)`` its cells along each axis.
-        rounding: By how much its clearances may be off [m].
+        rounding: Error of its clearances [m].
         clearance: ``(C,)`` float32.
         first: ``(C + 1,)`` int32.
         items: int32.
@@ -53,7 +53,7 @@ class Space(NamedTuple):
         triangles: ``(., 6)``.
         bounds: ``(2, 3)`` of the world.
         extent: ``(2, 3)`` of the obstacles.
-        pad: How far from the obstacles the index reaches at least [m].
+        pad: Distance from the obstacles that the index covers at least [m].
     """
 
     low: Floats

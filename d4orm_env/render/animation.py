@@ -45,12 +45,12 @@ def save_animation(
 
     Args:
         problem: The problem that the trajectory belongs to.
-        trajectory: What to show.
+        trajectory: Motion to show.
         path: A ``.gif`` file, or ``.mp4`` where ffmpeg is installed.
         fps: Frames per second; by default one frame per time step, at most 20.
-        speed: How many times faster than real time it plays.
+        speed: Speed of playing, in multiples of real time.
         max_frames: A longer animation gets fewer frames per second, at the same speed.
-        marks: Where it was disturbed, as for :func:`~d4orm_env.render.plot_trajectory`.
+        marks: Its disturbances, as for :func:`~d4orm_env.render.plot_trajectory`.
 
     Returns:
         The path.

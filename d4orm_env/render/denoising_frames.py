@@ -25,7 +25,7 @@ class Denoising:
         paths: ``(S, P, K, d)`` where the candidate leads [m].
         samples: ``(S, N, P, K, d)`` where some of the samples lead that it was made of [m].
         alpha: ``(S, N)`` how opaque each sample is drawn, 0 to 1.
-        seconds_per_step: How long a replay shows each.
+        seconds_per_step: Time for which a replay shows each.
 
     Raises:
         ValueError: If the shapes do not go together.
@@ -56,9 +56,9 @@ def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, pan
 
     Args:
         problem: The problem that was planned for.
-        denoising: What was seen.
+        denoising: Denoising as seen.
         path: A PNG, SVG or PDF file.
-        panels: How many steps to show, in rows of three.
+        panels: Number of steps to show, in rows of three.
 
     Raises:
         ValueError: For another suffix.

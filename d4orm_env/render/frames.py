@@ -102,7 +102,7 @@ class FrameRenderer:
             trail: ``(T, K, d)`` positions up to now, oldest first.
             contacts: ``(N, d)`` further points to mark with a star, such as earlier contacts.
             caption: Text above the picture; by default how many robots have arrived.
-            marks: Where the execution was disturbed up to now; its moments are the last ones of ``trail``.
+            marks: Disturbances of the execution up to now; its moments are the last ones of ``trail``.
 
         Returns:
             ``(height, width, 3)`` image, the caller's own.

@@ -105,12 +105,12 @@ class Axes2D:
     """One view of the world on one axes: the plane, space, or space seen from above.
 
     Args:
-        axes: Where to draw: flat, or ``projection="3d"`` for a view of space.
-        problem: Whose world it is.
+        axes: Axes to draw on: flat, or ``projection="3d"`` for a view of space.
+        problem: Problem of the world.
         limits: ``(2, d)`` corners of what is shown, see :func:`view_limits`.
 
     Attributes:
-        axes: Where it draws.
+        axes: Axes to draw on.
         spatial: Whether this is a view of space (mplot3d, orthographic, so that spheres are circles).
         right, up: ``(2,)`` or ``(3,)`` unit vectors that span the plane of the picture.
     """

@@ -76,9 +76,9 @@ def plot_trajectory(
 
     Args:
         problem: The problem that the trajectory belongs to.
-        trajectory: What to draw.
+        trajectory: Motion to draw.
         title: Title of the figure; by default the problem's name and the outcome, ``""`` for none.
-        marks: Where it was disturbed, ``episode.marks``: arrows are pushes, as long as the way in a second at their
+        marks: Its disturbances, ``episode.marks``: arrows are pushes, as long as the way in a second at their
             speed, crosses are where a robot stops obeying, and grey discs with dotted ways are intruders.
 
     Returns:
@@ -139,9 +139,9 @@ def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | No
     """Draw a problem, and a motion in it if there is one, on axes, as :func:`plot_trajectory` does without its legend.
 
     Args:
-        problem: What to draw.
+        problem: Problem to draw.
         trajectory: A motion that belongs to it; without one the team is at its starts.
-        axes: Where to draw; for a spatial problem ``projection="3d"``, or flat for a view from above. By default axes
+        axes: Axes to draw on; for a spatial problem ``projection="3d"``, or flat for a view from above. By default axes
             of a new figure of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show it.
 
     Returns:

@@ -36,7 +36,7 @@ class ReplayMotion:
     """One team's motion, ready for a page.
 
     Attributes:
-        content: What the page reads: lists, numbers and texts only.
+        content: Data of the page: lists, numbers and texts only.
     """
 
     content: dict[str, object]
@@ -56,11 +56,11 @@ def motion(
 
     Args:
         problem: The problem that the trajectory belongs to.
-        trajectory: What to show, ``T`` steps.
-        title: What to call it.
+        trajectory: Motion to show, ``T`` steps.
+        title: Its title.
         figures: Key figures in a line.
         goals: ``(T+1, K, d)`` where they change on the way; the problem's by default.
-        denoising: How a plan came about, shown before the motion.
+        denoising: Denoising of the plan, shown before the motion.
         bodies: ``(T+1, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
             none; a radius of zero for what is not there.
 
@@ -102,8 +102,8 @@ class Replay:
     """Motions side by side on one page, with one clock; notebooks show it where it is the last value of a cell.
 
     Attributes:
-        title: What the page is called.
-        motions: What it shows, one or more.
+        title: Title of the page.
+        motions: Motions that it shows, one or more.
         autoplay: Whether it plays when it is opened.
 
     Raises:

@@ -19,8 +19,8 @@ def with_bounds(settings: Settings, world: World, area: Area | None) -> World:
     Args:
         settings: With the ``bounds``.
         world: Of the scenario.
-        area: What a margin is laid around: the same for every seed, so that worlds that differ in their seed alone have
-            the same bounds.
+        area: Region that a margin is laid around: the same for every seed, so that worlds that differ in their seed
+            alone have the same bounds.
 
     Raises:
         ValueError: If they are no bounds, or the scenario has some of its own.

@@ -32,7 +32,7 @@ class Layout:
         world: Obstacles and bounds of the scenario itself.
         travel: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in
             their seed alone have the same shapes.
-        area: Where robots start and end: random obstacles are placed there, and bounds around it. ``None`` where
+        area: Region of starts and goals: random obstacles are placed there, and bounds around it. ``None`` where
             ``world`` has walls, and its obstacles already.
     """
 

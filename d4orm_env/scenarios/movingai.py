@@ -83,7 +83,7 @@ def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[M
     Args:
         content: Of the file.
         shape: Rows and columns of its map.
-        count: How many rows.
+        count: Number of rows.
 
     Raises:
         ValueError: If it is no such file, is of another map, or has fewer rows; one line without the file's name.

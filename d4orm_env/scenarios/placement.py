@@ -93,7 +93,7 @@ def with_random_obstacles(settings: Settings, world: World, places: Points, area
         settings: Number and radius of obstacles, team, seed.
         world: The world they are added to.
         places: ``(., d)`` starts, then goals, or none where these are drawn later [m].
-        area: Where they are drawn from.
+        area: Region that they are drawn from.
 
     Raises:
         ValueError: If so many do not fit; the message says how many do.

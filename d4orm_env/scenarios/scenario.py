@@ -52,7 +52,7 @@ class Scenario:
     """Something that makes problems.
 
     Attributes:
-        name: What it is called in tables and messages.
+        name: Its name in tables and messages.
         generator: ``(seed, num_robots, **settings) -> Problem``.
 
     Raises:

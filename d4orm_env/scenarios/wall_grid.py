@@ -83,10 +83,10 @@ def wall_world(openings: Openings, side: float, width: float, random: np.random.
     """The world of that plan, centred on the origin.
 
     Args:
-        openings: Which walls are open.
+        openings: Openings in the walls.
         side: Of a square, from wall to wall [m].
         width: Of an opening, somewhere along the square's side; the whole side if it is as wide [m].
-        random: Where along.
+        random: Generator of their positions.
     """
     columns, rows = openings.above.shape[1], openings.right.shape[0]
     pitch = side + WALL

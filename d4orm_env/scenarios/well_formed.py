@@ -40,7 +40,7 @@ class _Placing:
     Args:
         inside: The region.
         separation: Distance of robots that pass by from a place, in steps of the lattice.
-        most: How many places there will be.
+        most: Number of places there will be.
     """
 
     def __init__(self, inside: Mask, separation: float, most: int) -> None:
@@ -97,7 +97,7 @@ def draw_places(
     """Random places, far enough apart that a robot gets from each to each while robots are on all others.
 
     Args:
-        random: Where the draws come from.
+        random: Generator of the draws.
         space: The region.
         groups: Of each group of places the part of the region that they are drawn from, or ``None`` for all of it,
             and their number.
@@ -169,7 +169,7 @@ def populate(
         world: Walls and bounds.
         step: Of the lattice that places are drawn from [m].
         travel: The distance the horizon is made for [m].
-        remedy: What to change where the robots do not fit.
+        remedy: Remedy where the robots do not fit.
         exchange: Half of the robots start at an x below the first of them and end above the second [m], the others the
             other way round; everywhere by default.
 

@@ -49,7 +49,7 @@ class Stretch:
     Attributes:
         path: ``(T, S+1, B, d)`` positions at the ends of the sub-steps [m].
         reach: ``(T, B)`` how far from where it began a body gets in each step [m].
-        start: When it begins [s].
+        start: Time at which it begins [s].
         dt: Length of a step [s].
     """
 

@@ -15,8 +15,8 @@ class Violation:
         kind: ``"robot contact"``, ``"obstacle contact"``, ``"bounds contact"``, ``"control limit"``, ``"not arrived"``,
             ``"non-finite"`` or ``"not judged"``.
         robots: Indices of the robots concerned.
-        time: When it first happens, contacts to within a sub-step [s].
-        detail: What happened, with values and units.
+        time: Time at which it first happens, contacts to within a sub-step [s].
+        detail: Description, with values and units.
     """
 
     kind: str

@@ -33,7 +33,7 @@ class SharedPolicy(Policy):
 
     Args:
         predict: ``(B, n)`` float32 observations of any number of robots to ``(B, m)`` actions.
-        weights: What has a ``state_dict``, by which a store of trials tells one training's model from another's.
+        weights: Something with a ``state_dict``, by which a store of trials tells one training's model from another's.
         normalized: Whether actions are in ``[-1, 1]``, which stand for the lowest and the highest of the environment.
     """
 
@@ -67,7 +67,7 @@ def from_sb3(model: Model, deterministic: bool = True) -> SharedPolicy:
     """A model of Stable-Baselines3, trained on the environment's own observations and actions, as through SuperSuit.
 
     Args:
-        model: What ``PPO.load(path)`` or the training gave.
+        model: Result of ``PPO.load(path)`` or of the training.
         deterministic: Take the most likely action rather than draw one.
     """
     return SharedPolicy(partial(_ask_sb3, model, deterministic), model.policy)
@@ -78,8 +78,8 @@ def from_torchrl(module: Model, observation_key: Key = "observation", action_key
 
     Args:
         module: Reads ``(B, n)`` observations from a ``TensorDict`` of ``B`` robots, writes ``(B, m)`` actions into it.
-        observation_key: Where it reads them.
-        action_key: Where it writes them.
+        observation_key: Key of the observations.
+        action_key: Key of the actions.
     """
     return SharedPolicy(partial(_ask_torchrl, module, observation_key, action_key), module)
 
@@ -88,7 +88,7 @@ def from_rllib(module: Model, normalized: bool = True) -> SharedPolicy:
     """An ``RLModule`` of RLlib on torch, asked by ``forward_inference``.
 
     Args:
-        module: What ``algorithm.get_module(module_id)`` or ``RLModule.from_checkpoint(path)`` gave.
+        module: Result of ``algorithm.get_module(module_id)`` or ``RLModule.from_checkpoint(path)``.
         normalized: Whether its actions are in ``[-1, 1]``, as RLlib trains unless ``normalize_actions`` is off.
     """
     return SharedPolicy(partial(_ask_rllib, module), module, normalized)

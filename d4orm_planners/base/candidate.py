@@ -26,7 +26,7 @@ class Candidate:
         controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
         trajectory: Their rollout.
         failed: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked.
-        report: What :func:`d4orm_env.verify` says; ``None`` where a robot fails at any step, and it was not asked.
+        report: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, and it was not asked.
     """
 
     planned: FloatArray

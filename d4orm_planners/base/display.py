@@ -44,7 +44,7 @@ class DisplayMixin:
         """Draw the motion with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
 
         Args:
-            axes: Where to draw; by default axes of a new figure of ``matplotlib.pyplot``.
+            axes: Axes to draw on; by default those of a new figure of ``matplotlib.pyplot``.
 
         Returns:
             The axes, spatial for a spatial problem.
@@ -60,8 +60,8 @@ class DisplayMixin:
         """Return the motion of a replay; :class:`d4orm_env.render.replay.Replay` puts several side by side.
 
         Args:
-            title: What to call it there; by default what it is called everywhere.
-            denoising: How a plan came about, shown before the motion; see :mod:`d4orm_planners.sampling.denoising`.
+            title: Its title there; by default its own.
+            denoising: Denoising of the plan, shown before the motion; see :mod:`d4orm_planners.sampling.denoising`.
         """
         from d4orm_env.render.replay import motion
 

@@ -33,14 +33,14 @@ class Episode(DisplayMixin):
     """Record of an episode.
 
     Attributes:
-        problem: What the environment ran.
+        problem: Problem of the environment.
         trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
         metrics: The environment's own, see :meth:`d4orm_env.envs.episode_record.EpisodeRecord.metrics`, and
             ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.
         goals: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode.
-        marks: Where it was disturbed, for pictures; ``None`` without disturbances.
+        marks: Its disturbances, for pictures; ``None`` without disturbances.
     """
 
     problem: Problem
@@ -99,7 +99,7 @@ def open_env(problem: Problem, physics: str = "model", **options: Any) -> Parall
 
     Args:
         problem: The problem.
-        physics: What moves the robots, one of :data:`PHYSICS`.
+        physics: Physics of the robots, one of :data:`PHYSICS`.
         **options: Further arguments of :class:`d4orm_env.navigation_v0.parallel_env`.
 
     Raises:
@@ -119,7 +119,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
 
     Args:
         env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
-        policy: What acts: a policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
+        policy: A policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
         seed: Seeds both.
 
     Returns:

@@ -27,8 +27,8 @@ def drive_further_in(search: SolveRun, candidate: Candidate, judge: Callable[[Fl
 
     Args:
         search: The search.
-        candidate: What an iteration came to.
-        judge: What makes a candidate of controls ``(H, K, m)``.
+        candidate: Result of an iteration.
+        judge: Function that makes a candidate of controls ``(H, K, m)``.
     """
     report = candidate.report
     if report is None or report.ok or any(violation.kind != "not arrived" for violation in report.violations):

@@ -47,11 +47,11 @@ class IterationRecord:
         best_reward: Mean reward of the best candidate so far.
         best_solved: Whether that one is a solution.
         excluded: Samples of this iteration that were left out because their reward was not finite.
-        note: What the method itself says of how the iteration ended; ``ipopt`` has IPOPT's return status here,
+        note: Remark of the method on how the iteration ended; ``ipopt`` has IPOPT's return status here,
             ``d-d4orm`` the nodes that were lost and the messages that were dropped, and path finding why it found none.
         unreachable: Robots for which path finding found no way to their goals.
         controls: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history.
-        trajectory: Where they lead, likewise.
+        trajectory: Their rollout, likewise.
     """
 
     iteration: int
@@ -81,7 +81,7 @@ class Plan(DisplayMixin):
         seed: The seed.
         controls: ``(H, K, m)`` inside the limits, zero once docked.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
-        status: How the search ended. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
+        status: End of the search. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
             budget, so without a solution unless it was to be improved. ``"stopped"`` (by the callback) or
             ``"interrupted"``: with whatever it had. ``"infeasible"``: at once, for there is a proof that nothing solves
             the problem, see :func:`d4orm_env.core.infeasibility.prove_infeasible`. ``"refuted"``: a file says

@@ -48,8 +48,8 @@ class Iteration:
         controls: ``(H, K, m)`` the new candidate.
         denoising_steps: Sample-score-update steps spent.
         excluded: Samples left out because their reward was not finite.
-        note: What the method itself says of how the iteration ended, where it has a word for it.
-        judged: What :func:`~d4orm_planners.base.candidate.evaluate_controls` made of these controls, if the iteration
+        note: Remark of the method on how the iteration ended, where it has a word for it.
+        judged: Result of :func:`~d4orm_planners.base.candidate.evaluate_controls` for these controls, if the iteration
             asked; else the loop does.
         unreachable: Robots for which path finding found no way to their goals.
     """
@@ -69,9 +69,9 @@ class Planner(ABC):
     the first one and every :meth:`iterate` the next. A planner that keeps nothing has ``None``, and no ``init``.
 
     Attributes:
-        name: What its plans say they are by; that of the class unless it gives another.
+        name: Planner's name in its plans; that of the class unless it gives another.
         config: The settings.
-        preset: Which of its presets it was made with, if any.
+        preset: Preset that it was made with, if any.
         drives_straight: Whether it begins with straight drives, whose kernels the command line then compiles ahead.
         presets: By name, settings for :func:`~d4orm_planners.make_planner`, which leaves out those that do not apply.
     """
@@ -115,7 +115,7 @@ class Planner(ABC):
         once.
 
         Args:
-            problem: What to solve.
+            problem: Problem to solve.
             seed: Non-negative seed; the same seed gives the same plan.
             time_limit: Seconds, compilation not counted; looked at before every iteration, and within one between its
                 denoising steps, repairs or IPOPT's iterations. An iteration that it cuts short ends with what it has

@@ -148,7 +148,7 @@ def within_limits(problem: Problem, actions: Actions) -> Actions:
     What is no action of this team, such as one that is not finite, stays as it is: the environment says what is wrong.
 
     Args:
-        problem: Whose robots they are.
+        problem: Problem of the robots.
         actions: ``(m,)`` controls by agent.
     """
     controls, size = np.zeros((problem.num_robots, problem.control_size), np.float32), (problem.control_size,)
@@ -192,7 +192,7 @@ class OpenLoop(StatePolicy):
     """Plans once at the reset and executes the plan, whatever happens.
 
     Attributes:
-        planner: What makes the plan.
+        planner: Planner that makes the plan.
         plan: The plan of the present episode.
     """
 

@@ -39,27 +39,27 @@ class SolveRun:
     """One solve on its way.
 
     Args:
-        planner: What iterates.
+        planner: Planner that iterates.
         problem: The problem.
         seed: Non-negative.
         initial_controls: ``(H, K, m)`` to start from; zeros by default.
-        engine: What rolls out and samples, if not the planner's own.
-        judge: What makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
+        engine: Engine for rollouts and samples, if not the planner's own.
+        judge: Function that makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
         check_interval: Failures are looked for at every so many steps only (paper, section VI-A); a solution keeps the
             margin at all steps.
 
     Attributes:
         problem: The problem.
-        engine: What rolls out and samples.
+        engine: Engine for rollouts and samples.
         seed: The solve's seed.
         watch: Time used.
         current: The candidate that the next iteration starts from.
         best: The best candidate so far.
         iteration: Iterations done.
-        state: What the planner keeps between its own iterations, of a type of its own; ``None`` before the first one.
+        state: State of the planner between its own iterations, of a type of its own; ``None`` before the first one.
         metrics: Numbers of the method's own that the plan's metrics will have.
         time_limit: Seconds that the solve may take, or ``None``.
-        watcher: What is told of every denoising step, or ``None``.
+        watcher: Observer of every denoising step, or ``None``.
         cancelled: Once set, by whatever thread, the iteration under way is left as if its time were over.
     """
 

@@ -24,8 +24,8 @@ class WorkingPlan:
 
     Args:
         search: The search.
-        trajectory: What the team does at first.
-        report: What :func:`~d4orm_env.verify` says of that, if it was asked.
+        trajectory: The team's motion at first.
+        report: Report of :func:`~d4orm_env.verify` on that, if it was asked.
 
     Attributes:
         controls: ``(H, K, m)``.

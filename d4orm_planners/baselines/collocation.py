@@ -114,8 +114,8 @@ class TeamProgram:
         """Solve from a guess.
 
         Args:
-            guess: Where IPOPT starts.
-            contacts: What is kept clear of what, and when.
+            guess: Start of IPOPT.
+            contacts: Pairs that are kept clear of each other, and when.
             docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stay there.
             options: IPOPT's.
             should_stop: Asked every hundredth of a second whether to end; it ends within a tenth, even where writing

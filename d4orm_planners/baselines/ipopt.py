@@ -67,7 +67,7 @@ class WarmStart:
 
     Attributes:
         program: The problem as IPOPT is given it.
-        motion: What every iteration perturbs.
+        motion: Motion that every iteration perturbs.
     """
 
     program: TeamProgram

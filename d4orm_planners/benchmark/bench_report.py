@@ -34,9 +34,9 @@ def write_report(
     """Write ``bench.json`` and ``bench.md``.
 
     Args:
-        folder: Where to.
+        folder: Output folder.
         settings: Of the benchmark.
-        begun: What :func:`circumstances` said at its beginning.
+        begun: Result of :func:`circumstances` at its beginning.
         results: By section, see :func:`~d4orm_planners.benchmark.benchmark.run_parts`.
 
     Returns:

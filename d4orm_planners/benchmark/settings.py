@@ -40,7 +40,7 @@ class BenchmarkSettings(CheckedSettings):
         plan_time_limit: Seconds per plan.
         thread_robots: Team sizes whose iterations are timed with several threads and with one.
         memory_robots: Team size of the memory measurement.
-        obstacles: How many boxes stand among the ways of 8 robots.
+        obstacles: Numbers of boxes among the paths of 8 robots.
         far_obstacles: The same of boxes far away; also what environments are stepped among.
         map_cells: Cells along a side of the maps whose index of obstacles is timed.
 

@@ -23,7 +23,7 @@ class Spread:
         upper_quartile: A quarter lie above it.
         smallest: The smallest.
         largest: The largest.
-        count: How many there were.
+        count: Number of values.
     """
 
     median: float
@@ -60,7 +60,7 @@ def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> 
     """Seconds that ``work`` takes, after one call that does not count.
 
     Args:
-        work: What to time.
+        work: Function to time.
         repetitions: Calls at most, at least one.
         time_limit: No further call begins once the counted ones have taken this long [s].
     """
@@ -79,8 +79,8 @@ def in_turn(
     """Seconds that each of two things takes, done in turn after once that does not count.
 
     Args:
-        first: What to time.
-        second: What to compare it with.
+        first: Function to time.
+        second: Function to compare it with.
         repetitions: Pairs at most, at least one.
         time_limit: No further pair begins once the counted ones have taken this long [s].
     """

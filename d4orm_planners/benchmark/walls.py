@@ -43,8 +43,8 @@ def measure_obstacles(
     """Seconds of an iteration among boxes and in the open, in turn, and of verify().
 
     Args:
-        iterate: What to time.
-        num_boxes: How many boxes.
+        iterate: Function to time.
+        num_boxes: Number of boxes.
         where: Near the robots' ways, or far from them.
         repetitions: Pairs at most.
         time_limit: Seconds after which no further pair begins.

@@ -87,7 +87,7 @@ def refuse_options(context: typer.Context, options: Iterable[str], reason: str) 
     Args:
         context: Of the command.
         options: Names of parameters of its function.
-        reason: What to say after the option.
+        reason: Text after the option.
 
     Raises:
         ValueError: If one of them was given.

@@ -48,7 +48,7 @@ def resumable(kept: str, enabled: bool) -> Iterator[Callable[[str, int, int], No
     """:func:`parts_progress` of what goes on after Ctrl-C where it was; says so then.
 
     Args:
-        kept: What is kept where, for people.
+        kept: Place of the results, for people.
         enabled: Whether to show progress.
     """
     try:

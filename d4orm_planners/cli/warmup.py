@@ -40,10 +40,10 @@ class WarmupReport:
     """Report of a warm-up.
 
     Attributes:
-        seconds: How long it took.
+        seconds: Time that it took.
         compiled: Kernels that had to be compiled.
         loaded: Kernels that were in the cache already.
-        folders: Where the cache is; empty if no folder can be written to, so that nothing is kept.
+        folders: Folders of the cache; empty if no folder can be written to, so that nothing is kept.
         lost: Kernels that could not be written there.
     """
 

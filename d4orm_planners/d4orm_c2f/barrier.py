@@ -47,10 +47,10 @@ def safe_velocities(
 
     Args:
         problem: The robots and obstacles.
-        joint: Where everything is.
+        joint: State of everything.
         wanted: ``(K, d)`` [m/s].
         free: ``(K,)`` robots that can be told other velocities; the others are at rest.
-        gap: What is to be left between surfaces [m].
+        gap: Distance to leave between surfaces [m].
         caution: Robots may come to be so much faster towards anything than they are told [m/s]. If any, they are also
             taken to go on for a time step before they brake.
 

@@ -48,14 +48,14 @@ class CoarsePlanTracker:
         problem: The problem of the episode.
         config: The settings.
         seed: Of the episode.
-        refiner: What refinements roll out and sample with.
-        background: Where they are made, if not between control loops.
+        refiner: Engine of refinements.
+        background: Thread that they are made in, if not between control loops.
         lifelong: Whether robots that arrive get new goals.
         last_step: Time steps after which the episode ends.
 
     Attributes:
         problem: The problem, with the limits that the robots are believed to have now.
-        guidance: What is followed at present.
+        guidance: Coarse plan that is followed at present.
         index: Waypoint at which the team is.
         anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
         stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.

@@ -42,7 +42,7 @@ class Deviation:
 
     Args:
         problem: The robots.
-        engine: What knows how they should move.
+        engine: Engine for rollouts.
         config: To be found out: how late commands and how noisy states are, which robots are weak or do not obey.
         docks: Whether robots dock at their goals, rather than drive through them to others.
 
@@ -50,8 +50,8 @@ class Deviation:
         speed: ``(K,)`` the largest deviation of each robot in a time step, over its length, of late [m/s].
         drift: The largest change of a robot's velocity from what was expected within a few steps of late [m/s].
         problem: The robots with the limits that they are believed to have now.
-        lateness: How late commands are executed.
-        losses: How often commands are not executed at all.
+        lateness: Estimator of the latency of commands.
+        losses: Estimator of the share of commands that are lost.
         standing: Robots that have stalled.
     """
 

@@ -39,7 +39,7 @@ def drive_home(
 
     Args:
         window: The robots from where they are to their goals, over the prediction horizon.
-        engine: What rolls out.
+        engine: Engine for rollouts.
         controls: ``(H_predict, K, m)``.
         near: ``(K,)`` whose drives are tried.
         docked: ``(K,)`` robots at rest for good.

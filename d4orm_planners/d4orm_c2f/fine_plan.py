@@ -37,7 +37,7 @@ class Situation(NamedTuple):
     """State at the beginning of a control loop.
 
     Attributes:
-        joint: Where the robots are.
+        joint: State of the robots.
         docked: ``(K,)`` robots that stay there.
         subgoals: ``(K, d)`` [m].
         base: ``(H_predict, K, m)`` controls to deform.
@@ -63,7 +63,7 @@ class Window:
     Args:
         problem: The problem of the episode.
         config: The settings.
-        engine: What rolls out and samples.
+        engine: Engine for rollouts and samples.
         docks: Whether robots dock at their goals, rather than drive through them to others.
 
     Attributes:

@@ -30,7 +30,7 @@ class StagnationMonitor:
     """Watches an episode for robots that do not get on along their paths.
 
     Args:
-        joint: Where they begin.
+        joint: Their first state.
     """
 
     def __init__(self, joint: JointState) -> None:
@@ -60,8 +60,8 @@ def keep_time(
 
     Args:
         problem: The robots; the path has a waypoint per time step of it.
-        engine: What moves them.
-        joint: Where they are.
+        engine: Engine for rollouts.
+        joint: Their state.
         path: ``(H+1, K, d)`` waypoints [m].
         indices: ``(K,)`` where on it they should be now; from elsewhere they catch up.
         horizon: Steps.

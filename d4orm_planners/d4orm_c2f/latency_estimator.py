@@ -25,7 +25,7 @@ class Lateness:
         known: Steps late that commands are known to be, or ``None`` to find out.
 
     Attributes:
-        steps: How late they are.
+        steps: Their latency.
     """
 
     def __init__(self, team: Team, known: int | None) -> None:

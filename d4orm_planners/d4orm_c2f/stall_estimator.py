@@ -51,7 +51,7 @@ class Standing:
         """The joint state, in which those that do not obey are docked where they are, or will come to rest.
 
         Args:
-            joint: Where the robots are.
+            joint: State of the robots.
             commanded: ``(K, m)`` the commands that should have been executed in the last step.
         """
         problem, places = self._problem, joint.states[:, : self._d]

@@ -16,7 +16,7 @@ def episode_of(policy: str, problem: Problem, seed: int) -> FloatArray:
 
     Args:
         policy: Name of a policy.
-        problem: Where it drives.
+        problem: Its problem.
         seed: Of the policy.
 
     Raises:

@@ -23,10 +23,10 @@ class DeformedPlan(WorkingPlan):
     """The team's plan, some robots' controls deformed around all others.
 
     Args:
-        planner: Whose rules deformations go by.
+        planner: Planner with the rules of deformations.
         search: The search.
-        trajectory: What the team does at first.
-        report: What :func:`~d4orm_env.verify` says of that, if it was asked.
+        trajectory: The team's motion at first.
+        report: Report of :func:`~d4orm_env.verify` on that, if it was asked.
     """
 
     def __init__(

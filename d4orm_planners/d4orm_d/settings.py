@@ -24,7 +24,7 @@ class D4ormDConfig(DeformationConfig):
         decoupling: ``"groups"`` replans every group of robots that conflict, the team's reward within it (the paper).
             ``"independent"`` replans robots that have no conflict with each other at once, each by its own reward,
             around all others, and takes over only what is no worse.
-        start: What the first iteration does without initial controls. ``"team"`` deforms the whole team at once;
+        start: First iteration without initial controls. ``"team"`` deforms the whole team at once;
             ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"auto"`` does the
             second in big teams where robots so meet less than half of the others on average.
         first_collisions: Whether the first iteration over the whole team minds collisions.
@@ -53,13 +53,13 @@ class RepairRules:
         noise_factors: On the noise of successive repairs: what ordinary noise does not get around, wider noise may.
         slack: Steps beyond the latest arrival of the robots repaired that their repair looks at. Farther on there is
             nothing to search, and what happens there would dilute the rewards.
-        recency_gain: What a repair adds to a robot's recency. The least recently repaired go first.
+        recency_gain: Increase of a robot's recency by a repair. The least recently repaired go first.
         recency_decay: Share of it that is left after an iteration.
-        crowding: How much earlier a robot's turn is for every robot that it meets: it blocks the most.
+        crowding: Priority of a robot for every robot that it meets: it blocks the most.
         joint_interval: Every so many iterations robots may be repaired jointly, each by their team's reward, ...
         joint_failures: ... if so many repairs in a row failed for each of them ...
         joint_robots: ... and they are so few: robots that only together can get out of each other's way.
-        shortenings: How many times in turn robots look for shorter ways home.
+        shortenings: Number of times in turn that robots look for shorter final approaches.
         earlier: Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal.
         batch: Robots that look for ways home at the same time: all ways of a big team take room.
     """

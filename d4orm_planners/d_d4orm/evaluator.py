@@ -18,12 +18,12 @@ class Evaluator:
     """Judges candidates, and remembers some.
 
     Args:
-        engine: What rolls out.
+        engine: Engine for rollouts.
         problem: The problem.
         remembered: Candidates of this process's own nodes that are remembered.
 
     Attributes:
-        engine: What rolls out.
+        engine: Engine for rollouts.
         problem: The problem.
         stop: Once set, nodes leave their iterations between denoising steps.
         solution_ends: Whether to set it at the first solution.

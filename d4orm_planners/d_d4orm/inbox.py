@@ -26,7 +26,7 @@ class Report:
 
     Attributes:
         node: Its sender.
-        sequence: Which of its candidates it is.
+        sequence: Number of the candidate.
         candidate: Rolled out and judged by the receiver.
     """
 
@@ -39,14 +39,14 @@ class Inbox:
     """Takes messages from a transport; nothing that arrives makes it raise.
 
     Args:
-        judge: What judges the candidates.
-        transport: Where messages arrive.
-        num_nodes: How many nodes there are.
+        judge: Evaluator of the candidates.
+        transport: Transport of the messages.
+        num_nodes: Number of nodes.
         own: The node that it belongs to, or ``None`` for an observer's.
 
     Attributes:
         newest: The newest report of every node heard from, by node.
-        dropped: How many messages were dropped, by :data:`~d4orm_planners.d_d4orm.messages.KINDS`.
+        dropped: Numbers of messages that were dropped, by :data:`~d4orm_planners.d_d4orm.messages.KINDS`.
         false_claims: Candidates that were not what their sender claimed. They count for what they are.
         namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
     """

@@ -37,7 +37,7 @@ class Message:
 
     Attributes:
         node: Its sender, from 0.
-        sequence: Which of its candidates it is, from 1.
+        sequence: Number of the candidate, from 1.
         controls: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would.
         reward: Mean reward.
         feasible: Whether it is a solution.

@@ -35,11 +35,11 @@ class Task:
     """Common task of the nodes of one solve.
 
     Attributes:
-        num_nodes: How many nodes there are.
+        num_nodes: Number of nodes.
         seed: That of the whole solve.
         controls: ``(H, K, m)`` to start from; ``None`` for zeros.
-        selection: How a node chooses what to go on from; see :func:`~d4orm_planners.d_d4orm.selection.choose`.
-        k: How many candidates it draws from.
+        selection: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.selection.choose`.
+        k: Number of candidates that it draws from.
     """
 
     num_nodes: int
@@ -54,10 +54,10 @@ class Node:
 
     Args:
         number: Its number, from 0.
-        task: What it has in common with the others.
-        planner: What it refines its candidate with.
+        task: Common task of the nodes.
+        planner: Planner that refines its candidate.
         transport: Its access to the others.
-        judge: What rolls out and judges, in common with other nodes of this process.
+        judge: Evaluator, in common with other nodes of this process.
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
             network the time at which it began, by which two nodes of one number know which was first.
         observer: Called with every :class:`~d4orm_planners.d_d4orm.node_events.Event`, in the node's own thread.
@@ -66,8 +66,8 @@ class Node:
         number: From 0.
         search: Its own search.
         candidate: The candidate that it made last.
-        transport: What it sends and receives by, with a count.
-        inbox: What the others sent.
+        transport: Transport of its messages, with a count.
+        inbox: Messages of the others.
         excluded: Samples left out so far because their reward was not finite.
     """
 

@@ -18,10 +18,10 @@ class Event:
     Attributes:
         node: The node that did it.
         kind: One of :data:`KINDS`.
-        begin: When it began to, by :func:`time.perf_counter` [s].
-        end: When it was done, likewise. Messages take no time here.
+        begin: Time at which it began to, by :func:`time.perf_counter` [s].
+        end: Time at which it was done, likewise. Messages take no time here.
         of: The node that the candidate came from.
-        sequence: Which of that node's messages it is, from 1; 0 for one that was not sent yet.
+        sequence: Number among that node's messages, from 1; 0 for one that was not sent yet.
         candidate: The candidate, as judged by ``node``.
         size: Bytes of the message that was sent, else 0.
     """

@@ -269,7 +269,7 @@ class AsyncNodePool(NodePool):
         transports: All ends to close in the end.
         patience: See :class:`NodePool`.
         judge: See :class:`NodePool`.
-        observer: What the solve itself hears of the nodes.
+        observer: Observer of the nodes for the solve itself.
     """
 
     def __init__(

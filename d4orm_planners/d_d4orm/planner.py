@@ -30,7 +30,7 @@ class RunningNodes:
 
     Attributes:
         crew: The nodes.
-        opened: What they need and ends after them.
+        opened: Resources that they need and that end after them.
     """
 
     crew: NodePool

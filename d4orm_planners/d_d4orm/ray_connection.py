@@ -31,7 +31,7 @@ class RayConnection:
     Args:
         address: ``"auto"`` for the cluster that this machine belongs to, an address, or ``"local"`` for a new instance
             on this machine.
-        what: What needs it, for the error without Ray.
+        what: User of it, for the error without Ray.
 
     Raises:
         ValueError: If the address is none.

@@ -53,7 +53,7 @@ class Worker:
 
     Args:
         node: Number of the node that it works for.
-        num_nodes: How many there are.
+        num_nodes: Number of nodes.
         planner: The planner.
         problem: The problem.
         seed: The node's seed.

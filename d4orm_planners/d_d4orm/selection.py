@@ -42,8 +42,8 @@ def merge(newest: Mapping[int, Item], arrivals: Iterable[Item]) -> tuple[dict[in
     """The newest item of every node.
 
     Args:
-        newest: What is held so far, by node.
-        arrivals: What came in, in any order.
+        newest: Items held so far, by node.
+        arrivals: Items that came in, in any order.
 
     Returns:
         What is held now, and the stale arrivals: those that are no newer than what was held before.
@@ -68,7 +68,7 @@ def k_means(points: ArrayLike, k: int, generator: np.random.Generator) -> IntArr
     Args:
         points: ``(n, D)``.
         k: Clusters; there are fewer where there are fewer different points.
-        generator: What the start is drawn with.
+        generator: Generator that the start is drawn with.
 
     Returns:
         ``(n,)`` the cluster of each point, numbered from 0.
@@ -117,8 +117,8 @@ def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, genera
             one of the best of ``k`` clusters (section VIII-D).
         rewards: ``(n,)``.
         points: ``(n, ...)`` the candidates' controls.
-        k: How many to draw from.
-        generator: What it is drawn with.
+        k: Number to draw from.
+        generator: Generator that it is drawn with.
 
     Raises:
         ValueError: If there is no such rule.

@@ -39,10 +39,10 @@ class DD4ormConfig(PlannerConfig):
     Attributes:
         refinement: The settings of that planner. Its ``num_samples`` and ``repair_samples`` are those of all nodes
             together, of which each gets an equal share; what every planner takes is as it is here.
-        nodes: How many, at most 1024; ``None`` for one per robot, as where the robots themselves are the nodes.
-        selection: What a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the best one
-            (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
-        k: How many candidates it draws from.
+        nodes: Number of nodes, at most 1024; ``None`` for one per robot, as where the robots themselves are the nodes.
+        selection: Candidate that a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the
+            best one (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
+        k: Number of candidates that it draws from.
         mode: ``"sync"``: all nodes refine, then all exchange; the same seed gives the same plan. ``"async"``: each at
             its own pace; plans then depend on which is sooner.
         patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
@@ -51,8 +51,8 @@ class DD4ormConfig(PlannerConfig):
             ``"zenoh"``: this process is one node among others on a network, each at its own pace (``mode="async"``).
         address: Of the Ray cluster, ``"host:port"``, or ``"auto"`` for the one that this machine belongs to; ``None``
             for an instance on this machine that ends with the solve.
-        node: Which of the nodes this process is, from 0; over a network only.
-        zenoh: Where the other nodes are: :class:`~d4orm_planners.d_d4orm.zenoh_transport.ZenohSettings`, or a
+        node: Number of this process among the nodes, from 0; over a network only.
+        zenoh: Network of the nodes: :class:`~d4orm_planners.d_d4orm.zenoh_transport.ZenohSettings`, or a
             mapping of them; over a network only.
     """
 

@@ -58,7 +58,7 @@ class ZenohSettings:
     """Network of the nodes. By default that is this machine only, and no port is open beyond loopback.
 
     Attributes:
-        namespace: What the nodes of one solve have in common and others on the network have not: their messages have
+        namespace: Name shared by the nodes of one solve alone: their messages have
             the key ``NAMESPACE/candidates``.
         listen: Endpoints to listen at, as ``tcp/192.168.1.10:7447``; port 0 for any free one.
         connect: Endpoints of other nodes or of a zenoh router; one that is away is tried again and again. One is
@@ -117,7 +117,7 @@ class ZenohTransport:
     """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh log what it does.
 
     Args:
-        settings: Where the others are.
+        settings: Network of the others.
 
     Raises:
         ImportError: If zenoh is not installed.

@@ -69,7 +69,7 @@ class PathIndex:
     Args:
         positions: ``(H+1, K, d)`` [m], finite; copied. At the start none counts as near.
         radius: ``(K,)`` [m].
-        margin: What robots are to keep between them [m].
+        margin: Gap that robots are to keep between them [m].
 
     Attributes:
         table: The index as kernels read it.

@@ -106,7 +106,7 @@ class DenoisingStep(NamedTuple):
     """One step of a denoising run, for observers.
 
     Attributes:
-        task: What is sampled around, and how it is scored.
+        task: Distribution of the samples, and their scoring.
         noise_scale: Standard deviation of the samples.
         mean: ``(H, K, m)`` the weighted mean of the deformations, which the next step samples around.
         samples: ``(S, H, K, m)`` the first deformations that it is the mean of, at most :data:`WATCHED_SAMPLES`.

@@ -71,7 +71,7 @@ class Scoring(NamedTuple):
     Attributes:
         docked: ``(K,)`` bool, docked from the beginning.
         collisions: Whether robots count when near each other or near a moving body.
-        bodies: What moves, :class:`~d4orm_planners.engine.proximity.Bodies`.
+        bodies: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`.
         bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`.
     """
 

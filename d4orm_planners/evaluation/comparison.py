@@ -22,10 +22,10 @@ class Paired:
     """Paired comparison of two policies on the same problems, seeds and levels of noise.
 
     Attributes:
-        pairs: How many trials they have in common.
+        pairs: Number of trials that they have in common.
         only_first: Those in which only the first succeeded.
         only_second: Those in which only the second did.
-        success_p: How likely it is that two equally good policies differ so much in successes: McNemar's exact test,
+        success_p: Probability that two equally good policies differ so much in successes: McNemar's exact test,
             two-sided.
         difference: Median of the first's cost less the second's.
         cost_p: The same for the costs: Wilcoxon's signed-rank test, two-sided.
@@ -50,8 +50,8 @@ def paired(
     Args:
         first: Trials of one policy.
         second: Trials of another.
-        cost: What counts, less being better, such as steps to the first solution with twice the budget for none.
-        succeeded: What success is; by default that everyone arrived and nothing was touched. A plan that touches
+        cost: Cost, such as steps to the first solution with twice the budget for none.
+        succeeded: Criterion of success; by default that everyone arrived and nothing was touched. A plan that touches
             nothing and does not keep the margin is no solution, see :func:`is_solved`.
 
     Raises:
@@ -112,8 +112,8 @@ class PairedPolicies:
         num_robots: Team size.
         model: Models of the team.
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbance: What else went wrong; empty for nothing.
-        level: How much of it.
+        disturbance: Further disturbance; empty for none.
+        level: Its level.
         first: A policy's label.
         second: Another's.
         trials: Pairs of trials.

@@ -31,7 +31,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     """The page.
 
     Args:
-        trials: What :meth:`~d4orm_planners.evaluation.store.TrialStore.trials` returned.
+        trials: Result of :meth:`~d4orm_planners.evaluation.store.TrialStore.trials`.
         deadlines: Seconds for planning, for tables of success within them; none by default.
 
     Raises:

@@ -140,7 +140,7 @@ def run_jobs(jobs: Iterable[Job], pool: Pool, trial_timeout: float | None = None
     """Run jobs and yield trials as they end. A trial whose process dies, or which takes too long, ends with an error.
 
     Args:
-        jobs: What to run.
+        jobs: Jobs to run.
         pool: Pool that runs it; closed at the end, also when the iteration is broken off.
         trial_timeout: Seconds that a trial may take, that of the plan included; ``None`` is no limit.
 
@@ -183,7 +183,7 @@ class ProcessPool:
     Args:
         size: Processes.
         threads: Threads of each.
-        run: What they do with a job; by default they run its trials.
+        run: Function that runs a job; by default its trials.
     """
 
     def __init__(self, size: int, threads: int = 1, run: Callable[[Any], Iterator[object]] = run_job) -> None:

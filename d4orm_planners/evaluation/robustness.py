@@ -27,8 +27,8 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
     against it.
 
     Args:
-        folder: Where to.
-        rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
+        folder: Output folder.
+        rates: Result of :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
 
     Returns:
         The paths.
@@ -51,8 +51,8 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     """Write ``disturbances.md``, ``tolerance.csv``, ``pairs.csv``, ``tolerance.png`` and a picture per disturbance.
 
     Args:
-        folder: Where to.
-        groups: What :func:`~d4orm_planners.evaluation.evaluate.run_study` returned for a study with disturbances.
+        folder: Output folder.
+        groups: Result of :func:`~d4orm_planners.evaluation.evaluate.run_study` for a study with disturbances.
 
     Returns:
         The paths; ``pairs.csv`` is not among them, and not written, where there is one policy only.
@@ -152,7 +152,7 @@ def _draw_disturbance(path: Path, name: str, rates: Sequence[SuccessRate]) -> No
     """Success against the level of one disturbance: one line per policy, one panel per scenario, team and noise.
 
     Args:
-        path: Where to.
+        path: Output file.
         name: The disturbance.
         rates: Those of its levels, at least one.
     """

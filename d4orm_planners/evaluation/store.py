@@ -37,8 +37,8 @@ class TrialKey(NamedTuple):
         problem: :attr:`d4orm_env.core.problem.Problem.digest`.
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.
-        disturbances: What else goes wrong, as JSON: a list of ``[name, attributes]``.
-        physics: What moved the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
+        disturbances: Further disturbances, as JSON: a list of ``[name, attributes]``.
+        physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
     """
 
     policy: str
@@ -73,14 +73,14 @@ class Trial:
     The first seven fields are its :class:`TrialKey`.
 
     Attributes:
-        label: What the policy with these settings was called.
+        label: Name of the policy with these settings.
         scenario: Name of the scenario, with the arguments that it was given.
         num_robots: Team size.
         model: Model names of the team, each once, joined by ``+``.
         dt: Time step [s].
         versions: Versions of the libraries, as JSON; ``{}`` where the process was lost.
         machine: Processor, cores and system, as JSON, likewise.
-        date: When the trial ended, UTC, ISO 8601.
+        date: Time at which the trial ended, UTC, ISO 8601.
         success: Everyone arrived in time, and none was ever in contact.
         verified: Whether :func:`d4orm_env.verify` found no fault with the executed controls; ``None`` if not judged.
         violation: The first fault that it found.
@@ -94,14 +94,14 @@ class Trial:
         mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
         iterations: Iterations of the planner; ``None`` for a policy that executes no plan.
-        status: How its solve ended, see :class:`d4orm_planners.base.plan.Plan`.
+        status: End of its solve, see :class:`d4orm_planners.base.plan.Plan`.
         wall_time: Seconds spent planning, or choosing actions.
         preparation: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a
             controller; ``None`` in rows that older versions wrote.
         training_time: Seconds of training behind a learned policy, all before it included, where its file tells; else
             ``None``.
         elapsed: Seconds that the trial took, with the environment and the judge.
-        history: When in the solve the best plan so far changed, as JSON: a list of
+        history: Times in the solve at which the best plan so far changed, as JSON: a list of
             ``[seconds, solved (0 or 1), mean reward, denoising steps]``, the last not in rows that older versions
             wrote; empty for a policy that executes no plan. See :attr:`progress`.
         messages: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others.

@@ -19,10 +19,10 @@ class TrialGroup(NamedTuple):
     """Trials of one policy, one per seed, that have all but their seeds in common.
 
     Attributes:
-        label: What the policy with its settings is called.
+        label: Name of the policy with its settings.
         trials: At least one.
-        disturbance: What else goes wrong, such as ``"push.speed"``; empty for nothing.
-        level: How much of it.
+        disturbance: Further disturbance, such as ``"push.speed"``; empty for nothing.
+        level: Its level.
     """
 
     label: str
@@ -36,15 +36,15 @@ class Compared:
     """Successes of a policy on one scenario, model and team size, at one level of noise.
 
     Attributes:
-        label: What the policy with its settings was called.
+        label: Name of the policy with its settings.
         policy: Registry name.
         scenario: Scenario name.
         num_robots: Team size.
         model: Models of the team.
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbance: What else went wrong, such as ``"push.speed"``; empty for nothing.
-        level: How much of it.
-        physics: What moved the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
+        disturbance: Further disturbance, such as ``"push.speed"``; empty for nothing.
+        level: Its level.
+        physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
         trials: Trials, those with an error included.
         successes: Those that succeeded.
         lower: Lower end of the 95% confidence interval of the success rate (Wilson).
@@ -175,7 +175,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     Unlike the normal approximation it stays inside [0, 1] and says something at 0 and at all successes.
 
     Args:
-        successes: How many succeeded.
+        successes: Number that succeeded.
         trials: Out of how many.
 
     Raises:
@@ -200,7 +200,7 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
 
     Args:
         trials: The trials.
-        label: What to call the policy; by default what the first trial calls it.
+        label: Name of the policy; by default that in the first trial.
     """
     successes = [trial for trial in trials if trial.success]
     travel = mean_interval([trial.travel_time for trial in successes if trial.travel_time is not None])
@@ -267,12 +267,12 @@ class Tolerance:
     """At which level of a disturbance the success of a policy falls below a threshold.
 
     Attributes:
-        label: What the policy with its settings was called.
+        label: Name of the policy with its settings.
         scenario: Scenario name.
         num_robots: Team size.
         model: Models of the team.
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbance: What went wrong, such as ``"push.speed"``.
+        disturbance: Disturbance, such as ``"push.speed"``.
         stands: The last level before that, in the order in which they were given; ``None`` if it fails at the first.
         fails: The first level with a success rate below the threshold; ``None`` if it tolerates all.
         threshold: The threshold.

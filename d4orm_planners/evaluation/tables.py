@@ -32,8 +32,8 @@ def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) 
     """Write ``table.md`` and ``table.csv``, and of the store in the folder ``trials.csv`` and ``trials.parquet``.
 
     Args:
-        folder: Where the store is.
-        rates: What :func:`~d4orm_planners.evaluation.evaluate.evaluate` returned.
+        folder: Folder of the store.
+        rates: Result of :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
 
     Returns:
         The paths; ``trials.parquet`` is not among them, and not written, where pyarrow is not installed.

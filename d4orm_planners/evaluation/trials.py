@@ -39,10 +39,10 @@ class Condition:
 
     Attributes:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbances: What else goes wrong.
-        name: What is varied, such as ``"push.speed"``; empty for nothing.
-        level: How much of it; of disturbances that differ in more than a number, their place among the levels.
-        physics: What moves the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
+        disturbances: Further disturbances.
+        name: Varied quantity, such as ``"push.speed"``; empty for nothing.
+        level: Its level; of disturbances that differ in more than a number, their place among the levels.
+        physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
     """
 
     control_noise_std: float = 0.0
@@ -78,10 +78,10 @@ class Configuration:
     """A policy with its settings.
 
     Attributes:
-        label: What it is called in the results.
+        label: Its name in the results.
         policy: Its name or import path; the label of one that a program gave itself.
         settings: Those that differ from the defaults.
-        given: What :func:`~d4orm_planners.make_policy` takes for it in any process, if not ``policy``.
+        given: Argument of :func:`~d4orm_planners.make_policy` for it in any process, if not ``policy``.
     """
 
     label: str
@@ -124,9 +124,9 @@ class Job:
     Attributes:
         policy: The policy with its settings.
         problem: The problem.
-        scenario: What it is called in the results.
+        scenario: Its name in the results.
         seed: Of the policy and of the noise.
-        conditions: What goes wrong.
+        conditions: Conditions.
     """
 
     policy: Configuration

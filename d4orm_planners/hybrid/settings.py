@@ -18,11 +18,11 @@ class HybridConfig(D4ormDConfig):
     """Settings of the hybrid planner: those of D4orm-D, whose repairs it makes, and of what it does besides.
 
     Attributes:
-        start: What the first iteration does without initial controls: as in D4orm-D, or ``"mapf"``, path finding on a
+        start: First iteration without initial controls: as in D4orm-D, or ``"mapf"``, path finding on a
             roadmap, whose solution becomes better from iteration to iteration (:mod:`d4orm_planners.mapf`). ``"auto"``
             finds paths where obstacles lead somebody far round, or repairs have not helped for some time.
         reroute: Whether robots that fail search for paths among all others' before they are deformed.
-        improver: What makes a solution better: ``"lns"``, large-neighbourhood search of groups of robots for faster
+        improver: Improver of a solution: ``"lns"``, large-neighbourhood search of groups of robots for faster
             paths around all others, or ``"denoising"``, the whole team deformed again.
     """
 
@@ -38,13 +38,13 @@ class RerouteRules:
     """The numbers of the search for ways around others.
 
     Attributes:
-        sweeps: How many times in turn the robots that fail look for a way in an iteration.
+        sweeps: Number of times in turn that robots which fail look for a path in an iteration.
         batch: Robots that look for ways at the same time, not minding each other's: so that all cores have work.
         width: Ways that a search keeps after each block of steps.
-        contact: What being near another robot for a block of steps costs in the first sweep [s]: waiting that long is
+        contact: Cost of being near another robot for a block of steps in the first sweep [s]: waiting that long is
             cheaper.
         contact_growth: Times as much it costs in the next sweep: what cannot be had for little may be had for more.
-        apart: How far apart the ways that are kept must be, in radii of the largest robot, or else twice as much in
+        apart: Least distance between paths that are kept, in radii of the largest robot, or else twice as much in
             speed [1/s].
         earlier: Blocks before a robot's first fault at which its new way begins: from one number to the other, which
             doubles with each sweep.

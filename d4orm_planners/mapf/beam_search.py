@@ -54,9 +54,9 @@ class BeamRules(NamedTuple):
     """Rules by which the beam keeps paths.
 
     Attributes:
-        width: How many.
-        contact: What being near another robot in a block costs [s].
-        apart: How far apart two are, or else twice as much in speed [m, m/s].
+        width: Number of paths.
+        contact: Cost of being near another robot in a block [s].
+        apart: Least distance between two, or else twice as much in speed [m, m/s].
     """
 
     width: int

@@ -90,11 +90,11 @@ def find_ways(
     So do those left over when the search should stop.
 
     Args:
-        team: What all do.
+        team: Plan of all.
         robots: Their numbers.
         blocks: ``(R,)`` the block of steps at whose beginning their new ways begin.
-        manner: What they may do.
-        rules: What ways are kept on the search.
+        manner: Their motion primitives.
+        rules: Rules by which paths are kept.
         limits: ``(R,)`` what a way must cost less than [s]: its time, and what it costs to meet others.
         company: Agents that they mind, or do not mind.
 

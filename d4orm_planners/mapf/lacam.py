@@ -34,7 +34,7 @@ class TeamConfiguration:
 
     Attributes:
         positions: ``(K,)`` nodes.
-        parent: Where it came from; ``None`` for the start.
+        parent: Configuration that it came from; ``None`` for the start.
         moves: ``(M, 2)`` robots and edges in the order of the moves that led here.
         priorities: ``(K,)`` the highest goes first.
         untried: Constraints.

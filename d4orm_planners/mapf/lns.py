@@ -28,16 +28,16 @@ class NeighbourhoodRules:
         groups: Groups of robots that look for ways at the same time, not minding each other: so that all cores have
             work. What one finds is taken over only if it fits what those before it have found.
         size: Robots in a group, at most.
-        give: How much later than before a robot of a group may arrive for the sake of those after it [s].
-        temperature: How much worse the ways of a group may be and still be taken over, on average and at first [s].
+        give: Delay that a robot of a group may accept for the sake of those after it [s].
+        temperature: Worsening at which a group's paths are still accepted, on average and at first [s].
         least_delay: A robot that arrives as soon as alone is chosen as often as one so much later [s].
-        nearness: How much farther away a robot may be and still be chosen for a group, at random, in radii of the
+        nearness: Random distance by which a robot may be farther away and still be chosen for a group, in radii of the
             largest robot.
         angles: By which robots turn off [degrees], all times the same number, ...
         scales: ... which is between these and drawn for every round.
         paces: Shares of their speed with which they head for their goals.
         width: Ways that a search keeps after each block of steps.
-        apart: How far apart the ways that are kept must be, in the same radii, or else twice as much in speed [1/s].
+        apart: Least distance between paths that are kept, in the same radii, or else twice as much in speed [1/s].
         contact: Cost of meeting another robot [s]: too much.
     """
 
@@ -67,7 +67,7 @@ def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float 
     Args:
         team: A team in which none fails; changed.
         seed: Of what is tried.
-        rounds: How often :attr:`NeighbourhoodRules.groups` groups try.
+        rounds: Number of rounds of :attr:`NeighbourhoodRules.groups` groups.
         temperature: See :attr:`NeighbourhoodRules.temperature`; it falls to zero with the rounds.
 
     Returns:

@@ -52,9 +52,9 @@ class RoadmapSolution:
     """The state of the search.
 
     Attributes:
-        roadmap: What ways are found on.
-        replanning: What makes them better.
-        driven: How the team drives on them.
+        roadmap: Roadmap that paths are found on.
+        replanning: Their improver.
+        driven: Rollout of the team on them.
     """
 
     roadmap: Roadmap

@@ -98,9 +98,9 @@ def straighten(
         roadmap: The roadmap.
         bodies: The robots.
         space: The world; ``None`` where there are no obstacles.
-        others: Where they are.
+        others: Their positions.
         k: The robot.
-        reach: What it keeps from obstacles [m].
+        reach: Distance that it keeps from obstacles [m].
         way: ``(n, 3)`` of :func:`find_way`, changed in place.
 
     Returns:
@@ -140,7 +140,7 @@ class Trip(NamedTuple):
     """Motion that a robot is taken to make when its path is planned.
 
     Attributes:
-        stride: How far it drives in a step [m].
+        stride: Distance that it drives in a step [m].
         launch: Steps that it loses whenever it sets out.
         latest: Step by which it must have arrived.
         linger: Steps for which it stays at its goal; negative for ever.
@@ -176,9 +176,9 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
         roadmap: The roadmap.
         cells: Its nodes.
         bodies: The robots.
-        others: Where they are.
+        others: Their positions.
         k: The robot.
-        trip: How it drives.
+        trip: Its motion.
 
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no way.

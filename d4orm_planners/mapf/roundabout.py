@@ -61,7 +61,7 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
 
     Args:
         problem: The team.
-        engine: What moves it.
+        engine: Engine for rollouts.
         side: 1 to pass the middle to the left of it, -1 to the right.
 
     Returns:

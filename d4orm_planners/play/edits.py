@@ -113,7 +113,7 @@ def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> 
     Args:
         problem: The scene.
         kind: ``"circles"``, ``"spheres"``, ``"cylinders"``, ``"boxes"`` or ``"polygons"``.
-        index: Which one of them.
+        index: Number of the one.
         shift: By how much.
     """
     by, d = np.asarray(shift, np.float32), problem.dimension
@@ -135,7 +135,7 @@ def followed(before: Problem, after: Problem, other: Problem, who: str) -> Probl
 
     Args:
         before: This scene.
-        after: What has become of it.
+        after: Its new state.
         other: Another with the same team and world, whose robots are elsewhere.
         who: Its owner, for messages.
     """

@@ -94,8 +94,8 @@ def polylines(
         path: ``(T, K, d)`` positions.
         colors: ``(K, 3)`` up to 255.
         paper: Brightness of what they are drawn on, up to 255.
-        shares: How much of its colour a way has at its beginning and its end; the rest is paper.
-        knots: Which points of its way each robot's line goes through.
+        shares: Share of its colour that a path has at its beginning and its end; the rest is paper.
+        knots: Points of its path that each robot's line goes through.
 
     Returns:
         ``(N, 2, 3)`` ends and their colours.

@@ -49,8 +49,8 @@ class Panel:
 
     Args:
         server: The page.
-        session: What they control.
-        view: What is shown of it.
+        session: Session that they control.
+        view: Its view.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session, view: View) -> None:

@@ -37,12 +37,12 @@ class Playground:
         problem: The scene to begin with.
         policies: Names of what drives, side by side; D4orm-C2F by default.
         seed: Of the policies, of what goes wrong, and of new goals.
-        host: Where to be found; by default on this machine only. Elsewhere the address has a token.
-        port: Where to be found; 0 for any free port.
+        host: Address of the page; by default on this machine only. Elsewhere the address has a token.
+        port: Port of the page; 0 for any free one.
 
     Attributes:
-        address: What to open in a browser.
-        session: What it shows.
+        address: Address to open in a browser.
+        session: Session that it shows.
 
     Raises:
         ValueError: If it cannot be found there, or there is no such policy.
@@ -78,7 +78,7 @@ class Playground:
         """Show the session until Ctrl-C or :meth:`stop`, or for so long.
 
         Raises:
-            BaseException: What ended the session, if anything did.
+            BaseException: The error that ended the session, if any.
         """
         end = None if seconds is None else time.perf_counter() + seconds
         self.session.start()

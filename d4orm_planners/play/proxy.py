@@ -29,13 +29,13 @@ class AuthenticatingProxy:
     in its address and gets it back as a cookie, which the others show.
 
     Args:
-        host: Where to listen.
-        port: Where to listen; 0 for any free port.
+        host: Host to listen on.
+        port: Port to listen on; 0 for any free one.
         target: The port of this machine that is behind it.
 
     Attributes:
-        port: Where it listens.
-        token: What opens it.
+        port: Port that it listens on.
+        token: Token that opens it.
 
     Raises:
         OSError: If it cannot listen there.

@@ -21,7 +21,7 @@ class Status:
         since: ``time.perf_counter()`` when this moment began.
         pace: Seconds from one step to the next at this speed.
         state: ``"running"``, ``"paused"``, ``"planning"`` or ``"arrived"``.
-        message: What went wrong last, for people.
+        message: Last error, for people.
         refused: Counts what was asked for and could not be.
     """
 
@@ -40,7 +40,7 @@ class Frame:
     """A moment of a team that a policy drives.
 
     Attributes:
-        status: How it goes.
+        status: Common status.
         policy: Name of what drives.
         problem: Team and world; its start and goals are those of the last change.
         states: ``(K, n)`` now.

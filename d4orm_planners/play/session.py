@@ -47,7 +47,7 @@ class Session:
         lifelong: Whether robots go on to new goals.
 
     Attributes:
-        failure: What ended the thread, if it was not :meth:`close`.
+        failure: Error that ended the thread, if it was not :meth:`close`.
 
     Raises:
         ValueError: If there is no such policy, or it cannot drive there.
@@ -128,7 +128,7 @@ class Session:
 
         Args:
             edit: The change.
-            lane: Whose robots it goes by, where several drive side by side; all others follow.
+            lane: Number of the team that it goes by, where several drive side by side; all others follow.
         """
 
         def make() -> None:
@@ -149,7 +149,7 @@ class Session:
         The policies are not told, and have to find out.
 
         Args:
-            robot: Which one; ``None`` is the one that is farthest from its goal.
+            robot: Its number; ``None`` is the one that is farthest from its goal.
             velocity: ``(d,)`` [m/s].
             lane: Whose robot has to be under way, and counts as the farthest.
         """

@@ -15,7 +15,7 @@ class Dial(NamedTuple):
     Attributes:
         name: The disturbance and its attribute, as :func:`~d4orm_env.disturbances.disturbance_registry.find_level`
             knows them.
-        label: What the page calls it, with its unit.
+        label: Its name on the page, with its unit.
         low: Least level.
         high: Greatest level.
         step: Between levels.
@@ -53,8 +53,8 @@ class Dials:
     """Sliders that disturb a session from its next step on.
 
     Args:
-        gui: Where they are.
-        session: What they disturb.
+        gui: The page's controls.
+        session: Session that they disturb.
     """
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:

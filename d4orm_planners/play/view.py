@@ -24,7 +24,7 @@ class View:
 
     Args:
         server: The page.
-        session: What is shown, and changed by dragging.
+        session: Session that is shown, and changed by dragging.
 
     Attributes:
         shown: Which of ``"plans"``, ``"guidance"``, ``"trails"``, ``"subgoals"`` and ``"margins"`` are, and whether on

@@ -31,7 +31,7 @@ class EpisodeOptions:
     Attributes:
         seed: Of the policies, of what goes wrong, and of new goals.
         lifelong: Whether robots go on to new goals.
-        disturbances: What goes wrong.
+        disturbances: Disturbances.
     """
 
     seed: int = 0
@@ -43,14 +43,14 @@ class Viewport:
     """A policy that drives a scene.
 
     Args:
-        name: What the policy is called.
-        policy: What drives; others may have used it before.
+        name: Name of the policy.
+        policy: Policy that drives; others may have used it before.
         scene: Team and world; where the robots are is where they start.
-        terms: What holds for all.
-        recording: What to go on recording; a fresh recording by default.
+        terms: Common options of all.
+        recording: Recording to go on with; a fresh one by default.
 
     Attributes:
-        recording: What happened up to now.
+        recording: Recording up to now.
         finished: Whether all robots have arrived.
     """
 

@@ -57,11 +57,11 @@ class LaneView:
 
     Args:
         server: The page.
-        session: What is shown, and changed by dragging.
-        index: Which of those that drive.
-        frame: What it shows at first.
+        session: Session that is shown, and changed by dragging.
+        index: Its number among those that drive.
+        frame: Its first frame.
         place: ``(3,)`` where its origin is on the page [m].
-        shown: What is shown, see :class:`~d4orm_planners.play.view.View`.
+        shown: Layers that are shown, see :class:`~d4orm_planners.play.view.View`.
     """
 
     def __init__(

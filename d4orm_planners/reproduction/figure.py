@@ -90,20 +90,20 @@ class Figure:
     """A figure or table of the paper.
 
     Attributes:
-        name: What to call it on the command line.
-        title: What it shows.
+        name: Its name on the command line.
+        title: Its title.
         source: Its place in the paper.
         sections: Its panels.
-        across: What varies from left to right.
-        metrics: What is tabulated, see :data:`~d4orm_planners.reproduction.numbers.METRICS`.
-        plots: What is drawn, see :data:`~d4orm_planners.reproduction.plots.PLOTS`.
+        across: Attribute that varies from left to right.
+        metrics: Metrics in the tables, see :data:`~d4orm_planners.reproduction.numbers.METRICS`.
+        plots: Plots, see :data:`~d4orm_planners.reproduction.plots.PLOTS`.
         seeds: Trials per policy, problem and level of noise; the paper's number.
         deadlines: Seconds for planning, for tables of success within them.
         paper: The numbers that the paper gives.
         reference: Label of the policy that the others are compared with, trial by trial; ``None`` for no comparison.
-        compared_by: What counts in that beside success.
+        compared_by: Cost in that, beside success.
         timed: Whether seconds of planning are told at all.
-        remarks: What differs from the paper's set-up, one sentence or two each.
+        remarks: Differences from the paper's set-up, one sentence or two each.
     """
 
     name: str
@@ -170,7 +170,7 @@ class Group:
 
     Attributes:
         section: Title of the section.
-        label: What the policy with its settings is called there.
+        label: Name there of the policy with its settings.
         trials: One per seed.
     """
 
@@ -192,7 +192,7 @@ def reproduce(
     Args:
         figure: The figure, or its :meth:`Figure.quick` version.
         out: Folder to keep the trials in; made if it does not exist.
-        seeds: How many, from 0 up; the figure's own number by default.
+        seeds: Number of seeds, from 0 up; the figure's own number by default.
         workers: Processes of one thread each; 1 plans one after another on all cores, as times should be measured.
         progress: Called as ``progress(what, trials done, trials in all)`` for every section.
 

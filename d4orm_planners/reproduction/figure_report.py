@@ -151,9 +151,9 @@ def write_reproduction(
     """Write ``NAME.csv``, ``NAME.md`` and ``NAME.png`` for the figure, and its trials as ``trials.csv`` and as Parquet.
 
     Args:
-        folder: Where to.
+        folder: Output folder.
         figure: The figure.
-        groups: What :func:`~d4orm_planners.reproduction.figure.reproduce` returned for it.
+        groups: Result of :func:`~d4orm_planners.reproduction.figure.reproduce` for it.
         trials: Whether to write those too; ``trials.parquet`` only where pyarrow is installed.
 
     Returns:

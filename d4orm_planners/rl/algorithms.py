@@ -49,8 +49,8 @@ class Algorithm:
         """A new model, whose first weights are drawn from the global random state.
 
         Args:
-            env: What it learns from.
-            sets: What it sees, for a network that pools neighbours and obstacles; ``None`` makes a flat one.
+            env: Environment that it learns from.
+            sets: Its features, for a network that pools neighbours and obstacles; ``None`` makes a flat one.
             tuned: Those of :attr:`tunable` that are otherwise.
         """
         raise NotImplementedError

@@ -103,7 +103,7 @@ class Checkpoint:
     """A training after some lessons.
 
     Attributes:
-        folder: Where it is.
+        folder: Its folder.
         evaluations: One per lesson so far.
     """
 

@@ -41,7 +41,7 @@ def clone(
         env: Normalises its observations.
         inputs: ``(N, F)`` features.
         targets: ``(N, m)`` the expert's actions in ``[-1, 1]``.
-        epochs: How often each sample is looked at.
+        epochs: Number of times that each sample is looked at.
         random: In which order.
         report: Called with the number of epochs done.
     """

@@ -42,7 +42,7 @@ def make_lessons(num_robots: int, scenario: str, steps: int, unit: int, count: i
 
     Args:
         num_robots: Size of the full team.
-        scenario: What is to be learned.
+        scenario: Scenario to learn.
         steps: Robot-steps in all, rounded up to whole units.
         unit: Robot-steps that are taken between two updates.
         count: Lessons at most.

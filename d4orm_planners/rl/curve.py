@@ -36,7 +36,7 @@ class Evaluation:
         scenario: Scenario trained last.
         success_rate: Share of the validation episodes in which all arrived and none ever touched anything.
         travel_time: Their mean arrival time [s], with the whole episode for robots that did not arrive.
-        seconds: What the lesson took.
+        seconds: Time that the stage took.
         env_share: Share of it that went into the environments, instances that are drawn included; in an imitation, into
             recording.
         imitation_error: Root mean square of the actions less those of the expert, in units of the limits, in episodes

@@ -42,7 +42,7 @@ class Features:
     functions of the gap.
 
     Attributes:
-        slices: Where the parts of an observation lie.
+        slices: Slices of an observation.
         turned: Whether controls are vectors of the world.
         frame: ``"goal"`` or ``"heading"``: where the first axis of a robot's frame points.
     """

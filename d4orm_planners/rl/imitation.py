@@ -99,7 +99,7 @@ def imitate(
         settings: Settings of the imitation.
         out: Folder to write to, and to go on from.
         progress: Called as ``progress(what, episodes and epochs done, in all)``.
-        command: How the training was called, for the policy file.
+        command: Command of the training, for the policy file.
 
     Raises:
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.

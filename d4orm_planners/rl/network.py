@@ -46,7 +46,7 @@ class Header(BaseModel):
         layers: Number of layers; those of sets come before them and are not counted.
         encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.set_network`. Such
             a policy acts for any number of observed robots.
-        frame: Where the first axis of a robot's frame points; ``None`` is to the goal.
+        frame: Direction of the first axis of a robot's frame; ``None`` is to the goal.
         ways: Whether it heads along the shortest free ways, see :meth:`Features.along`; ``None`` is straight.
         training: The command and its settings, for people, and the ``training_time`` [s].
     """
@@ -78,7 +78,7 @@ class Network:
     """A policy that needs nothing but NumPy.
 
     Attributes:
-        header: What it is.
+        header: Its header.
         arrays: ``weight_i`` ``(out, in)`` and ``bias_i`` ``(out,)`` of each layer, and the normalisation:
             ``observation_mean`` and ``observation_variance`` ``(F,)``, and ``reward_variance`` ``()``, which only
             further training needs. With sets, the arrays of those, and no normalisation of observations.

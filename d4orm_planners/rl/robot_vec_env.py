@@ -38,7 +38,7 @@ class RobotVecEnv(VecEnv):
         scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like ``**kwargs``. One model for all robots.
         seed: Of the first world.
         reward: The reward to learn from, as in :class:`~d4orm_env.envs.options.EnvOptions`.
-        sight: How many of the observed robots are shown at most, the others being marked absent; ``None`` is all. Or
+        sight: Number of observed robots shown at most, the others being marked absent; ``None`` is all. Or
             that of each world.
         ways: Whether robots see their goals along their shortest free ways, see :meth:`Features.along`, and are paid
             for the way made along those.

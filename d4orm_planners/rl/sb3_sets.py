@@ -40,7 +40,7 @@ class SetExtractor(BaseFeaturesExtractor):
 
     Args:
         observation_space: Of features ``(F,)``.
-        features: What they are.
+        features: Their layout.
     """
 
     def __init__(self, observation_space: Box, features: Features) -> None:

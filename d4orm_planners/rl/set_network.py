@@ -24,7 +24,7 @@ def array_shapes(features: Features, arrays: Mapping[str, FloatArray]) -> dict[s
     """Shapes of the arrays that the sets of a network are made of; hidden widths are those of ``arrays``.
 
     Args:
-        features: What the network sees.
+        features: Features of the network.
         arrays: Those of a file, which may be anything.
     """
     shapes: dict[str, tuple[int | None, ...]] = {}

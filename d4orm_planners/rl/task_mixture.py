@@ -106,7 +106,7 @@ class TrainTask:
         scenario: Name, file or import path.
         num_robots: Size of its teams.
         settings: Arguments of the scenario.
-        sight: How many of the observed robots are shown at most; ``None`` is all.
+        sight: Number of observed robots shown at most; ``None`` is all.
         disturbances: Levels by name, see :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`.
     """
 
@@ -222,7 +222,7 @@ def gather_parts(exercises: Sequence[TrainTask], counts: Sequence[int]) -> list[
 
     Args:
         exercises: Parts of a mixture.
-        counts: How many worlds each has.
+        counts: Number of worlds of each.
     """
     gathered: list[tuple[TrainTask, list[int | None]]] = []
     for exercise, count in zip(exercises, counts, strict=True):
@@ -242,7 +242,7 @@ class MixedVecEnv(VecEnv):
 
     Attributes:
         parts: Them.
-        acted: Which robots acted in the last step.
+        acted: Robots that acted in the last step.
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step, worlds counted through.
         seconds: Time spent in the environments so far.
 

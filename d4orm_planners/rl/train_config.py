@@ -27,7 +27,7 @@ class TrainConfig(CheckedSettings):
     """Common settings of all trainings.
 
     Attributes:
-        scenario: What is to be learned. Instances of ``random`` are practised along with any other scenario.
+        scenario: Scenario to learn. Instances of ``random`` are practised along with any other scenario.
         num_robots: Size of the full team.
         seed: Of everything that is drawn.
         model: Robot model; ``None`` is the scenario's own.

@@ -149,7 +149,7 @@ class TrainingSettings(TrainConfig):
         """Worlds for a lesson.
 
         Args:
-            lesson: What is practised.
+            lesson: Stage of the training.
             number: Of the lesson.
             done: Robot-steps in the lessons before.
             drawn: Instances of earlier lessons, from which those that are used again are taken; others are left out,
@@ -194,7 +194,7 @@ class TrainingResult:
     Attributes:
         network: The policy with the best validation.
         curve: One evaluation per lesson.
-        policy_path: Where the policy is.
+        policy_path: Path of the policy.
     """
 
     network: Network
@@ -212,10 +212,10 @@ def train(
     ``tensorboard/``, logs.
 
     Args:
-        settings: What to train on.
+        settings: Settings of the training.
         out: Folder to write to, and to go on from.
         progress: Called as ``progress(what, steps done, steps in all)``.
-        command: How the training was called, for the policy file.
+        command: Command of the training, for the policy file.
 
     Raises:
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.

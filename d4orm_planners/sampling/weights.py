@@ -60,7 +60,7 @@ class GroupWeights:
     """Weights of each robot's part of a sample by what the robot's group gained by it.
 
     Attributes:
-        rule: What makes weights of rewards.
+        rule: Function that makes weights of rewards.
         groups: Disjoint groups of robots, all robots together.
     """
 

@@ -100,7 +100,7 @@ def direct(
         paces: ``(T,)`` how fast each point may be passed [m/s].
         sights: ``(K,)`` how far ahead robots look at least [m].
         dt: Time step [s].
-        beyond: How far robots may plan to drive beyond their goals, which stop them [m].
+        beyond: Distance beyond their goals that robots may plan to drive, if these stop them [m].
         size: The radius of the largest robot [m].
         positions: ``(K, 3)`` float64 where they are [m].
         standing: ``(K,)`` bool: docked, and so at the end of its route.
@@ -137,8 +137,8 @@ def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: f
         arcs: ``(P,)`` length of the route up to each [m].
         dt: Time step, in which a robot should not drive past a corner [s].
         corner: ``(P,)`` how fast each could be by itself [m/s].
-        speed: How fast the robot can be [m/s].
-        braking: How fast it brakes [m/s^2].
+        speed: Largest speed of the robot [m/s].
+        braking: Its deceleration [m/s^2].
         paces: ``(P,)`` output.
     """
     after = before = speed

@@ -99,11 +99,11 @@ def point_ahead(
 
     Args:
         route: Its points, their arcs and bends.
-        paces: How fast each may be passed [m/s].
-        at: Where it is.
+        paces: Speed at which each may be passed [m/s].
+        at: The point that it is at.
         last: The last point that it may head for.
         stop: Length of the route from which on it heads for no further point [m].
-        sight: How far it looks at least [m], and the time step [s].
+        sight: Its least look-ahead [m], and the time step [s].
         place: ``(3,)`` where it really is [m].
         size: The radius of the largest robot [m].
     """

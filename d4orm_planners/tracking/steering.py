@@ -23,7 +23,7 @@ def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> Fl
     """``(K, m)`` controls inside each robot's limits.
 
     Args:
-        problem: Whose robots they are.
+        problem: Problem of the robots.
         states: ``(K, n)``.
         goals: ``(K, d)`` [m].
     """
@@ -34,7 +34,7 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
     """``(K, d)`` velocities straight to the goals, from which every robot can still stop there [m/s].
 
     Args:
-        problem: Whose robots they are.
+        problem: Problem of the robots.
         states: ``(K, n)``.
         goals: ``(K, d)`` [m].
     """
@@ -83,7 +83,7 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     """``(K, m)`` controls inside each robot's limits that bring the team to these velocities as soon as they allow.
 
     Args:
-        problem: Whose robots they are.
+        problem: Problem of the robots.
         states: ``(K, n)``.
         velocities: ``(K, d)`` wanted [m/s].
     """
@@ -103,7 +103,7 @@ def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:
     """Return controls ``(K, m)`` that a step executes as they are: inside each robot's own limits, zero on padding.
 
     Args:
-        problem: Whose robots they are.
+        problem: Problem of the robots.
         controls: ``(K, m)`` float32, finite.
     """
     limited = np.zeros_like(controls)
@@ -121,7 +121,7 @@ def present_velocities(problem: Problem, states: FloatArray, controls: FloatArra
     """``(K, d)`` velocities [m/s]; that of a first-order robot is its last command.
 
     Args:
-        problem: Whose robots they are.
+        problem: Problem of the robots.
         states: ``(K, n)``.
         controls: ``(K, m)`` executed last.
     """

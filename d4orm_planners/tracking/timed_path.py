@@ -37,8 +37,8 @@ class Timed(NamedTuple):
         corners: ``(C,)`` float64 length of the route up to each corner [m].
         departs: ``(C,)`` float64 step at which it may set out for each corner from the one before.
         arrives: ``(C,)`` float64 step at which it should be there.
-        sight: How far ahead the robot looks at least [m].
-        beyond: How far it may plan to drive beyond its goal, which stops it [m].
+        sight: Least look-ahead of the robot [m].
+        beyond: Distance beyond its goal that it may plan to drive, if that stops it [m].
         size: The radius of the largest robot [m].
     """
 

@@ -40,8 +40,8 @@ class Course:
         controls: ``(T, K, m)``.
         states: ``(T+1, K, n)``.
         goals: ``(K, d)`` that it was made for.
-        digest: What names it.
-        reward: What the planner makes of it.
+        digest: Its digest.
+        reward: Its reward by the planner.
     """
 
     begin: int

@@ -21,8 +21,8 @@ class RobotProcesses:
     """A process for every robot, which ends with the block at the latest.
 
     Args:
-        mission: What they have to know.
-        folder: Where they write what happens.
+        mission: Their settings.
+        folder: Folder of their logs.
     """
 
     def __init__(self, mission: Mission, folder: Path) -> None:

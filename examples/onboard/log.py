@@ -22,7 +22,7 @@ class Log:
 
     Args:
         path: The file.
-        robot: Whose it is.
+        robot: Its owner.
 
     Attributes:
         tick: The present tick.

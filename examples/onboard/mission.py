@@ -25,7 +25,7 @@ class Mission:
     """The settings of one run.
 
     Attributes:
-        robots: How many.
+        robots: Number of robots.
         seed: Of starts, goals and planning.
         side: Side of the square that they drive in [m].
         horizon: Steps of a plan.

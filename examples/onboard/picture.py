@@ -24,8 +24,8 @@ def draw(rows: Sequence[Row], num_robots: int, seconds: float) -> Any:
 
     Args:
         rows: The timeline.
-        num_robots: How many robots.
-        seconds: What of the run is shown below.
+        num_robots: Number of robots.
+        seconds: Part of the run that is shown below.
     """
     figure, (above, below) = plt.subplots(
         2, 1, figsize=(9.5, 2.4 + 0.75 * num_robots), layout="constrained", height_ratios=(1.25, 1)

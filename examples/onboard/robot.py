@@ -35,8 +35,8 @@ class Robot:
     Args:
         mission: The settings.
         number: Its number, from 0.
-        team: Where it exchanges candidates.
-        log: Where it writes what happens.
+        team: Network for candidates.
+        log: Its log.
     """
 
     def __init__(self, mission: Mission, number: int, team: Transport, log: Log) -> None:

@@ -54,11 +54,11 @@ class Round:
     """Planning from where the team will be when the plan takes over.
 
     Args:
-        agenda: What to plan.
+        agenda: Task of the round.
         mission: The settings.
-        robot: Whose node it is.
-        engine: What rolls out and samples.
-        team: Where candidates are exchanged.
+        robot: Owner of the node.
+        engine: Engine for rollouts and samples.
+        team: Network for candidates.
         observer: Called with what the node does, and the digest of the plan that it is about.
     """
 

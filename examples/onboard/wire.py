@@ -18,8 +18,8 @@ class Tick:
         number: Ticks since the start; -1 for the last message, which ends the run.
         state: The joint state, see :mod:`d4orm_env.envs.joint_state`.
         lost: Robots that have been given up; they stand where they stopped.
-        ballots: What each robot announced last as the plan of its choice, ``""`` for none.
-        rewards: What each of those is worth.
+        ballots: Plan that each robot announced last as its choice, ``""`` for none.
+        rewards: Rewards of those.
     """
 
     number: int
@@ -35,10 +35,10 @@ class Command:
 
     Attributes:
         number: The tick.
-        robot: Who.
+        robot: Its number.
         control: ``(m,)``.
         ballot: Digest of the plan that it would take over next, ``""`` for none.
-        reward: What that is worth.
+        reward: Its reward.
         executing: Digest of the plan that it executes.
     """
 

@@ -33,9 +33,9 @@ class Record:
         joints: The joint states, one more than steps.
         reached: ``(K,)`` who reached a goal, per step.
         collided: ``(K,)`` who touched something, per step.
-        executing: What the robots said they execute, per step.
-        lost: Who had been given up, per step.
-        began: When each tick began, by :func:`time.perf_counter` [s].
+        executing: Plans that the robots said they execute, per step.
+        lost: Robots that had been given up, per step.
+        began: Time at which each tick began, by :func:`time.perf_counter` [s].
         answered: Seconds until all had answered, per step.
     """
 
@@ -72,7 +72,7 @@ class World:
     Args:
         mission: The settings.
         robots: The network.
-        ticks: How many at most.
+        ticks: Most ticks.
         speed: Simulated seconds per second at most.
     """
 

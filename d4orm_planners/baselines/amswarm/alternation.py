@@ -106,7 +106,7 @@ def alternate(
         robot: Its number among them.
         limits: ``(2,)`` of speed and acceleration [m/s, m/s^2], infinite where there is none.
         goal: ``(d,)`` [m].
-        fixed: How many of the first coefficients are given.
+        fixed: Number of first coefficients that are given.
         motion: ``(n+1, d)`` coefficients; the given ones are read and the others written.
         guess: :class:`Guess` to begin with, and the motion's samples in the end.
 

@@ -33,7 +33,7 @@ class AMSwarmConfig(PlannerConfig):
         barrier: Share of its distance to a body's reach that a robot may use up in a step; 1 allows all of it.
         lookout: Bodies are minded that are predicted to come this near to the reach; ``None`` minds all.
         clearance: Added to every distance to keep, for what is driven between the steps.
-        perturbation: What every guess is moved by at most, so that symmetric teams do not block themselves.
+        perturbation: Largest perturbation of every guess, so that symmetric teams do not block themselves.
         penalty: First weight of the constraints.
         growth: Factor by which it grows from one alternation to the next.
         alternations: Of a replanning, at most.

@@ -93,7 +93,7 @@ class Tree:
         frames: Of the robots.
         space: The world.
         nodes: That are not expanded yet, best first.
-        made: How many nodes there have been.
+        made: Number of nodes made so far.
     """
 
     frames: tuple[WayFrame, ...]
@@ -115,7 +115,7 @@ class Planning:
     Args:
         problem: The team.
         config: The method's settings.
-        denoiser: What denoises motions.
+        denoiser: Denoiser of motions.
         frames: Of the robots.
         space: The world.
 

@@ -82,9 +82,9 @@ def guide(
         frame: The robot's :class:`~d4orm_planners.baselines.mmd.way_frame.WayFrame`.
         sines: ``(N + 1, M)`` of :func:`~d4orm_planners.baselines.mmd.way_frame.sine_table`.
         deviation: ``(2 M,)`` of the modes.
-        surroundings: What is to be minded.
+        surroundings: Constraints on the motion.
         durations: ``(B,)`` of the motions [s].
-        steps: How often to go along each motion.
+        steps: Number of times to go along each motion.
         motions: ``(B, 2 M)`` float32 whitened modes, changed in place.
     """
     last, modes = sines.shape[0] - 1, sines.shape[1]

@@ -61,7 +61,7 @@ def train(
     """Fit the network to the examples by Adam; the weights are the average of the training's last half.
 
     Args:
-        examples: What to learn from.
+        examples: Training set.
         steps: Minibatches of 256.
         seed: Of weights, minibatches and noise.
         width: Of the layers.

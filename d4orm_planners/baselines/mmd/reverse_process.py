@@ -36,7 +36,7 @@ class Batch:
     Attributes:
         motions: ``(B, SIZE)`` float32 whitened modes.
         durations: ``(B,)`` how long each takes [s].
-        driven: What comes of driving along them.
+        driven: Rollouts along them.
         steps: Denoising steps that it took.
     """
 
@@ -70,7 +70,7 @@ class Denoiser:
         Args:
             robot: Its number.
             frame: Its way.
-            surroundings: What to mind.
+            surroundings: Constraints on the motion.
             seed: Of the noise and the durations.
             before: ``(B, SIZE)`` motions to begin with, which get the noise of the last ``reuse_steps`` again; noise by
                 default.

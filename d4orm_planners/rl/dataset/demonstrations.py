@@ -32,13 +32,13 @@ class Demonstrations:
     """Episodes of a policy to be recorded.
 
     Attributes:
-        policy: What acts, as for :func:`~d4orm_planners.make_policy`.
+        policy: The policy, as for :func:`~d4orm_planners.make_policy`.
         settings: Of the policy, ``time_limit`` and ``preset`` of a planner among them.
         environment: Arguments of :class:`~d4orm_env.navigation_v0.parallel_env`, as ``{"scenario": "random",
             "num_robots": 8}``.
         seeds: One episode each: the environment is reset with the seed, which draws the instance where the scenario
             draws, and so is the policy.
-        agents: Whose an episode of the dataset is: ``"team"``, with the spaces of the joint environment, or
+        agents: Owner of an episode of the dataset: ``"team"``, with the spaces of the joint environment, or
             ``"robot"``, one for each robot with its own.
         only_success: Leave out episodes in which a robot touches anything or does not arrive.
 

@@ -32,11 +32,11 @@ class DatasetFiles:
     """The files of a dataset.
 
     Attributes:
-        folder: What Minari opens, ``.../data``.
+        folder: Folder that Minari opens, ``.../data``.
         observation_space: Of the dataset.
         action_space: Likewise.
         env_spec: From which Minari makes the environment again, if it can.
-        agents: Whose an episode is, ``"team"`` or ``"robot"``.
+        agents: Owner of an episode, ``"team"`` or ``"robot"``.
     """
 
     folder: Path

@@ -110,7 +110,7 @@ def record_episode(env: ParallelEnv, policy: Policy, seed: int = 0) -> RecordedE
 
     Args:
         env: A :mod:`d4orm_env.navigation_v0` parallel environment, not wrapped.
-        policy: What acts.
+        policy: The policy.
         seed: Seeds both.
 
     Returns:

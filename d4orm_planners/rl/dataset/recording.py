@@ -25,7 +25,7 @@ class Recording:
     """Episodes in a folder, a file each, from when they end until they are in a dataset.
 
     Attributes:
-        folder: Where.
+        folder: Their folder.
     """
 
     folder: Path
@@ -103,9 +103,9 @@ def record_all(
     """Record episodes of these seeds, and yield each seed when its episode is on disk.
 
     Args:
-        demonstrations: What to record.
-        recording: Where to.
-        seeds: Which.
+        demonstrations: Demonstrations to record.
+        recording: Folder of the recording.
+        seeds: Seeds of the episodes.
         workers: Processes of one thread each; by default as many as there are cores; with 1 this process on all cores.
 
     Raises:

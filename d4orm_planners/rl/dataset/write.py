@@ -43,7 +43,7 @@ def write_dataset(
     ends with the dataset that it would have ended with. One with more seeds adds them.
 
     Args:
-        demonstrations: What to record.
+        demonstrations: Demonstrations to record.
         out: Folder of the dataset; by default the one where :func:`minari.load_dataset` finds its name.
         dataset_id: Its name in Minari, as ``"d4orm/mine-v0"``; made of scenario, team size and policy by default.
         shard_size: Seeds whose episodes go into one file.
