@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from d4orm_planners.base.controller import Controller
     from d4orm_planners.base.episode import Episode, run_episode
     from d4orm_planners.base.names import register_planner, register_policy
     from d4orm_planners.base.plan import IterationRecord, Plan, load_plan
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from d4orm_planners.evaluation.evaluate import evaluate
 
 __all__ = [
+    "Controller",
     "Episode",
     "Iteration",
     "IterationRecord",
@@ -37,6 +39,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "base.controller": ("Controller",),
     "base.episode": ("Episode", "run_episode"),
     "evaluation.evaluate": ("evaluate",),
     "base.names": ("register_planner", "register_policy"),

@@ -1,0 +1,263 @@
+"""A policy in a robot team's own control loop: measured states in, setpoints out, no environment needed."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as AnswerLate
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env import navigation_v0
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, shown
+from d4orm_env.core.portable import NUMPY_OPS
+from d4orm_env.core.problem import Problem
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.disturbance_observer import DisturbanceObserver
+from d4orm_planners.base.planner_registry import PolicyLike, make_policy
+from d4orm_planners.base.policy import Actions, Policy
+from d4orm_planners.tracking.steering import by_model, track_velocities
+
+Mode = Literal["nominal", "measured"]
+
+FEEDBACK = 0.25
+"""Share of a distance from the reference that controls are to make up for within a step."""
+SAME_PERIOD = 0.5
+"""Share of a period within which another call gets the same setpoint."""
+
+
+@dataclass(frozen=True, eq=False)
+class ControlSetpoint:
+    """What the team is to do until the next step.
+
+    Attributes:
+        position: ``(K, d)`` where robots are to be at the end of the period [m].
+        velocity: ``(K, d)`` their velocity then [m/s].
+        acceleration: ``(K, d)`` on the way there [m/s^2].
+        heading: ``(K,)`` heading at the end of the period [rad]; zero for robots whose model has none.
+        control: ``(K, m)`` controls of the robots' models, within each robot's limits.
+        arrived: ``(K,)`` bool: it stays at its goal from now on.
+        held: True if the policy did not answer in time: robots brake.
+    """
+
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    heading: Floats
+    control: FloatArray
+    arrived: BoolArray
+    held: bool
+
+
+class Controller:
+    """A policy as a controller of real or simulated robots.
+
+    It keeps a model of the team, the reference, which is stepped as the environment would be. Robots that have reached
+    their goals stay there for good, and their controls bring them back if they are measured elsewhere.
+
+    In mode ``"nominal"`` the policy sees the reference, and robots follow it: by their own trackers, which are given
+    position, velocity and acceleration, or by the controls, which have a feedback on what was measured. In mode
+    ``"measured"`` the policy sees what was measured. In both, controls make up for what pushes a robot all the time, as
+    a thrust that is too weak does (:mod:`d4orm_planners.base.disturbance_observer`).
+
+    What is not a number in measured states is missing, and the reference takes its place. Speeds and coordinates beyond
+    what a robot's model allows count as the limit. A step that comes too late delays the reference; it never leaps.
+
+    Args:
+        policy: Anything that :func:`~d4orm_planners.make_policy` takes.
+        mode: ``"nominal"`` or ``"measured"``.
+        reserve: Share of the robots' limits on speed, acceleration and turn rate that the reference leaves to the
+            feedback in mode ``"nominal"``.
+        timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
+            meanwhile, and its answer, which would be too late, is not used. ``None`` waits.
+        lag: Time constant of the robots' actuators [s], one or one per robot, which the estimate of that allows for.
+        **settings: Of the policy.
+
+    Raises:
+        ValueError: For a bad argument, or if there is no such policy.
+    """
+
+    def __init__(
+        self,
+        policy: PolicyLike = "d4orm-c2f",
+        *,
+        mode: Mode = "nominal",
+        reserve: float = 0.2,
+        timeout: float | None = None,
+        lag: ArrayLike = 0.0,
+        **settings: Any,
+    ) -> None:
+        if mode not in get_args(Mode):
+            raise ValueError(f"mode is {shown(mode)}; choose one of {', '.join(get_args(Mode))}")
+        self.mode = mode
+        self.reserve = positive_number(reserve, "reserve", zero_allowed=True, most=0.9)
+        self.timeout = None if timeout is None else positive_number(timeout, "timeout")
+        self.policy: Policy = make_policy(policy, **settings)
+        self._lag = lag
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="controller")
+        self._late: Future[Actions] | None = None
+        self._env: Any = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the policy's thread as soon as it has answered."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+    def begin(self, problem: Problem, states: ArrayLike, time: float = 0.0, seed: int = 0) -> None:
+        """Take over a team; policies that plan do so now, however long it takes.
+
+        Args:
+            problem: The team, its goals and its world.
+            states: ``(K, n)`` measured states; where they are missing, those of ``problem.start``.
+            time: Of the measurement [s], by any clock that goes on.
+            seed: Seeds whatever the policy draws.
+
+        Raises:
+            ValueError: If the states have another shape, or the lag fits no team of this size.
+        """
+        self._wait_for_late(None)
+        self._observer, self._robots = DisturbanceObserver(problem, self._lag), problem
+        self._open(problem, seed)
+        space, shape = self._env.state_space, problem.start.shape
+        self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
+        start, _ = self._plausible(states)
+        left = 1 - (self.reserve if self.mode == "nominal" else 0.0)
+        team = problem.team
+        limits = {name: left * getattr(team, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
+        self._open(problem.resumed_at(start, problem.goal, team=team.replace(**limits)), seed)
+        self.policy.reset(self._env, seed=seed)
+        self._time = float(time) - problem.dt
+        self._setpoint = self._described(self._joint, self._joint.controls, held=False)
+
+    def step(self, states: ArrayLike, time: float) -> ControlSetpoint:
+        """Return the setpoint for the period that begins now.
+
+        Called more often than once every ``problem.dt`` it returns the same one again.
+
+        Args:
+            states: ``(K, n)`` measured states; NaN where there is none.
+            time: Of the measurement [s].
+
+        Raises:
+            RuntimeError: Before :meth:`begin`.
+            ValueError: If the states have another shape, or the time is before that of the last step.
+        """
+        if self._env is None:
+            raise RuntimeError("the controller has no team yet; call begin(problem, states) before step()")
+        passed = (time - self._time) / self.problem.dt
+        if not passed > -SAME_PERIOD:
+            raise ValueError(f"time is {time!r} s, before the last step; give times of one clock, in seconds")
+        measured, known = self._plausible(states)
+        if passed >= SAME_PERIOD:
+            self._time = time
+            self._setpoint = self._advance(measured, known)
+        return self._setpoint
+
+    @property
+    def arrived(self) -> BoolArray:
+        """``(K,)`` bool: robots that have reached their goals."""
+        return self._joint.arrived
+
+    @property
+    def over(self) -> bool:
+        """True if all robots have arrived, or the problem's horizon is over; robots are then held at rest."""
+        return not self._env.agents
+
+    @property
+    def _joint(self) -> JointState:
+        return split_state(self.problem, self._env.state())
+
+    def _open(self, problem: Problem, seed: int) -> None:
+        self.problem = problem
+        self._env = navigation_v0.parallel_env(problem=problem)
+        self._observations, _ = self._env.reset(seed=seed)
+
+    def _plausible(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
+        """``(K, n)`` states that the reference can be in, measured ones where they are known, and ``(K,)`` where."""
+        joint = self._joint
+        reference, measured = joint.states, as_float32(states)
+        if measured.shape != reference.shape:
+            raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
+        known: BoolArray = np.all(np.isfinite(measured), axis=1)
+        plausible = np.clip(np.where(known[:, None], measured, reference), *self._bounds)
+        for model, robots in by_model(self._robots):
+            x, limits = (tuple(rows[robots].T) for rows in (plausible, self._robots.team.limits))
+            limited = model.functions.limit_state(x[: model.state_size], limits, NUMPY_OPS)
+            plausible[robots, : model.state_size] = np.stack(np.broadcast_arrays(*limited), axis=1)
+        return plausible, known
+
+    def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
+        parked = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
+        if self.mode == "measured" and not self.over:
+            self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, measured))
+        self._observer.observe(measured, known)
+        before, actions = self._joint, self._actions()
+        brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
+        controls, held = brakes, not self.over and actions is None
+        if not self.over:
+            if actions is None:
+                actions = dict(zip(self._env.possible_agents, brakes))
+            self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
+            controls = self._joint.controls
+        follows = known & parked if self.mode == "measured" else known
+        controls = self._observer.compensated(self._with_feedback(measured, follows, controls), self.arrived)
+        return self._described(before, controls, held)
+
+    def _actions(self) -> Actions | None:
+        """Return the policy's actions; ``None`` if they do not come in time, or no longer."""
+        if self.over or not self._wait_for_late(0.0):
+            return None
+        acting = {agent: self._observations[agent] for agent in self._env.agents}
+        answer = self._executor.submit(self.policy.act, acting, self._env.state())
+        try:
+            return answer.result(self.timeout)
+        except AnswerLate:
+            self._late = answer
+            return None
+
+    def _wait_for_late(self, seconds: float | None) -> bool:
+        """Wait for an answer that is overdue and of no use any more, and return whether none is."""
+        if self._late is not None:
+            try:
+                self._late.result(seconds)
+            except AnswerLate:
+                return False
+            self._late = None
+        return True
+
+    def _with_feedback(self, measured: FloatArray, follows: BoolArray, controls: FloatArray) -> FloatArray:
+        """``(K, m)`` controls that bring those robots from where they were measured to the reference."""
+        joint, d = self._joint, self.problem.dimension
+        error = self._setpoint.position - measured[:, :d]
+        wanted = self._velocities(joint) + FEEDBACK / self.problem.dt * error
+        followed = track_velocities(self._robots, measured, wanted.astype(np.float32))
+        off = np.linalg.norm(error, axis=1) > self.problem.rounding
+        return np.where((follows & off)[:, None], followed, controls)
+
+    def _velocities(self, joint: JointState) -> Floats:
+        """``(K, d)`` velocities; of first-order models those that were commanded."""
+        velocities = np.zeros((self.problem.num_robots, self.problem.dimension))
+        for model, robots in by_model(self.problem):
+            rows = (joint.states, joint.controls, self.problem.team.limits)
+            x, u, limits = (tuple(row[robots].T) for row in rows)
+            parts = model.functions.velocity(x, u, limits, NUMPY_OPS)
+            velocities[robots] = np.stack(np.broadcast_arrays(*parts), axis=1)
+        return velocities
+
+    def _described(self, before: JointState, controls: FloatArray, held: bool) -> ControlSetpoint:
+        joint = self._joint
+        heading = np.zeros(self.problem.num_robots)
+        for model, robots in by_model(self.problem):
+            if model.heading_index is not None:
+                heading[robots] = joint.states[robots, model.heading_index]
+        velocity = self._velocities(joint)
+        acceleration = (velocity - self._velocities(before)) / self.problem.dt
+        position = joint.states[:, : self.problem.dimension].astype(np.float64)
+        return ControlSetpoint(position, velocity, acceleration, heading, controls.copy(), joint.arrived.copy(), held)

@@ -1,0 +1,78 @@
+"""An estimate of what pushes robots all the time: a thrust that is too weak, a slope, a steady wind."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.core.problem import Problem
+from d4orm_planners.tracking.steering import limit_controls
+
+GAIN = 0.1
+"""Share of what is left unexplained in a step that goes into the estimate."""
+MOST = 0.5
+"""Largest estimate, as a share of the control's limit: the rest is needed to steer."""
+
+
+class DisturbanceObserver:
+    """The part of each robot's motion that its controls do not explain, for models whose controls are derivatives.
+
+    ``y(t+1) = y(t) + dt (u(t) + bias)``, where ``y`` is the velocity of double integrators and the position of
+    first-order ones, and ``u`` follows the control with a first-order lag.
+
+    Args:
+        problem: The team.
+        lag: Time constant of the actuators [s], one or ``K``.
+
+    Attributes:
+        bias: ``(K, d)`` the estimate, in units of the controls; zero for other models.
+
+    Raises:
+        ValueError: If the lag is negative, or neither one number nor one per robot.
+    """
+
+    def __init__(self, problem: Problem, lag: ArrayLike = 0.0) -> None:
+        self.problem, count, d = problem, problem.num_robots, problem.dimension
+        try:
+            constants: Floats = np.broadcast_to(np.asarray(lag, np.float64), (count,))
+        except (TypeError, ValueError):
+            raise ValueError(f"lag must be one number or one per robot ({count}), not {lag!r}") from None
+        if not (np.isfinite(constants) & (constants >= 0)).all():
+            raise ValueError(f"lag is {lag!r}; it must not be negative")
+        names = problem.team.models
+        columns = {"holonomic2d": range(d, 2 * d), "holonomic3d": range(d, 2 * d), "velocity2d": range(d)}
+        self._observed: BoolArray = np.array([name in columns for name in names])
+        self._columns = np.array([columns.get(name, range(d)) for name in names])
+        self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
+        fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
+        self._fastest = fastest[:, None]
+        self._remains = np.where(constants > 0, np.exp(-problem.dt / np.maximum(constants, 1e-12)), 0.0)[:, None]
+        # Mean over a step of exp(-t / lag).
+        self._share = (constants / problem.dt)[:, None] * (1 - self._remains)
+        self.bias, self._applied = np.zeros((count, d)), np.zeros((count, d))
+        self._explained: Floats | None = None
+        self._before: Floats | None = None
+
+    def observe(self, states: FloatArray, known: BoolArray) -> None:
+        """Learn from measured states ``(K, n)``, where they are known ``(K,)``, now and a step ago."""
+        now = np.take_along_axis(states, self._columns, axis=1).astype(np.float64)
+        now[~known] = np.nan
+        if self._before is not None and self._explained is not None:
+            expected = self._before + self.problem.dt * (self._explained + self.bias)
+            size = np.linalg.norm(expected, axis=1, keepdims=True)
+            expected /= np.maximum(size / self._fastest, 1.0)
+            left = (now - expected) / self.problem.dt
+            better = np.clip(self.bias + GAIN * left, -self._most, self._most)
+            self.bias = np.where(self._observed[:, None] & np.isfinite(left), better, self.bias)
+        self._before = now
+
+    def compensated(self, controls: FloatArray, resting: BoolArray) -> FloatArray:
+        """``(K, m)`` controls that come to what these would without the disturbance; unchanged for robots at rest."""
+        d, wanted = self.problem.dimension, controls.copy()
+        wanted[:, :d] -= np.where(resting[:, None], 0.0, self.bias).astype(np.float32)
+        sent = limit_controls(self.problem, wanted)
+        self._explained = sent[:, :d] + self._share * (self._applied - sent[:, :d])
+        self._explained[resting] = np.nan
+        self._applied = sent[:, :d] + self._remains * (self._applied - sent[:, :d])
+        return sent

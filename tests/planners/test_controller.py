@@ -1,0 +1,297 @@
+"""Controllers of robots: what they do in a loop without an environment, and what sensors may say."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d4orm_env import Problem, Team, make_problem, navigation_v0
+from d4orm_env.disturbances import Bias, ControlNoise, Gain, StateNoise
+from d4orm_env.envs.joint_state import split_state
+from d4orm_planners import Controller, make_policy, run_episode
+from d4orm_planners.base.controller import ControlSetpoint
+from d4orm_planners.base.disturbance_observer import MOST, DisturbanceObserver
+from d4orm_planners.baselines.go_to_goal import GoToGoal
+
+MODELS = ("holonomic2d", "velocity2d", "differential_drive", "unicycle", "holonomic3d")
+
+
+def team(model: str, count: int = 4, **changes: Any) -> Problem:
+    return make_problem("sphere" if model == "holonomic3d" else "circle", num_robots=count, model=model, **changes)
+
+
+def driven(controller: Controller, problem: Problem, disturbances: Any = (), seed: int = 0) -> tuple[Any, list[Any]]:
+    """A plant that does what the controller says, and all setpoints."""
+    plant, said = navigation_v0.parallel_env(problem=problem, disturbances=list(disturbances)), []
+    plant.reset(seed=seed)
+    time = 3.0
+    controller.begin(problem, plant.unwrapped.problem.start, time, seed)
+    while plant.agents:
+        measured = split_state(problem, plant.state()).states
+        said.append(controller.step(measured, time))
+        plant.step({agent: said[-1].control[int(agent.removeprefix("robot_"))] for agent in plant.agents})
+        time += problem.dt
+    controller.close()
+    return plant, said
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> None:
+    problem = team(model)
+    policy, same = ("d4orm", {}) if model == "unicycle" else ("d4orm-c2f", {"refine": "sync"})
+    plant, said = driven(Controller(policy, mode=mode, reserve=0.0, **same), problem)
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy(policy, **same), seed=0)
+    assert plant.metrics()["success"] == episode.metrics["success"] == 1
+    places = np.stack([s.position for s in said])
+    states = episode.trajectory.positions[1 : len(places) + 1]
+    # What float32 leaves of a measured velocity is a push, but a small one.
+    np.testing.assert_allclose(places, states, atol=2e-5 if mode == "nominal" else 0.02)
+    np.testing.assert_array_equal(said[-1].arrived, True)
+    assert not any(s.held for s in said)
+    speeds = np.linalg.norm([s.velocity for s in said], axis=2)
+    assert speeds.max() <= problem.team.max_speed.max() * (1 + 1e-5)
+
+
+@pytest.mark.parametrize(
+    "policy", ["go-to-goal", "random", "orca", "ppo", "mppi", lambda o, s: {each: [9, 9] for each in o}]
+)
+def test_any_policy_is_within_each_robots_limits(policy: Any) -> None:
+    if policy == "orca":
+        pytest.importorskip("pyrvo")
+    settings = {"num_samples": 64, "num_steps": 5, "max_iterations": 2} if policy == "mppi" else {}
+    problem = team("holonomic2d", max_acceleration=[1.0, 0.5, 0.2, 1.0])
+    _, said = driven(Controller(policy, mode="measured", **settings), problem, [StateNoise(0.01, 0.02)])
+    sizes = np.linalg.norm([s.control for s in said], axis=2)
+    assert (sizes <= problem.team.max_acceleration * (1 + 1e-6)).all()
+    assert all(s.control.dtype == np.float32 for s in said)
+
+
+@pytest.mark.parametrize(
+    ("mode", "disturbances"),
+    [
+        ("measured", [Bias(0.25)]), ("measured", [ControlNoise(0.2)]), ("measured", [Gain(0.1)]),
+        ("measured", [StateNoise(0.01, 0.02)]), ("nominal", [ControlNoise(0.2)]), ("nominal", [StateNoise(0.01, 0.02)]),
+    ],
+)  # fmt: skip
+def test_disturbed_robots_arrive(mode: Any, disturbances: list[Any]) -> None:
+    problem = team("holonomic2d", 6, horizon=150)
+    plant, said = driven(Controller("d4orm-c2f", mode=mode), problem, disturbances, seed=1)
+    metrics = plant.metrics()
+    assert metrics["arrived"] == 6
+    assert metrics["collisions"] == 0
+    assert len(said) < problem.horizon
+
+
+def test_without_an_estimate_a_steady_push_leaves_robots_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the observer is for: go-to-goal brakes in time only if it knows what pushes it."""
+
+    def misses() -> float:
+        goals = []
+        for seed in range(5):
+            problem = team("holonomic2d", 1, goal_speed=0.05, horizon=140)
+            plant, _ = driven(Controller("go-to-goal", mode="measured"), problem, [Bias(0.3)], seed)
+            goals.append(plant.metrics()["arrived"])
+        return float(np.mean(goals))
+
+    with_observer = misses()
+    monkeypatch.setattr("d4orm_planners.base.disturbance_observer.GAIN", 0.0)
+    assert misses() <= with_observer == 1
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_sensors_may_say_anything(data: st.DataObject) -> None:
+    problem = team("holonomic2d", 3)
+    controller = Controller("go-to-goal", mode=data.draw(st.sampled_from(["nominal", "measured"])))
+    controller.begin(problem, problem.start)
+    values = st.floats(width=32) | st.floats(-3, 3, width=32)
+    measured = st.lists(st.lists(values, min_size=4, max_size=4), min_size=3, max_size=3)
+    for step in range(4):
+        states = np.array(data.draw(measured), np.float32)
+        said = controller.step(states, step * problem.dt)
+        for part in (said.position, said.velocity, said.acceleration, said.control):
+            assert np.isfinite(part).all()
+        assert (np.linalg.norm(said.control, axis=1) <= problem.team.max_acceleration * (1 + 1e-6)).all()
+    controller.close()
+
+
+def test_missing_robots_are_where_the_reference_has_them() -> None:
+    problem = team("holonomic2d", 3)
+    seen, blind = Controller("go-to-goal", mode="measured"), Controller("go-to-goal", mode="measured")
+    for controller in (seen, blind):
+        controller.begin(problem, problem.start)
+    states = problem.start.copy()
+    for step in range(20):
+        told = seen.step(states, step * problem.dt)
+        partly = states.copy()
+        partly[1] = np.nan
+        other = blind.step(partly, step * problem.dt)
+        np.testing.assert_allclose(other.control, told.control, atol=1e-5)
+        states = np.hstack([told.position, told.velocity]).astype(np.float32)
+
+
+def test_one_setpoint_a_period_and_none_skipped() -> None:
+    problem = team("holonomic2d", 2)
+    controller = Controller("go-to-goal")
+    controller.begin(problem, problem.start, time=100.0)
+    first = controller.step(problem.start, 100.0)
+    assert controller.step(problem.start, 100.03) is first
+    second = controller.step(problem.start, 100.1)
+    assert second is not first
+    late = controller.step(problem.start, 101.0)
+    # The reference is one step on, not nine.
+    assert np.linalg.norm(late.position - second.position, axis=1).max() <= 0.1 * problem.dt * 3
+    after = controller.step(problem.start, 101.1)
+    assert after is not late
+    with pytest.raises(ValueError, match=r"time is 99.0 s, before the last step"):
+        controller.step(problem.start, 99.0)
+    with pytest.raises(ValueError, match="time is nan"):
+        controller.step(problem.start, float("nan"))
+
+
+def test_clocks_may_drift() -> None:
+    problem = team("holonomic2d", 2)
+    controller = Controller("go-to-goal")
+    controller.begin(problem, problem.start)
+    said = [controller.step(problem.start, 0.1013 * step + 0.01 * (-1) ** step) for step in range(50)]
+    assert len({id(s) for s in said}) == 50
+
+
+class Slow(GoToGoal):
+    """A policy that answers when it is allowed to."""
+
+    def __init__(self) -> None:
+        self.allowed = threading.Event()
+        self.calls = 0
+
+    def act(self, observations: Any, state: Any) -> Any:
+        self.calls += 1
+        assert self.allowed.wait(60)
+        return super().act(observations, state)
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "velocity2d"])
+def test_who_does_not_answer_in_time_is_not_waited_for(model: str) -> None:
+    problem, slow = team(model, 2), Slow()
+    with Controller(slow, timeout=0.02) as controller:
+        controller.begin(problem, problem.start)
+        slow.allowed.set()
+        moving = [controller.step(problem.start, step * problem.dt) for step in range(4)]
+        assert not any(s.held for s in moving)
+        slow.allowed.clear()
+        held = [controller.step(problem.start, step * problem.dt) for step in range(4, 24)]
+        assert all(s.held for s in held)
+        assert slow.calls == 5, "it is not asked again while it thinks"
+        np.testing.assert_allclose(held[-1].velocity, 0, atol=1e-5)
+        np.testing.assert_allclose(held[-1].position, held[-2].position, atol=1e-5)
+        slow.allowed.set()
+        times = itertools.count(24)
+        until(lambda: not controller.step(problem.start, next(times) * problem.dt).held)
+
+
+def until(condition: Any) -> None:
+    for _ in range(200):
+        if condition():
+            return
+        threading.Event().wait(0.05)
+    raise AssertionError
+
+
+def test_who_has_arrived_is_brought_back() -> None:
+    problem = Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[0.3, 0]])
+    controller = Controller("go-to-goal", mode="measured")
+    controller.begin(problem, problem.start)
+    states, step = problem.start, 0
+    while not controller.arrived.all():
+        said = controller.step(states, 0.1 * step)
+        states, step = np.hstack([said.position, said.velocity]).astype(np.float32), step + 1
+    assert controller.over
+    np.testing.assert_array_equal(controller.step(states, 0.1 * step).control, 0)
+    step += 1
+    away = states + np.float32([0.2, 0, 0, 0])
+    said = controller.step(away, 0.1 * (step + 1))
+    assert said.control[0, 0] < -0.3
+    np.testing.assert_allclose(said.position, states[:, :2], atol=1e-6)
+
+
+def test_it_begins_where_robots_are() -> None:
+    problem = team("holonomic2d", 3)
+    elsewhere = problem.start + np.float32([0.2, 0.1, 0, 0])
+    controller = Controller("d4orm-c2f")
+    controller.begin(problem, elsewhere)
+    said = controller.step(elsewhere, 0.0)
+    np.testing.assert_allclose(said.position, elsewhere[:, :2], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mode": "open"}, "mode is 'open'; choose one of nominal, measured"),
+        ({"reserve": 1.0}, "reserve"), ({"timeout": 0}, "timeout"), ({"timeout": -1.0}, "timeout"),
+        ({"policy": "d4orm-c2"}, "d4orm-c2"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Controller(**arguments)
+
+
+def test_bad_states_and_lags_are_named() -> None:
+    problem = team("holonomic2d", 3)
+    controller = Controller("go-to-goal")
+    with pytest.raises(RuntimeError, match="call begin"):
+        controller.step(problem.start, 0.0)
+    with pytest.raises(ValueError, match=r"states have shape \(2, 4\); expected \(K, n\) = \(3, 4\)"):
+        controller.begin(problem, problem.start[:2])
+    for lag, message in ((-1, "must not be negative"), ([1, 2], r"one number or one per robot \(3\)")):
+        with pytest.raises(ValueError, match=message):
+            Controller("go-to-goal", lag=lag).begin(problem, problem.start)
+
+
+# The observer, in numbers.
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.15])
+@pytest.mark.parametrize("model", ["holonomic2d", "velocity2d"])
+def test_a_steady_push_is_found(model: str, lag: float) -> None:
+    problem = Problem(Team((model,)), [[0, 0, 0, 0] if model == "holonomic2d" else [0, 0]], [[5, 0]])
+    observer, push = DisturbanceObserver(problem, lag), np.array([0.2, -0.1])
+    y, applied, dt, state = np.zeros(2), np.zeros(2), problem.dt, problem.start.copy()
+    for step in range(60):
+        observer.observe(state, np.array([True]))
+        control = np.float32([[0.3 * np.sin(step), 0.1 * np.cos(step)]])
+        sent = observer.compensated(control, np.array([False]))[0]
+        remains = np.exp(-dt / lag) if lag else 0.0
+        mean = sent + (applied - sent) * (lag / dt) * (1 - remains)
+        applied = sent + (applied - sent) * remains
+        y = y + dt * (mean + push)
+        state[0, -2:] = y
+    np.testing.assert_allclose(observer.bias[0], push, atol=0.005)
+    np.testing.assert_allclose(observer.compensated(control, np.array([False]))[0], control[0] - push, atol=0.005)
+
+
+def test_the_estimate_leaves_something_to_steer_with() -> None:
+    problem = Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[5, 0]])
+    observer, state = DisturbanceObserver(problem), problem.start.copy()
+    for step in range(200):
+        observer.observe(state, np.array([step % 7 != 0]))
+        observer.compensated(np.zeros((1, 2), np.float32), np.array([False]))
+        state[0, 2] += 5.0 * problem.dt
+    np.testing.assert_allclose(observer.bias, [[MOST, 0]])
+
+
+def test_setpoints_have_the_shapes_that_are_promised() -> None:
+    problem = team("differential_drive", 3)
+    controller = Controller("go-to-goal")
+    controller.begin(problem, problem.start)
+    said: ControlSetpoint = controller.step(problem.start, 0.0)
+    assert said.position.shape == said.velocity.shape == said.acceleration.shape == (3, 2)
+    assert said.control.shape == (3, 2)
+    assert said.heading.shape == said.arrived.shape == (3,)
