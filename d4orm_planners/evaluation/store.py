@@ -18,8 +18,6 @@ from d4orm_env.core.arrays import shown
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
 VERSION = 9
-READABLE = (4, 5, 6, 7, 8, VERSION)
-"""Readable versions; in older ones some columns have other names, and some, and a setting, are missing."""
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -160,10 +158,6 @@ class Trial:
 
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
-_FORMER = {"num_robots": "robots", "control_noise_std": "noise"}
-"""Columns that had other names in version 4."""
-_FORMERLY = {"disturbances": "'[]'", "physics": "'model'"}
-"""Values of columns that were missing; others are empty."""
 _TRUTHS = ("success", "verified")
 _JSON: Mapping[str, type | tuple[int, ...]] = {
     "config": dict,
@@ -253,7 +247,7 @@ class TrialStore:
     def trials(self) -> list[Trial]:
         """All trials, in order of key."""
         with self._connection() as connection:
-            rows = connection.execute(f"SELECT {_as_now(connection)} FROM trials ORDER BY {_KEY}").fetchall()
+            rows = connection.execute(f"SELECT {', '.join(_NAMES)} FROM trials ORDER BY {_KEY}").fetchall()
         return [self._trial(number, dict(zip(_NAMES, row))) for number, row in enumerate(rows)]
 
     def _trial(self, number: int, values: dict[str, Any]) -> Trial:
@@ -266,7 +260,7 @@ class TrialStore:
     def finished(self) -> set[TrialKey]:
         """Keys of all trials that ran to their end."""
         with self._connection() as connection:
-            rows = connection.execute(f"SELECT {_KEY} FROM (SELECT {_as_now(connection)} FROM trials) WHERE error = ''")
+            rows = connection.execute(f"SELECT {_KEY} FROM trials WHERE error = ''")
             return {TrialKey(*row) for row in rows}
 
     @contextmanager
@@ -297,12 +291,10 @@ class TrialStore:
         if self._read_only and not os.access(self.path.parent, os.W_OK) and not (log.exists() and log.stat().st_size):
             # SQLite cannot make the files that it keeps beside the store, and no writer has left anything in them.
             name += "?mode=ro&immutable=1"
-        connection = sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
-        connection.create_function("config_now", 1, config_now, deterministic=True)
-        return connection
+        return sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
 
     def _make(self, connection: sqlite3.Connection) -> None:
-        """Make the table in a new file, or give one from before the columns of now."""
+        """Make the table in a new file."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             # One transaction, so that of two processes that find no file one makes the table.
             connection.execute("BEGIN IMMEDIATE")
@@ -311,24 +303,12 @@ class TrialStore:
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
-        elif _is_former(connection):
-            connection.execute("BEGIN IMMEDIATE")
-            # Another process may have been quicker.
-            if _is_former(connection):
-                # Columns of the key cannot be added.
-                connection.execute(f"CREATE TABLE anew {_TABLE}")
-                columns = f"({', '.join(_NAMES)})"
-                connection.execute(f"INSERT INTO anew {columns} SELECT {_as_now(connection)} FROM trials")
-                connection.execute("DROP TABLE trials")
-                connection.execute("ALTER TABLE anew RENAME TO trials")
-                connection.execute(f"PRAGMA user_version = {VERSION}")
-            connection.execute("COMMIT")
 
     def _check(self, connection: sqlite3.Connection) -> None:
         """Refuse a file of another kind or version, which stays untouched."""
         if _pragma(connection, "application_id") != APPLICATION_ID:
             raise self._foreign("it is another program's database")
-        if (version := _pragma(connection, "user_version")) not in READABLE:
+        if (version := _pragma(connection, "user_version")) != VERSION:
             raise self._foreign(f"it has version {version}, and this program reads version {VERSION}")
 
     def _foreign(self, reason: str) -> ValueError:
@@ -351,36 +331,6 @@ def checked_trial(values: Mapping[str, Any]) -> Trial:
             raise ValueError(f"has {shown(values[name])} as {name}")
     truths = {name: None if values[name] is None else bool(values[name]) for name in _TRUTHS}
     return Trial(**{**values, **truths})
-
-
-def _columns(connection: sqlite3.Connection) -> set[str]:
-    return {row[1] for row in connection.execute("PRAGMA table_info(trials)")}
-
-
-def _is_former(connection: sqlite3.Connection) -> bool:
-    version = _pragma(connection, "user_version")
-    return version in READABLE and (version < VERSION or bool(set(_NAMES) - _columns(connection)))
-
-
-def _as_now(connection: sqlite3.Connection) -> str:
-    """The columns of now, taken from those that a file has, and its settings as they are now."""
-    there = _columns(connection)
-    former = {name: name if name in there else _FORMER.get(name, _FORMERLY.get(name, "NULL")) for name in _NAMES}
-    # A column may have been missing in a file that has the names of now.
-    found = {name: column if column in there or name not in _FORMER else "NULL" for name, column in former.items()}
-    if _pragma(connection, "user_version") < VERSION and "config" in there:
-        found["config"] = "config_now(config)"
-    return ", ".join(f"{column} AS {name}" for name, column in found.items())
-
-
-def config_now(config: str | bytes | float | None) -> str | bytes | float | None:
-    """Settings of a trial, as JSON, with the one that sampling methods had not before version 9 and that meant this."""
-    if not isinstance(config, str) or '"credit": ' not in config or '"penalty": ' in config:
-        return config
-    try:
-        return json.dumps({**json.loads(config), "penalty": 1.0}, sort_keys=True)
-    except (ValueError, TypeError, RecursionError):  # damaged, which whoever reads it says
-        return config
 
 
 def _use_wal(connection: sqlite3.Connection) -> None:

@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done, require_file
 from d4orm_planners.base.escaping import markdown_text, one_line, spreadsheet_cell
-from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, checked_trial, config_now
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, checked_trial
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _trials(file: ParquetFile) -> Iterator[Trial]:
     for batch in file.iter_batches(batch_size=1024):
         for row in batch.to_pylist():
             try:
-                yield checked_trial({**defaults, **row, "config": config_now(row["config"])})
+                yield checked_trial({**defaults, **row})
             except ValueError as error:
                 raise ValueError(f"trial {number} {error}") from None
             number += 1

@@ -33,7 +33,7 @@ from d4orm_planners.evaluation.robustness import write_robustness
 from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
-from d4orm_planners.evaluation.tables import HEADER, markdown, read_parquet, write_parquet
+from d4orm_planners.evaluation.tables import HEADER, markdown
 from d4orm_planners.evaluation.trials import Job
 
 TINY: dict[str, Any] = {"num_robots": [2], "control_noise_std": [0.0, 0.3], "seeds": range(2), "workers": 1}
@@ -133,79 +133,6 @@ def test_a_finished_trial_stays_and_a_failed_one_is_replaced(tmp_path: Path) -> 
     assert store.add(trial(1, error="boom"))
     assert store.add(trial(1))
     assert store.trials() == [trial(), trial(1)]
-
-
-def test_the_table_is_that_of_the_files_that_are_out_there(tmp_path: Path) -> None:
-    TrialStore(tmp_path / "new.sqlite")
-    with closing(sqlite3.connect(tmp_path / "new.sqlite")) as connection:
-        (made,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'trials'").fetchone()
-    for former, name in (("noise", "control_noise_std"), ("robots", "num_robots")):
-        made = made.replace(name, former)
-    # Files that lack these columns get them.
-    for column in (" stretch REAL,", " disturbances TEXT NOT NULL,", " physics TEXT NOT NULL,", " training_time REAL,"):
-        made = made.replace(column, "")
-    assert made.replace("seed, disturbances, physics)", "seed)").split() == FIRST_SCHEMA.split()
-
-
-def test_a_store_of_the_version_before_is_read_as_it_is_and_goes_on(tmp_path: Path) -> None:
-    TrialStore(tmp_path / "now.sqlite").add(trial(), trial(1))
-    with closing(sqlite3.connect(tmp_path / "now.sqlite")) as connection:
-        columns = [row[1] for row in connection.execute("PRAGMA table_info(trials)") if row[1] not in LATER]
-        rows = connection.execute(f"SELECT {', '.join(columns)} FROM trials").fetchall()
-    path = tmp_path / "before.sqlite"
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute(FIRST_SCHEMA)
-        places = ", ".join("?" * len(rows[0]))
-        connection.executemany(f"INSERT INTO trials VALUES ({places})", rows)
-        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-        connection.execute("PRAGMA user_version = 4")
-    content = path.read_bytes()
-    assert TrialStore.existing(path).trials() == [trial(), trial(1)]
-    assert path.read_bytes() == content
-    store = TrialStore(path)
-    assert not store.add(trial())
-    assert store.add(trial(2))
-    assert TrialStore.existing(path).trials() == [trial(), trial(1), trial(2)]
-
-
-@pytest.mark.parametrize(
-    ("config", "now"),
-    [
-        ('{"credit": "team", "num_steps": 9}', '{"credit": "team", "num_steps": 9, "penalty": 1.0}'),
-        ('{"credit": "team", "penalty": 3.0}', '{"credit": "team", "penalty": 3.0}'),
-        ('{"time_horizon": 2}', '{"time_horizon": 2}'),
-    ],
-)
-def test_settings_of_before_a_violation_had_a_price_are_those_with_its_former_one(
-    config: str, now: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "before.sqlite"
-    TrialStore(path).add(trial(config=config))
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("PRAGMA user_version = 8")
-    content = path.read_bytes()
-    store = TrialStore.existing(path)
-    assert (store.trials(), store.finished()) == ([trial(config=now)], {trial(config=now).key})
-    assert path.read_bytes() == content
-    assert not TrialStore(path).add(trial(config=now))
-    assert TrialStore.existing(path).trials() == [trial(config=now)]
-    write_parquet(tmp_path / "before.parquet", [trial(config=config)])
-    assert read_parquet(tmp_path / "before.parquet") == [trial(config=now)]
-
-
-LATER = ("stretch", "disturbances", "physics", "training_time")
-"""Columns that version 4 had not."""
-
-FIRST_SCHEMA = """
-CREATE TABLE trials (policy TEXT NOT NULL, config TEXT NOT NULL, problem TEXT NOT NULL, noise REAL NOT NULL,
-seed INTEGER NOT NULL, label TEXT NOT NULL, scenario TEXT NOT NULL, robots INTEGER NOT NULL, model TEXT NOT NULL,
-dt REAL NOT NULL, versions TEXT NOT NULL, machine TEXT NOT NULL, date TEXT NOT NULL, success INTEGER NOT NULL,
-verified INTEGER, violation TEXT NOT NULL, collided INTEGER NOT NULL, arrived INTEGER NOT NULL, travel_time REAL,
-makespan REAL, reward REAL, mean_squared_jerk REAL, steps INTEGER NOT NULL, iterations INTEGER, status TEXT NOT NULL,
-wall_time REAL, preparation REAL, elapsed REAL, history TEXT NOT NULL, messages INTEGER, message_bytes INTEGER,
-waiting_share REAL, error TEXT NOT NULL, PRIMARY KEY (policy, config, problem, noise, seed)) WITHOUT ROWID
-"""
-"""Of version 4, whose files are out there; two columns have other names since."""
 
 
 def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> None:
