@@ -144,6 +144,14 @@ _SECTIONS: dict[str, Callable[[list[Row]], str]] = {
         "s": lambda row: f"{row['seconds']:.2f}",
         "MiB": lambda row: f"{row['bytes'] / 2**20:.1f}",
     }),
+    "robots": _tabulated("Control loops of D4orm-C2F, and setpoints of a plan at 100 Hz", {
+        "mode": itemgetter("mode"),
+        "robots": itemgetter("num_robots"),
+        "loop, ms": lambda row: milliseconds(row["loop"]),
+        "95%, ms": lambda row: f"{row['loop_95'] * 1e3:.1f}",
+        "largest, ms": lambda row: f"{row['loop'].largest * 1e3:.1f}",
+        "plan.sample(), ms": lambda row: milliseconds(row["sample"]),
+    }),
     "startup": _tabulated("From the start of a process to its first plan", {
         "robots": itemgetter("num_robots"),
         "compiling, s": lambda row: f"{row['compiling']:.1f}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.util import find_spec
-from typing import TypeAlias
+from typing import TypeAlias, get_args
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.scenarios import make_problem
+from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.benchmark.env_steps import (
     DISTURBANCES,
@@ -25,6 +26,7 @@ from d4orm_planners.benchmark.env_steps import (
     measure_worlds,
 )
 from d4orm_planners.benchmark.probes import measure_memory, measure_startup
+from d4orm_planners.benchmark.robots import measure_robots
 from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Row, Spread, in_turn, measure
 from d4orm_planners.benchmark.walls import Where, measure_index, measure_obstacles
@@ -92,6 +94,12 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
             yield "obstacles", f"{count} boxes {where}", partial(_measure_obstacles, settings, count, where)
     for cells in settings.map_cells:
         yield "index", f"index of {cells} x {cells} cells", partial(measure_index, cells)
+    for mode in get_args(Mode):
+        yield (
+            "robots",
+            f"control loops, {mode}",
+            partial(measure_robots, mode, settings.repetitions, settings.time_limit),
+        )
     yield "startup", "first plan of a process", partial(measure_startup, 8, min(settings.repetitions, 5))
     size = settings.memory_robots
     memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
