@@ -95,11 +95,8 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for cells in settings.map_cells:
         yield "index", f"index of {cells} x {cells} cells", partial(measure_index, cells)
     for mode in get_args(Mode):
-        yield (
-            "robots",
-            f"control loops, {mode}",
-            partial(measure_robots, mode, settings.repetitions, settings.time_limit),
-        )
+        loops = partial(measure_robots, mode, settings.repetitions, settings.time_limit)
+        yield "robots", f"control loops, {mode}", loops
     yield "startup", "first plan of a process", partial(measure_startup, 8, min(settings.repetitions, 5))
     size = settings.memory_robots
     memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))

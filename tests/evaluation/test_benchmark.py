@@ -123,6 +123,8 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
     names = {row["environment"] for row in results["environments"]}
     assert {"make_vec, rooms along ways", "FunctionalEnv"} <= names
     assert [(row["obstacles"], row["where"]) for row in results["obstacles"]] == [(3, "near"), (5, "far")]
+    assert [row["mode"] for row in results["robots"]] == ["nominal", "measured"]
+    assert all(row["loop"].count > 30 and row["loop_95"] > 0 for row in results["robots"])
     (index,) = results["index"]
     assert 0 < index["bytes"] < 2**20
     (memory,) = results["memory"]
