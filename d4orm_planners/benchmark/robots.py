@@ -21,7 +21,8 @@ def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Row:
     problem = make_problem("circle", num_robots=NUM_ROBOTS, goal_speed=0.1, horizon=150)
     plan = make_planner().solve(problem, seed=0)
     sampling = measure(plan.sample, repetitions, time_limit)
-    seconds, states = [], problem.start
+    seconds: list[float] = []
+    states = problem.start
     with Controller("d4orm-c2f", mode=mode, reserve=0.0) as controller:
         controller.begin(problem, states)
         while not controller.over:
