@@ -58,11 +58,11 @@ bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 	$(BIN)/d4orm bench --out bench
 
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in data/
-	$(BIN)/python examples/one_dimension.py --out docs/tables
-	$(BIN)/python examples/tune_rivals.py --trials data/tuning.parquet --out docs/tables
+	$(BIN)/python -m examples.studies.one_dimension --out docs/tables
+	$(BIN)/python -m examples.studies.tune_rivals --trials data/tuning.parquet --out docs/tables
 	for study in $(STUDIES); do \
-	  $(BIN)/python examples/$$study.py --trials data/$$study.parquet --out docs/tables || exit 1; done
-	$(BIN)/python examples/training_seeds.py --curves data/training_curves.csv --out docs/tables
+	  $(BIN)/python -m examples.studies.$$study --trials data/$$study.parquet --out docs/tables || exit 1; done
+	$(BIN)/python -m examples.studies.training_seeds --curves data/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
 	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --no-times --out docs/tables --quiet || exit 1; done
 	for figure in big-teams coarseness ipopt; do \

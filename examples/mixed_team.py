@@ -1,6 +1,6 @@
 """Plan for the mixed team of ``scenarios/mixed_team.yaml``, check the plan, and save it, a picture and an animation.
 
-python examples/mixed_team.py
+python -m examples.mixed_team
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from outputs import argument_parser
+from examples.outputs import argument_parser
 
 from d4orm_env import load_problem, verify
 from d4orm_env.render import save_animation, save_picture

@@ -1,6 +1,6 @@
 """Plan for 64 robots with random starts and goals on 10 m x 10 m, and save the plan, a picture and an animation.
 
-    python examples/sixty_four_robots.py --seed 1
+    python -m examples.sixty_four_robots --seed 1
 
 D4orm-D begins with everybody driving straight to its goal, and repairs the robots that meet.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from outputs import argument_parser, count, save_table
+from examples.outputs import argument_parser, count, save_table
 
 from d4orm_env import make_problem, verify
 from d4orm_env.render import save_animation, save_picture

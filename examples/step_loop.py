@@ -1,13 +1,13 @@
 """A hand-written ``env.step`` loop: two policies in the same world, with the noise on the controls turned up.
 
-    python examples/step_loop.py
+    python -m examples.step_loop
 
 Copy ``run`` to start an experiment of your own; ``d4orm_planners.run_episode`` is the same loop with a recording.
 """
 
 from __future__ import annotations
 
-from outputs import argument_parser, save_table
+from examples.outputs import argument_parser, save_table
 
 from d4orm_env import navigation_v0
 from d4orm_planners import make_policy

@@ -1,6 +1,6 @@
 """Train a policy by reinforcement for some minutes, and compare it with D4orm-C2F and ORCA under noise.
 
-    python examples/train_and_compare.py
+    python -m examples.train_and_compare
 
 Five million robot-steps with four robots take about five minutes on two cores. Broken off, the script goes on where it
 was: the training from its last checkpoint, the comparison after its last trial.
@@ -8,7 +8,7 @@ was: the training from its last checkpoint, the comparison after its last trial.
 
 from __future__ import annotations
 
-from outputs import argument_parser, count, require, save_table
+from examples.outputs import argument_parser, count, require, save_table
 
 require("orca", "pyrvo")
 require("rl", "stable_baselines3", "tensorboard")

@@ -30,11 +30,17 @@ SOLVE_RATES = {"paper": 1, "big": 1, "canonical": 1, "walls": 1, "few": 3}
 """Tables of ``solve_rates.py``, and how many planners are in each."""
 
 
+def module_of(name: str) -> str:
+    """Where the example of that name is, as ``examples.studies.ablation``."""
+    (path,) = EXAMPLES.rglob(f"{name}.py")
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
 def run(name: str, out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run ``examples/NAME.py --quick`` in a process of its own."""
+    """Run the example of that name with ``--quick`` in a process of its own."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     return subprocess.run(
-        [sys.executable, str(EXAMPLES / f"{name}.py"), "--quick", "--out", str(out), *arguments],
+        [sys.executable, "-m", module_of(name), "--quick", "--out", str(out), *arguments],
         capture_output=True,
         text=True,
         check=False,
@@ -77,8 +83,7 @@ def completed(name: str, out: Path, *arguments: str) -> None:
 def test_an_example_says_which_extra_is_missing(name: str, module: str, extra: str, tmp_path: Path) -> None:
     code = (
         f"import runpy, sys; sys.modules[{module!r}] = None; sys.argv = ['x', '--quick']\n"
-        f"sys.path.insert(0, {str(EXAMPLES)!r})\n"
-        f"runpy.run_path({str(EXAMPLES / name)!r} + '.py', run_name='__main__')"
+        f"runpy.run_module({module_of(name)!r}, run_name='__main__')"
     )
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     result = subprocess.run(
@@ -539,8 +544,8 @@ def test_lifelong_bound_is_the_time_of_a_straight_drive(
     monkeypatch: pytest.MonkeyPatch, position: float, velocity: float, seconds: float
 ) -> None:
     """A single robot on a line, limits of 1 m/s and 1 m/s^2, and the goal's disc begins at 4 m."""
-    monkeypatch.syspath_prepend(EXAMPLES)
-    lifelong = importlib.import_module("lifelong")
+    monkeypatch.syspath_prepend(ROOT)
+    lifelong = importlib.import_module("examples.studies.lifelong")
     problem = make_problem("circle", num_robots=1)
     goal = np.array([[4 + problem.goal_radius, 0]], np.float32)
     states = np.array([[position, 0, velocity, 0]], np.float32)
@@ -549,8 +554,8 @@ def test_lifelong_bound_is_the_time_of_a_straight_drive(
 
 
 def test_lifelong_drives_are_summed_up_over_their_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(EXAMPLES)
-    lifelong = importlib.import_module("lifelong")
+    monkeypatch.syspath_prepend(ROOT)
+    lifelong = importlib.import_module("examples.studies.lifelong")
     drive = {"scenario": "random", "robots": 2, "seconds": 60.0, "touched": 1, "contacts": 3, "replanned": 4}
     first = {**drive, "goals": 20, "least_time": 3.0, "loop_seconds": [0.01, 0.03]}
     second = {**drive, "goals": 24, "least_time": 3.75, "loop_seconds": [0.02]}
@@ -566,8 +571,8 @@ def test_lifelong_drives_are_summed_up_over_their_seeds(monkeypatch: pytest.Monk
 
 @pytest.fixture
 def multimodality(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(EXAMPLES)
-    return importlib.import_module("multimodality")
+    monkeypatch.syspath_prepend(ROOT)
+    return importlib.import_module("examples.studies.multimodality")
 
 
 @pytest.mark.parametrize(

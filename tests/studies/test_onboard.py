@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from network_support import PATIENCE
 from PIL import Image
-from test_examples import EXAMPLES, PNG, ROOT, run, table
+from test_examples import PNG, ROOT, run, table
 
 from d4orm_env import Problem, Team, World
 from d4orm_env.envs.joint_state import JointState
@@ -35,11 +35,11 @@ pytestmark = pytest.mark.studies
 def onboard() -> Any:
     """The modules of the demonstration."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(EXAMPLES)
+        patch.syspath_prepend(ROOT)
         yield SimpleNamespace(
-            course=importlib.import_module("onboard.course"),
-            mission=importlib.import_module("onboard.mission"),
-            wire=importlib.import_module("onboard.wire"),
+            course=importlib.import_module("examples.studies.onboard.course"),
+            mission=importlib.import_module("examples.studies.onboard.mission"),
+            wire=importlib.import_module("examples.studies.onboard.wire"),
         )
 
 
@@ -207,7 +207,7 @@ def test_the_others_drive_on_when_a_robot_is_killed(tmp_path: Path) -> None:
 def test_ctrl_c_ends_all_processes_and_writes_what_there_is(tmp_path: Path) -> None:
     pytest.importorskip("zenoh")
     out = tmp_path / "out"
-    command = [sys.executable, str(EXAMPLES / "onboard_lifelong.py"), "--robots", "2", "--out", str(out)]
+    command = [sys.executable, "-m", "examples.studies.onboard_lifelong", "--robots", "2", "--out", str(out)]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     process = subprocess.Popen(
         command,

@@ -1,0 +1,1 @@
+"""Learning with libraries of others, a program each."""

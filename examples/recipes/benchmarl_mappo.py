@@ -1,0 +1,83 @@
+"""MAPPO of BenchMARL on a task of this package; any other of its algorithms for continuous actions does as well.
+
+pip install benchmarl "torchrl<0.12"        # in an environment of its own, see docs/recipes.md
+python -m examples.recipes.benchmarl_mappo
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from examples.outputs import argument_parser, count, require, save_table
+
+require("rl", "torchrl")
+try:
+    from benchmarl.algorithms import MappoConfig
+except ImportError as error:
+    print(f"this example needs BenchMARL in an environment of its own, see docs/recipes.md ({error})", file=sys.stderr)
+    raise SystemExit(2) from None
+import torch
+from benchmarl.experiment import Callback, Experiment, ExperimentConfig
+from benchmarl.models.mlp import MlpConfig
+
+from d4orm_env.integrations.benchmarl import NavigationTask
+
+WORLDS, HORIZON = 256, 32
+
+
+def settings(folder: Path, iterations: int) -> Any:
+    """Return the settings of an experiment: short rollouts of many worlds, and small batches."""
+    config = ExperimentConfig.get_from_yaml()
+    config.save_folder, config.loggers, config.create_json = str(folder), [], True
+    config.max_n_iters, config.max_n_frames, config.gamma, config.lr = iterations, None, 0.98, 1e-3
+    config.on_policy_n_envs_per_worker = WORLDS
+    config.on_policy_collected_frames_per_batch = WORLDS * HORIZON
+    config.on_policy_n_minibatch_iters, config.on_policy_minibatch_size = 4, WORLDS * HORIZON // 4
+    config.evaluation, config.render = False, False
+    return config
+
+
+class Successes(Callback):
+    """Counts of the episodes that ended in each iteration, and of those that succeeded."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: list[tuple[int, int]] = []
+
+    def on_batch_collected(self, batch: Any) -> None:
+        """Count."""
+        ended = batch["next", "done"][..., 0]
+        success = batch["next", "robots", "info", "success"][ended][:, 0, 0]
+        self.counts.append((len(success), int(success.sum())))
+
+
+def main() -> None:
+    """Train, and print how many episodes succeeded on the way."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--iterations", type=count, default=200, help="of 8192 steps of teams each")
+    arguments = parser.parse_args()
+    iterations, parts = (60, 3) if arguments.quick else (arguments.iterations, 10)
+    torch.set_num_threads(1)  # the layers are too small to be shared
+    own = {"num_robots": arguments.num_robots, "reward": "training", "max_cycles": 100, "num_instances": 512}
+    counted, folder = Successes(), arguments.out / "benchmarl"
+    folder.mkdir(parents=True, exist_ok=True)
+    model = MlpConfig.get_from_yaml()
+    model.num_cells, model.activation_class = [64, 64], torch.nn.Tanh
+    Experiment(
+        task=NavigationTask("random", own), algorithm_config=MappoConfig.get_from_yaml(), model_config=model,
+        critic_model_config=model, seed=0, config=settings(folder, iterations), callbacks=[counted],
+    ).run()  # fmt: skip
+    rows = []
+    for part in np.array_split(np.arange(iterations), parts):
+        ended, succeeded = np.sum([counted.counts[index] for index in part], axis=0)
+        steps = (part[-1] + 1) * WORLDS * HORIZON * arguments.num_robots
+        rows.append({"robot-steps": steps, "episodes": ended, "success": f"{succeeded / max(ended, 1):.0%}"})
+    save_table(rows, arguments.out / "benchmarl_mappo.csv")
+
+
+if __name__ == "__main__":
+    main()

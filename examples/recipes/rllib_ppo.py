@@ -1,0 +1,77 @@
+"""PPO of RLlib (new API stack), one network for all robots.
+
+pip install d4orm-env "ray[rllib]" torch        # in an environment of its own, see docs/recipes.md
+python -m examples.recipes.rllib_ppo
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from examples.outputs import argument_parser, count, save_table
+
+try:
+    from ray.rllib.algorithms.ppo import PPOConfig
+except ImportError as error:
+    print(f"this example needs RLlib in an environment of its own, see docs/recipes.md ({error})", file=sys.stderr)
+    raise SystemExit(2) from None
+from ray.rllib.callbacks.callbacks import RLlibCallback
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+
+from d4orm_env import navigation_v0
+from d4orm_env.integrations.rllib import RLlibNavigation
+from d4orm_planners import run_episode
+from d4orm_planners.base.adapters import from_rllib
+
+WORLDS = 64
+
+
+class Successes(RLlibCallback):
+    """Tells whether all have arrived and nobody touched anything."""
+
+    def on_episode_end(self, *, episode: Any, metrics_logger: Any, **others: Any) -> None:
+        """Count."""
+        last = [robot.get_infos(-1)["is_success"] for robot in episode.agent_episodes.values()]
+        metrics_logger.log_value("success", float(any(last)), reduce="mean", clear_on_reduce=True)
+
+
+def settings(env_config: dict[str, Any]) -> PPOConfig:
+    """Return the algorithm's settings: many worlds in one process, and small networks."""
+    config = PPOConfig().environment(RLlibNavigation, env_config=env_config)
+    config.env_runners(num_env_runners=0, num_envs_per_env_runner=WORLDS, rollout_fragment_length=32)
+    config.multi_agent(policies={"robot"}, policy_mapping_fn=lambda agent, episode, **others: "robot")
+    config.rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[64, 64], vf_share_layers=False))
+    config.training(train_batch_size_per_learner=WORLDS * 32, minibatch_size=1024, num_epochs=8)
+    config.training(lr=1e-3, gamma=0.98, grad_clip=0.5, vf_clip_param=1e4)
+    return config.callbacks(Successes).debugging(seed=0)
+
+
+def main() -> None:
+    """Train, print how many episodes succeeded on the way, and drive with what was learned."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--iterations", type=count, default=200, help="of 2048 steps of teams each")
+    arguments = parser.parse_args()
+    iterations, parts = (45, 3) if arguments.quick else (arguments.iterations, 10)
+    world = {"scenario": "random", "num_robots": arguments.num_robots, "reward": "training", "max_cycles": 100}
+    algorithm = settings(world).build_algo()
+    results = [algorithm.train()["env_runners"] for _ in range(iterations)]
+    rows = []
+    for part in np.array_split(np.arange(iterations), parts):
+        counted = [[results[index].get(name, 0) for name in ("num_episodes", "success")] for index in part]
+        ended, share = np.nan_to_num(counted).T  # not a number where none ended
+        steps = sum(results[part[-1]]["num_agent_steps_sampled_lifetime"].values())
+        success = (ended * share).sum() / max(ended.sum(), 1)
+        rows.append({"robot-steps": int(steps), "episodes": int(ended.sum()), "success": f"{success:.0%}"})
+    save_table(rows, arguments.out / "rllib_ppo.csv")
+    policy = from_rllib(algorithm.get_module("robot"))
+    env = navigation_v0.parallel_env(**world)
+    arrived = [int(run_episode(env, policy, seed=seed).metrics["arrived"]) for seed in range(10_000, 10_010)]
+    print(f"afterwards {sum(arrived)} of {10 * arguments.num_robots} robots arrived in 10 episodes")
+    algorithm.stop()
+
+
+if __name__ == "__main__":
+    main()

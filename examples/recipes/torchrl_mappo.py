@@ -1,0 +1,136 @@
+"""MAPPO with TorchRL: robots share a policy of what each sees, and learn by a critic that sees what all see.
+
+    python -m examples.recipes.torchrl_mappo
+
+``TorchRLNavigation`` steps all worlds in one compiled call. An episode is the team's, and a robot's own ends when it
+arrives: that is what the per-robot ``done`` is made of here, and robots that stand at their goals are left out of the
+loss. With TorchRL's own ``PettingZooWrapper`` give ``use_mask=True, done_on_any=False``: by its default the first robot
+that arrives ends the episode for all, and nobody else ever learns to.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from examples.outputs import argument_parser, count, require, save_table
+
+require("rl", "torchrl")
+import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torchrl.envs.utils import set_exploration_type
+from torchrl.modules import MultiAgentMLP, ProbabilisticActor, TanhNormal
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from d4orm_env.integrations.torchrl import TorchRLNavigation
+
+WORLDS, HORIZON = 256, 32
+GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES, LEARNING_RATE = 0.98, 0.95, 0.2, 4, 4, 1e-3
+REACH = 5.0
+"""Observations are cut off beyond this and taken in its measure: they are in metres, metres per second and seconds."""
+
+SEEN, ACTION, REWARD, VALUE = (("robots", name) for name in ("seen", "action", "reward", "state_value"))
+
+
+def scaled() -> TensorDictModule:
+    """Return a module that scales observations for the networks."""
+    return TensorDictModule(
+        lambda observation: observation.clamp(-REACH, REACH) / REACH, [("robots", "observation")], [SEEN]
+    )
+
+
+def network(env: TorchRLNavigation, outputs: int, centralised: bool) -> MultiAgentMLP:
+    """One for all robots, of what each sees or of what all see."""
+    return MultiAgentMLP(
+        n_agent_inputs=env.observation_spec["robots", "observation"].shape[-1], n_agent_outputs=outputs,
+        n_agents=len(env.group_map["robots"]), centralised=centralised, share_params=True, depth=2, num_cells=64,
+        activation_class=torch.nn.Tanh,
+    )  # fmt: skip
+
+
+def make_actor(env: TorchRLNavigation) -> ProbabilisticActor:
+    """Return the robots' actor."""
+    limits = env.action_spec["robots", "action"].space
+    parameters = [("robots", "loc"), ("robots", "scale")]
+    means = torch.nn.Sequential(network(env, 2 * limits.high.shape[-1], False), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictSequential(scaled(), TensorDictModule(means, [SEEN], parameters)), in_keys=parameters,
+        out_keys=[ACTION], distribution_class=TanhNormal, return_log_prob=True, log_prob_key=("robots", "log_density"),
+        distribution_kwargs={"low": limits.low[0], "high": limits.high[0]},
+    )  # fmt: skip
+
+
+def collect(env: TorchRLNavigation, actor: ProbabilisticActor, state: Any) -> tuple[Any, Any]:
+    """Some steps ``(worlds, T)``, and where they lead."""
+    moments = []
+    with torch.no_grad(), set_exploration_type("RANDOM"):
+        for _ in range(HORIZON):
+            moment, state = env.step_and_maybe_reset(actor(state))
+            moments.append(moment)
+    data = torch.stack(moments, dim=1)
+    over = data["next", "done"].unsqueeze(-2)
+    data["next", "robots", "done"] = over | ~data["next", "robots", "info", "acting"]
+    data["next", "robots", "terminated"] = data["next", "robots", "done"]  # running out of time counts as an end
+    return data, state
+
+
+def judged(data: Any, advantages: GAE) -> Any:
+    """The steps with advantages of mean zero and variance one over the robots that acted, zero for others."""
+    with torch.no_grad():
+        advantages(data)
+    acting = data["robots", "info", "acting"]
+    gains = data["advantage"]
+    gains = (gains - gains[acting].mean()) / (gains[acting].std() + 1e-8)
+    data["advantage"] = torch.where(acting, gains, 0)
+    data["value_target"] = torch.where(acting, data["value_target"], data[VALUE])
+    return data.reshape(-1)
+
+
+def main() -> None:
+    """Train, and print how many episodes succeeded on the way."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--updates", type=count, default=200, help="of 8192 steps of teams each")
+    arguments = parser.parse_args()
+    updates, parts = (60, 3) if arguments.quick else (arguments.updates, 10)
+    torch.manual_seed(0)
+    torch.set_num_threads(1)  # the layers are too small to be shared
+    env = TorchRLNavigation(
+        WORLDS, "random", arguments.num_robots, seed=0, reward="training", max_cycles=100, num_instances=512
+    )
+    state = env.reset()
+    actor = make_actor(env)
+    critic = TensorDictSequential(scaled(), TensorDictModule(network(env, 1, True), [SEEN], [VALUE]))
+    loss = ClipPPOLoss(actor, critic, clip_epsilon=CLIP, entropy_coeff=1e-3, normalize_advantage=False)
+    names = {"done": ("robots", "done"), "terminated": ("robots", "terminated")}
+    loss.set_keys(action=ACTION, reward=REWARD, value=VALUE, sample_log_prob=("robots", "log_density"), **names)
+    advantages = GAE(gamma=GAMMA, lmbda=LAMBDA, value_network=critic)
+    advantages.set_keys(reward=REWARD, value=VALUE, **names)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=LEARNING_RATE)
+    rows, begin, done = [], time.perf_counter(), 0
+    for part in np.array_split(np.arange(updates), parts):
+        successes: list[Any] = []
+        for _ in part:
+            data, state = collect(env, actor, state)
+            ended = data["next", "done"][..., 0]
+            successes += data["next", "robots", "info", "success"][ended][:, 0, 0].tolist()
+            done += data["next", *REWARD].numel()
+            batch = judged(data, advantages)
+            for _ in range(EPOCHS):
+                for rows_of in torch.randperm(len(batch)).chunk(MINIBATCHES):
+                    terms = loss(batch[rows_of])
+                    total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+                    optimizer.zero_grad()
+                    total.backward()
+                    torch.nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
+                    optimizer.step()
+        rows.append({"robot-steps": done, "episodes": len(successes), "success": f"{np.mean(successes or [0]):.0%}"})
+        print(f"{done} robot-steps, {time.perf_counter() - begin:.0f} s: success {rows[-1]['success']}", flush=True)
+    env.close()
+    save_table(rows, arguments.out / "torchrl_mappo.csv")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Measurements that the pages of the documentation rest on, a program each."""

@@ -1,0 +1,146 @@
+"""Ablation of D4orm-C2F's measures against disturbances: each left out by itself, and all of them left out.
+
+    python -m examples.studies.ablation --seeds 30 --out ablation
+
+Eight robots on the circle, on random places and in rooms, each measure under the disturbance that it is there for. The
+table has how many trials succeeded and in how many anybody touched anything, with all measures and without, how likely
+it is that both are equally good (McNemar, paired by seed), and how much longer robots travel without where both succeed
+(mean, and Wilcoxon's test). Trials are stored in the folder, and a call that was broken off goes on from there.
+`--go-on-from FILE` takes trials from a Parquet file, such as those with all measures in
+`data/disturbance_study.parquet`. `--trials FILE` makes the table of trials that are in such a file.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from examples.outputs import argument_parser, count, go_on_argument, save_table, stored, trials_argument
+from examples.studies.disturbance_study import (
+    DISTURBANCES,
+    FIRST_SEED,
+    NOTHING,
+    ROBOTS,
+    SCENARIOS,
+    names_by_text,
+    successes,
+    tell,
+)
+
+from d4orm_planners.evaluation.comparison import in_common, paired
+from d4orm_planners.evaluation.evaluate import run_study
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
+
+ALL, WITHOUT_ALL = "d4orm-c2f", "all of them"
+MEASURES: dict[str, dict[str, Any]] = {
+    "delay": {"delay": 0},
+    "filter_states": {"filter_states": False},
+    "learn_limits": {"learn_limits": False},
+    "expect_losses": {"expect_losses": False},
+    "stalls": {"stalls": False},
+    "last_resort": {"last_resort": False},
+    "drive_home": {"drive_home": False},
+}
+MEANT_FOR = {
+    "delay of 2 steps": "delay",
+    "states 2 cm, 5 cm/s": "filter_states",
+    "limits 20% weaker": "learn_limits",
+    "dropout 30%": "expect_losses",
+    "one robot stalls": "stalls",
+    "pushes 0.2/s, 0.3 m/s": "last_resort",
+    NOTHING: "drive_home",
+}
+"""Measure that is tried under each disturbance."""
+SETTINGS: Mapping[str, Mapping[str, Any]] = {
+    ALL: {},
+    **MEASURES,
+    WITHOUT_ALL: {name: value for measure in MEASURES.values() for name, value in measure.items()},
+}
+
+Cells = dict[tuple[str, str], dict[str, list[Trial]]]
+"""Trials by scenario and disturbance, and by what is left out."""
+
+
+def studies(scenarios: Sequence[str], disturbances: Sequence[str], seeds: int) -> list[Study]:
+    """One for every disturbance."""
+    return [
+        Study(
+            policies={
+                label: {"policy": ALL, "refine": "sync", **SETTINGS[label]}
+                for label in (ALL, MEANT_FOR[name], WITHOUT_ALL)
+            },
+            scenarios=scenarios, num_robots=ROBOTS, seeds=range(FIRST_SEED, FIRST_SEED + seeds),
+            disturbances={name: [[] if name == NOTHING else [DISTURBANCES[name]]]},
+        )
+        for name in disturbances
+    ]  # fmt: skip
+
+
+def by_cell(trials: Sequence[Trial]) -> Cells:
+    """The table's cells, in its order."""
+    named = names_by_text()
+    cells: Cells = {(scenario, name): {} for name in MEANT_FOR for scenario in SCENARIOS}
+    for trial in trials:
+        cell = cells[trial.scenario, named.get(trial.disturbances, NOTHING)]
+        cell.setdefault(trial.label, []).append(trial)
+    return {key: cell for key, cell in cells.items() if cell}
+
+
+def travel_time(trial: Trial) -> float:
+    """Return the robots' travel time, on average [s]."""
+    assert trial.travel_time is not None
+    return trial.travel_time
+
+
+def rows_of(cells: Cells) -> list[dict[str, Any]]:
+    """A row for every scenario, disturbance and what is left out."""
+    rows = []
+    for (scenario, disturbance), cell in cells.items():
+        for label in (MEANT_FOR[disturbance], WITHOUT_ALL):
+            pairs = in_common(cell[label], cell[ALL])
+            both = [(one, other) for one, other in pairs if one.success and other.success]
+            test = paired(cell[label], cell[ALL], lambda trial: float(not trial.success))
+            longer = [travel_time(one) - travel_time(other) for one, other in both]
+            cost = paired([one for one, _ in both], [other for _, other in both], travel_time) if both else None
+            rows.append(
+                {"disturbance": disturbance, "scenario": scenario, "left out": label, "trials": len(pairs),
+                 "with": successes([other for _, other in pairs]), "without": successes([one for one, _ in pairs]),
+                 "p (succeeded)": f"{test.success_p:.2g}",
+                 "travel time without [s]": f"{np.mean(longer):+.2f}" if longer else "-",
+                 "p (travel time)": f"{cost.cost_p:.2g}" if cost else "-"}
+            )  # fmt: skip
+    return rows
+
+
+def main() -> int:
+    """Run the study and write the table."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--seeds", type=count, default=30)
+    parser.add_argument("--workers", type=count, help="processes, by default one per core")
+    go_on_argument(parser)
+    trials_argument(parser)
+    arguments = parser.parse_args()
+    if arguments.trials is not None:
+        trials = read_parquet(arguments.trials)
+    else:
+        scenarios, names, seeds = SCENARIOS, tuple(MEANT_FOR), arguments.seeds
+        if arguments.quick:
+            scenarios, names, seeds = scenarios[:1], names[:1], 1
+        stored(arguments.go_on_from, arguments.out)
+        trials = [
+            trial
+            for study in studies(scenarios, names, seeds)
+            for group in run_study(study, arguments.out, workers=arguments.workers, progress=tell)
+            for trial in group.trials
+        ]
+        write_parquet(arguments.out / "ablation.parquet", trials)
+    save_table(rows_of(by_cell(trials)), arguments.out / "ablation.csv")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,159 @@
+"""Factorial of credit and update, on four teams: who gets the credit, and how samples become an update.
+
+    python -m examples.studies.credit_by_update --seeds 50 --out factorial
+
+Credit: samples are weighted by the reward of the team, of the group that a robot was in conflict with, of the robot, or
+of robot and team in turn; and by that of the group with contacts that cost twice as much, as much as they cost the two
+that touch. Update: MPPI, CEM with adaptive variance, MBD, i-MBD or D4orm, everything else being the
+paper's. Every trial has the same budget of denoising steps of 1024 samples, which MBD spends in one iteration (so that
+its credit by groups, or in turn, is credit by robot). The table has success with its 95% interval (Wilson), the mean
+number of steps to the first solution, a trial without one counting twice the budget (PAR-2), and how likely it is that
+the cell and D4orm with the same credit are equally good (McNemar on solutions, Wilcoxon on steps, paired by seed).
+Trials are stored in the folder, and a call that was broken off goes on from there. `--go-on-from FILE` takes trials
+from a Parquet file, such as `data/credit_by_update.parquet`; `--trials FILE` makes the table and the curves of one.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from examples.outputs import (
+    argument_parser,
+    count,
+    go_on_argument,
+    plt,
+    save_figure,
+    save_table,
+    stored,
+    trials_argument,
+    trials_of,
+)
+
+from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.evaluation.tables import read_parquet, write_parquet
+
+TEAMS = (("paper_circle", 8), ("paper_circle", 16), ("paper_random", 16), ("paper_heterogeneous", 8))
+CREDITS: dict[str, dict[str, Any]] = {
+    "team": {"credit": "team"},
+    "group": {"credit": "group"},
+    "robot": {"credit": "robot"},
+    "in turn": {"credit": "alternate"},
+    "group, penalty 2": {"credit": "group", "penalty": 2.0},
+}
+UPDATES: dict[str, dict[str, Any]] = {
+    "mppi": {},
+    "cem": {"adapt_variance": True},
+    "mbd": {"max_iterations": 1},
+    "i-mbd": {},
+    "d4orm": {},
+}
+REFERENCE = "d4orm"
+BUDGET, TINY, ITERATION = 1000, 20, 100
+"""Denoising steps of a trial, of the small version's, and of an iteration."""
+
+Cells = dict[tuple[str, str], list[Trial]]
+
+
+def policies(budget: int) -> dict[str, dict[str, Any]]:
+    """Every credit with every update, each with so many steps."""
+    steps = min(ITERATION, budget)
+    return {
+        f"{update}, {credit}": {
+            "policy": update, "preset": "paper", "engine": "cpu", **scoring,
+            "num_steps": budget if update == "mbd" else steps, "max_iterations": budget // steps, **settings,
+        }
+        for update, settings in UPDATES.items()
+        for credit, scoring in CREDITS.items()
+    }  # fmt: skip
+
+
+def run(teams: Iterable[tuple[str, int]], seeds: int, budget: int, out: Path) -> list[Trial]:
+    """Trials of every cell on every team."""
+    chosen = policies(budget)
+    studies = (
+        Study(policies=chosen, scenarios=(scenario,), num_robots=num_robots, seeds=range(seeds))
+        for scenario, num_robots in teams
+    )
+    return trials_of(studies, out)
+
+
+def by_team(trials: Iterable[Trial]) -> dict[str, Cells]:
+    """Trials by team, update and credit."""
+    teams: dict[str, Cells] = {}
+    for trial in trials:
+        update, _, credit = trial.label.partition(", ")
+        teams.setdefault(f"{trial.scenario}, {trial.num_robots}", {}).setdefault((update, credit), []).append(trial)
+    return teams
+
+
+def rows_of(team: str, cells: Cells) -> list[dict[str, Any]]:
+    """A row per cell."""
+    rows = []
+    for update, credit in ((update, credit) for update in UPDATES for credit in CREDITS):
+        trials = cells[update, credit]
+        solved = sum(map(is_solved, trials))
+        lower, upper = wilson_interval(solved, len(trials))
+        test = paired(trials, cells[REFERENCE, credit], penalised_steps, is_solved)
+        rows.append(
+            {"team": team, "update": update, "credit": credit, "solved": f"{solved} of {len(trials)}",
+             "interval": f"{lower:.0%} to {upper:.0%}", "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
+             "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
+        )  # fmt: skip
+    return rows
+
+
+def draw(teams: dict[str, Cells], path: Path) -> None:
+    """The share of seeds without a solution against the steps spent: a row per team, a column per credit."""
+    figure, axes = plt.subplots(
+        len(teams), len(CREDITS), figsize=(13, 2.4 * len(teams)), sharex=True, sharey=True, squeeze=False
+    )
+    for row, (team, cells) in zip(axes, teams.items(), strict=True):
+        budget = max(penalised_steps(trial) for trials in cells.values() for trial in trials) / 2
+        for axis, credit in zip(row, CREDITS, strict=True):
+            for number, update in enumerate(UPDATES):
+                curve = survival([steps_to_solution(trial) for trial in cells[update, credit]])
+                steps = np.concatenate([[0], curve.costs, [budget]])
+                left = np.concatenate([[1.0], curve.unsolved])
+                axis.stairs(left, steps, baseline=None, label=update, color=f"C{number}")
+            axis.set_ylim(-0.02, 1.02)
+        row[0].set_ylabel(f"{team}\nunsolved")
+    for axis in axes[-1]:
+        axis.set_xlabel("denoising steps")
+    for axis, credit in zip(axes[0], CREDITS, strict=True):
+        axis.set_title(f"credit: {credit}")
+    axes[0, 0].legend()
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def main() -> int:
+    """Run every cell on every team, write the table and draw the curves."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--seeds", type=count, default=50)
+    go_on_argument(parser)
+    trials_argument(parser)
+    arguments = parser.parse_args()
+    if arguments.trials is None:
+        teams, seeds, budget = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)
+        stored(arguments.go_on_from, arguments.out)
+        trials = run(teams, seeds, budget, arguments.out)
+        write_parquet(arguments.out / "credit_by_update.parquet", trials)
+    else:
+        trials = read_parquet(arguments.trials)
+    found = by_team(trials)
+    save_table(
+        [row for team, cells in found.items() for row in rows_of(team, cells)], arguments.out / "credit_by_update.csv"
+    )
+    draw(found, arguments.out / "credit_by_update.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

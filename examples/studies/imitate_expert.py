@@ -1,0 +1,115 @@
+"""Imitation of a planner: a network learns what D4orm-C2F does, first by cloning, then by DAgger, then by PPO.
+
+    python -m examples.studies.imitate_expert --seeds 3
+    python -m examples.studies.imitate_expert --trials data/imitate_expert.parquet
+
+The clone sees what the expert's own drives led to, and on its own comes into places where the expert never was. DAgger
+lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
+nothing. Success is that in 100 random instances that nothing learns from. All of it is in policy files of "ppo". Broken
+off, the same command goes on; some ten minutes a seed. With ``--trials`` nothing is trained, and the table is made of a
+file that it wrote before. The same from the command line: ``d4orm train imitation`` and ``d4orm train ppo
+--start-from``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from examples.outputs import argument_parser, count, measured, require, save_table, trials_argument
+
+require("rl", "stable_baselines3", "tensorboard")
+
+from d4orm_planners.evaluation.summary import mean_interval
+from d4orm_planners.rl.curve import Evaluation
+from d4orm_planners.rl.imitation import ImitationSettings, imitate
+from d4orm_planners.rl.training import TrainingSettings, train
+
+IMITATION = ImitationSettings(num_robots=4)
+REINFORCEMENT = TrainingSettings(num_robots=4, steps=1_000_000, lessons=10)
+Rows = Sequence[Mapping[str, Any]]
+
+
+def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, Any]]:
+    """A row per seed, way of learning, and point of its curve."""
+    imitation, reinforcement, rows = IMITATION, REINFORCEMENT, []
+    if quick:
+        imitation = replace(imitation, num_robots=2, episodes=20, rounds=2)
+        reinforcement = replace(reinforcement, num_robots=2, steps=100_000, lessons=2)
+    for seed in range(seeds):
+        learned = imitate(replace(imitation, seed=seed), out / f"imitation-{seed}", progress=report)
+        rows += [_row("cloning" if not index else "DAgger", seed, point) for index, point in enumerate(learned.curve)]
+        for name, start in (("PPO from there", str(learned.policy_path)), ("PPO from nothing", None)):
+            settings = replace(reinforcement, seed=seed, start_from=start)
+            curve = train(settings, out / f"{name.replace(' ', '-').lower()}-{seed}", progress=report).curve
+            rows += [_row(name, seed, point) for point in curve]
+    return rows
+
+
+def _row(way: str, seed: int, point: Evaluation) -> dict[str, Any]:
+    return {
+        "way": way,
+        "seed": seed,
+        "steps": point.steps,
+        "success": point.success_rate,
+        "travel_time": point.travel_time,
+        "imitation_error": point.imitation_error,
+        "seconds": point.seconds,
+    }
+
+
+def report(what: str, done: int, total: int) -> None:
+    """Say now and then how far it is."""
+    if done % max(total // 10, 1) == 0:
+        print(f"{done / total:4.0%}  {what}", flush=True)
+
+
+def summary(rows: Rows) -> list[dict[str, object]]:
+    """Summarise all seeds: after each round of the imitation, and after the first and the last stage of PPO.
+
+    A round learns from so many moments of robots as its episodes happen to have, which differ from seed to seed.
+    """
+    table = []
+    for way in dict.fromkeys(row["way"] for row in rows):
+        own = [row for row in rows if row["way"] == way]
+        curves = [[row for row in own if row["seed"] == seed] for seed in sorted({row["seed"] for row in own})]
+        points = list(zip(*curves, strict=True))
+        shown = points if way == "DAgger" or len(points) == 1 else [points[0], points[-1]]
+        table += [_point(way, point) for point in shown]
+    return table
+
+
+def _point(way: str, point: Rows) -> dict[str, object]:
+    ends = [100 * row["success"] for row in point]
+    success, lower, upper = mean_interval(ends)
+    errors = [row["imitation_error"] for row in point if row["imitation_error"] is not None]
+    return {
+        "learned by": way,
+        "moments or robot-steps": f"{np.mean([row['steps'] for row in point]):,.0f}",
+        "seeds": len(point),
+        "success": f"{success:.0f}%",
+        "95% interval": "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%",
+        "least, most": f"{min(ends):.0f}%, {max(ends):.0f}%",
+        "travel time [s]": f"{np.mean([row['travel_time'] for row in point]):.2f}",
+        "imitation error": f"{np.mean(errors):.2f}" if errors else "",
+    }
+
+
+def main() -> int:
+    """Learn, or read curves, and write what came of it."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--seeds", type=count, default=3, help="of each way of learning")
+    trials_argument(parser)
+    arguments = parser.parse_args()
+    seeds, quick, out = (1 if arguments.quick else arguments.seeds), arguments.quick, arguments.out / "imitation"
+    rows = measured(arguments.trials, lambda: measure(seeds, out, quick), arguments.out / "imitate_expert.parquet")
+    save_table(summary(rows), arguments.out / "imitate_expert.csv")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,166 @@
+"""Robots that get a new goal whenever they arrive, under D4orm-C2F, for some minutes of simulated time.
+
+    python -m examples.studies.lifelong --minutes 1
+    python -m examples.studies.lifelong --minutes 10 --seeds 10
+    python -m examples.studies.lifelong --minutes 5 --scenario warehouse --num-robots 32
+
+The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, a robot
+would accelerate to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
+pass through. It would drive straight, or among walls along the shortest free way, wherever it was heading before.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from examples.outputs import argument_parser, count, measured, save_gif, save_table, trials_argument
+from numpy.typing import NDArray
+
+from d4orm_env import Problem, make_problem, navigation_v0
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_env.envs.lifelong import goal_region
+from d4orm_env.render import FrameRenderer
+from d4orm_planners import make_policy
+from d4orm_planners.evaluation.summary import mean_interval
+
+
+def least_times(problem: Problem, joint: JointState) -> np.ndarray:
+    """``(K,)`` seconds within which no double integrator gets from a joint state to its goal."""
+    d = problem.dimension
+    speed, acceleration, _ = np.asarray(problem.team.limits, np.float64).T
+    to_goal = joint.goals.astype(np.float64) - joint.states[:, :d]
+    distance = np.linalg.norm(to_goal, axis=1)
+    velocity = joint.states[:, d : 2 * d]
+    towards = (velocity * to_goal).sum(axis=1) / np.maximum(distance, 1e-9)
+    if problem.world.num_obstacles:
+        distance = problem.resumed_at(joint.states, joint.goals).shortest_paths.length
+        towards = np.linalg.norm(velocity, axis=1)
+    way = np.maximum(distance - problem.goal_radius, 0)
+    to_top_speed = (speed**2 - towards**2) / (2 * acceleration)
+    accelerating = (np.sqrt(towards**2 + 2 * acceleration * np.minimum(way, to_top_speed)) - towards) / acceleration
+    return accelerating + np.maximum(way - to_top_speed, 0) / speed
+
+
+class Film:
+    """Pictures of the first seconds."""
+
+    def __init__(self, problem: Problem, seconds: float) -> None:
+        self.frames: list[NDArray[np.uint8]] = []
+        self._seconds, self._dt, self._nobody = seconds, problem.dt, np.zeros(problem.num_robots, bool)
+        self._trail: list[np.ndarray] = []
+        # With a view of all places that a goal may come to lie.
+        self._renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
+
+    def show(self, joint: JointState, collided: np.ndarray, reached: int) -> None:
+        """Draw what a step has come to, unless the film is over."""
+        self._trail = [*self._trail[-30:], joint.states[:, :2]]
+        seconds = joint.steps * self._dt
+        if seconds <= self._seconds:
+            trail, caption = np.stack(self._trail), f"{seconds:.1f} s    {reached} goals reached"
+            self.frames.append(
+                self._renderer.draw(joint.states, self._nobody, collided, joint.goals, trail, caption=caption)
+            )
+
+    def close(self) -> None:
+        """Free what draws."""
+        self._renderer.close()
+
+
+def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
+    """Drive for so many minutes, and film the first seconds: what was measured, and the film."""
+    env = navigation_v0.parallel_env(problem=problem, lifelong=True)
+    env.max_cycles = max(round(60 * minutes / problem.dt), 1)
+    observations, _ = env.reset(seed=seed)
+    policy: Any = make_policy("d4orm-c2f")
+    policy.reset(env, seed=seed)
+
+    joint = split_state(problem, env.state())
+    bounds = list(least_times(problem, joint))
+    act_times, collided = [], np.zeros(problem.num_robots, bool)
+    touched, pictures = collided, Film(problem, film)
+    pictures.show(joint, collided, 0)
+    while env.agents:
+        begin = time.perf_counter()
+        actions = policy.act(observations, env.state())
+        act_times.append(time.perf_counter() - begin)
+        observations, _, _, _, infos = env.step(actions)
+        before, joint = joint, split_state(problem, env.state())
+        bounds.extend(least_times(problem, joint)[(joint.goals != before.goals).any(axis=1)])
+        collided = np.array([infos[agent]["collided"] for agent in env.possible_agents])
+        touched = touched | collided
+        pictures.show(joint, collided, len(bounds) - problem.num_robots)
+    pictures.close()
+    metrics, replanned = env.unwrapped.metrics(), sum(loop.replanned for loop in policy.loops)
+    env.close()
+    row = {
+        "robots": problem.num_robots,
+        "seconds": joint.steps * problem.dt,
+        "goals": int(metrics["goals_reached"]),
+        "least_time": float(np.mean(bounds)),
+        "touched": int(touched.sum()),
+        "contacts": int(metrics["collisions"]),
+        "replanned": replanned,
+        "loop_seconds": act_times,
+    }
+    return row, pictures.frames
+
+
+def summary(drives: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The table's row of drives that differ in their seeds: means, sums, and all loops taken together."""
+    rates = [60 * drive["goals"] / (drive["robots"] * drive["seconds"]) for drive in drives]
+    bounds = [60 / drive["least_time"] for drive in drives]
+    share, lower, upper = mean_interval([rate / bound for rate, bound in zip(rates, bounds, strict=True)])
+    loops = 1000 * np.concatenate([drive["loop_seconds"] for drive in drives])
+    return {
+        "scenario": drives[0]["scenario"],
+        "robots": drives[0]["robots"],
+        "seeds": len(drives),
+        "simulated [s]": f"{sum(drive['seconds'] for drive in drives):.1f}",
+        "goals reached": sum(drive["goals"] for drive in drives),
+        "goals per robot-minute": f"{np.mean(rates):.2f}",
+        "bound": f"{np.mean(bounds):.2f}",
+        "share of the bound": f"{share:.1%}",
+        "interval": "-" if lower is None else f"{lower:.1%} to {upper:.1%}",
+        "robots that touched": sum(drive["touched"] for drive in drives),
+        "robot-steps in contact": sum(drive["contacts"] for drive in drives),
+        "loop, median [ms]": f"{np.median(loops):.0f}",
+        "loop, 95th percentile [ms]": f"{np.percentile(loops, 95):.0f}",
+        "loop, slowest [ms]": f"{loops.max():.0f}",
+        "guidance planned anew": sum(drive["replanned"] for drive in drives),
+    }
+
+
+def main() -> None:
+    """Run the loop, print the throughput and write the table and the animation of the first seed."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--minutes", type=float, default=1.0, help="simulated time per seed")
+    parser.add_argument("--scenario", default="random")
+    parser.add_argument("--num-robots", "--robots", type=count, default=16)
+    parser.add_argument("--seed", type=int, default=0, help="the first")
+    parser.add_argument("--seeds", type=count, default=1, help="how many, one after the other")
+    parser.add_argument("--film", type=float, default=20.0, help="seconds of the animation")
+    trials_argument(parser)
+    arguments = parser.parse_args()
+    num_robots, minutes, film = arguments.num_robots, arguments.minutes, arguments.film
+    if arguments.quick:
+        num_robots, minutes, film = 4, 0.1, 2.0
+
+    def measure() -> list[dict[str, Any]]:
+        drives: list[dict[str, Any]] = []
+        for seed in range(arguments.seed, arguments.seed + arguments.seeds):
+            problem = make_problem(arguments.scenario, num_robots=num_robots, seed=seed)
+            row, frames = drive(problem, seed, minutes, 0.0 if drives else film)
+            drives.append({"scenario": arguments.scenario, "seed": seed, **row})
+            if seed == arguments.seed:
+                save_gif(frames, arguments.out / "lifelong.gif", problem.dt)
+        return drives
+
+    drives = measured(arguments.trials, measure, arguments.out / "lifelong.parquet")
+    save_table([summary(drives)], arguments.out / "lifelong.csv")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""Kinds of solution that a planner finds: two robots swap places around an obstacle (the paper's appendix A).
+
+    python -m examples.studies.multimodality --seeds 100
+
+One solve per planner and seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of
+robot 1 about the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in
+which order the two robots and the obstacle lie from top to bottom as they pass each other, of which there are 3! = 6.
+The other two are cyclic (robot 0 above the obstacle, the obstacle above robot 1, robot 1 above robot 0): a robot must
+weave, and pass the other on one side before it passes the obstacle on the other. The signs do not tell how often a
+robot goes round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from examples.outputs import argument_parser, count, measured, plt, require, save_figure, save_table, trials_argument
+
+require("ipopt", "casadi")
+from d4orm_env import Problem, World, make_problem, verify
+from d4orm_planners import make_planner
+
+Signature = tuple[int, int, int]
+Row = Mapping[str, Any]
+
+PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "d4orm": ("d4orm", {}),
+    "d4orm, preset paper": ("d4orm", {"preset": "paper"}),
+    "ipopt": ("ipopt", {}),
+}
+
+CLASSES: dict[Signature, tuple[str, str]] = {
+    (-1, -1, -1): ("1 over O over 0", "#0072B2"),
+    (1, 1, 1): ("0 over O over 1", "#D55E00"),
+    (-1, 1, -1): ("O over 1 over 0", "#009E73"),
+    (-1, 1, 1): ("O over 0 over 1", "#CC79A7"),
+    (1, -1, -1): ("1 over 0 over O", "#E69F00"),
+    (1, -1, 1): ("0 over 1 over O", "#56B4E9"),
+    (-1, -1, 1): ("0 over 1 over O over 0", "black"),
+    (1, 1, -1): ("1 over 0 over O over 1", "#7F7F7F"),
+}
+"""Signs of the winding angles: the order from top to bottom (O is the obstacle), and a colour."""
+
+
+def crossing(radius: float) -> Problem:
+    """Robot 0 goes from right to left and robot 1 from left to right, with a circle at the origin in their way."""
+    return make_problem("circle", num_robots=2).replace(world=World(2, circles=[[0, 0, radius]]))
+
+
+def winding(path: np.ndarray) -> float:
+    """The angle [rad] that ``path`` ``(T, 2)`` sweeps about the origin, positive anticlockwise.
+
+    The path must not sweep half a turn or more in one step.
+    """
+    turns = np.diff(np.arctan2(path[:, 1], path[:, 0]))
+    return float(((turns + np.pi) % (2 * np.pi) - np.pi).sum())
+
+
+def signature(positions: np.ndarray) -> Signature:
+    """The signs of the winding angles of a plan ``(T, 2, 2)`` around an obstacle at the origin."""
+    first, second = positions[:, 0], positions[:, 1]
+    signs = [1 if winding(path) > 0 else -1 for path in (first, second, second - first)]
+    return signs[0], signs[1], signs[2]
+
+
+def solve(problem: Problem, seeds: int, **limits: Any) -> list[dict[str, Any]]:
+    """A row per planner and seed: whether the first solution passes, its travel time, and where the robots go."""
+    rows = []
+    for label, (name, settings) in PLANNERS.items():
+        planner = make_planner(name, **settings)
+        for seed in range(seeds):
+            plan = planner.solve(problem, seed=seed, **limits)
+            solved = plan.solved and verify(problem, plan.controls).ok
+            # To the millimetre, which compresses well.
+            places = np.round(plan.trajectory.positions.astype(np.float64), 3).ravel().tolist() if solved else []
+            rows.append(
+                {"planner": label, "seed": seed, "solved": solved, "robots": problem.num_robots,
+                 "travel_time": plan.metrics["travel_time"] if solved else None, "positions": places}
+            )  # fmt: skip
+        print(f"{label}: {sum(row['solved'] for row in rows[-seeds:])} of {seeds} seeds solved", flush=True)
+    return rows
+
+
+def solutions(rows: Sequence[Row], label: str) -> list[Row]:
+    """Return the solutions of a planner."""
+    return [row for row in rows if row["planner"] == label and row["solved"]]
+
+
+def path_of(row: Row) -> np.ndarray:
+    """``(T, K, 2)`` where the robots are [m]."""
+    return np.array(row["positions"]).reshape(-1, row["robots"], 2)
+
+
+def principal_components(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Project plans ``(T, K, 2)`` to ``(S, 2)`` [m], the two directions in which they differ most.
+
+    Also the ``(2,)`` shares of the variance.
+    """
+    features = np.stack([path.ravel() for path in paths]).astype(np.float64)
+    u, singular, _ = np.linalg.svd(features - features.mean(axis=0), full_matrices=False)
+    power = singular**2
+    # Over the root of steps times robots: two plans then lie as far apart as their robots do, in root mean square.
+    return u[:, :2] * singular[:2] / np.sqrt(features.shape[1] / 2), power[:2] / power.sum()
+
+
+def draw(problem: Problem, found: dict[Signature, list[np.ndarray]], out: Any) -> None:
+    """Left: all plans along their principal components. Right: of every class the plan nearest to its mean."""
+    rows = -(-len(found) // 2)
+    figure = plt.figure(figsize=(10.5, 0.8 + 1.45 * max(rows, 2)), layout="constrained")
+    grid = figure.add_gridspec(rows, 4, width_ratios=[1.15, 1.15, 1, 1])
+    scatter = figure.add_subplot(grid[:, :2])
+    points, shares = principal_components([plan for plans in found.values() for plan in plans])
+    first = 0
+    for number, (signs, plans) in enumerate(found.items()):
+        name, colour = CLASSES[signs]
+        part = points[first : first + len(plans)]
+        first += len(plans)
+        scatter.plot(*part.T, "o", color=colour, markersize=4.5, alpha=0.75, markeredgewidth=0, label=name)
+        panel = figure.add_subplot(grid[number // 2, 2 + number % 2])
+        typical = plans[int(((part - part.mean(axis=0)) ** 2).sum(axis=1).argmin())]
+        draw_plan(panel, problem, typical, colour)
+        panel.set_title(f"{name}: {len(plans)} plan{'s'[: len(plans) > 1]}", fontsize=9, color=colour)
+    scatter.set(
+        xlabel=f"first principal component [m], {shares[0]:.0%} of the variance",
+        ylabel=f"second principal component [m], {shares[1]:.0%} of the variance",
+    )
+    scatter.set_title(f"{len(points)} solutions in {len(found)} classes", fontsize=10)
+    scatter.set_aspect("equal", adjustable="datalim")
+    scatter.legend(title="top to bottom", loc="best", handletextpad=0.1)
+    save_figure(figure, out / "multimodality.png")
+
+
+def draw_plan(panel: Any, problem: Problem, positions: np.ndarray, colour: str) -> None:
+    """Both paths, and where the robots are when they are nearest to each other."""
+    x, y, radius = problem.world.circles[0]
+    panel.add_patch(plt.Circle((x, y), radius, color="0.75"))
+    panel.text(x, y, "O", ha="center", va="center", fontsize=8)
+    nearest = int(np.linalg.norm(positions[:, 0] - positions[:, 1], axis=1).argmin())
+    for robot, style in enumerate(("-", "--")):
+        path = positions[:, robot]
+        panel.plot(*path.T, style, color=colour, linewidth=1.4)
+        place, reach = path[nearest], float(problem.team.radius[robot])
+        panel.add_patch(plt.Circle(place, reach, facecolor="white", edgecolor=colour, zorder=3))
+        panel.text(*place, str(robot), ha="center", va="center", fontsize=6.5, zorder=4)
+    panel.set(xlim=(-2.8, 2.8), ylim=(-1.4, 1.4), aspect="equal")
+    panel.set_axis_off()
+
+
+def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """A row per class: how many plans of each planner are of it, and how long they travel."""
+    classes = {label: [signature(path_of(row)) for row in solutions(rows, label)] for label in PLANNERS}
+    table = []
+    for signs, (name, _) in CLASSES.items():
+        line = {"top to bottom": name, "signs": " ".join("+" if sign > 0 else "-" for sign in signs)}
+        for label, found in classes.items():
+            pairs = zip(solutions(rows, label), found, strict=True)
+            times = [row["travel_time"] for row, of in pairs if of == signs]
+            line[f"{label}: plans"] = str(len(times))
+            line[f"{label}: travel time [s]"] = f"{np.mean(times):.2f}" if times else ""
+        table.append(line)
+    return table
+
+
+def main() -> None:
+    """Solve with every planner and seed, count the classes, write the table and the plot of D4orm's."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--seeds", type=count, default=100)
+    parser.add_argument("--radius", type=float, default=0.5, help="of the obstacle [m]")
+    trials_argument(parser)
+    arguments = parser.parse_args()
+    seeds = min(arguments.seeds, 8) if arguments.quick else arguments.seeds
+    problem = crossing(arguments.radius)
+    rows = measured(
+        arguments.trials, partial(solve, problem, seeds, max_iterations=10), arguments.out / "multimodality.parquet"
+    )
+    save_table(summary(rows), arguments.out / "multimodality.csv")
+    paths = [path_of(row) for row in solutions(rows, "d4orm")]
+    found = {signs: [path for path in paths if signature(path) == signs] for signs in CLASSES}
+    draw(problem, {signs: members for signs, members in found.items() if members}, arguments.out)
+
+
+if __name__ == "__main__":
+    main()

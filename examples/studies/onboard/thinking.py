@@ -1,0 +1,160 @@
+"""A round of planning: a node of D-D4orm in a thread of its own, while the robot drives on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from examples.studies.onboard.course import Course, digest
+from examples.studies.onboard.mission import Mission
+
+from d4orm_env import Problem
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.engine.types import Engine
+from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.d_d4orm.evaluator import Evaluator
+from d4orm_planners.d_d4orm.node import Node, Task
+from d4orm_planners.d_d4orm.node_events import Event
+from d4orm_planners.d_d4orm.transport import Transport
+
+PATIENCE = 0.25
+"""Seconds that a node waits for the others after each of its iterations."""
+
+RESEND = 0.2
+"""Seconds between two looks at whether everybody has the best candidate, once all had it."""
+
+LOOK = 0.02
+"""Seconds between two looks at what has arrived, before that."""
+
+SEQUENCE = 10_000
+"""More messages than a node sends in a round; a later round's are numbered on from there."""
+
+
+@dataclass(frozen=True)
+class Agenda:
+    """Task of a round of planning.
+
+    Attributes:
+        number: Of the round; later ones have larger numbers.
+        members: The robots that are alive, whose nodes are numbered in this order.
+        takeover: Tick at which the plan begins.
+        problem: The problem that begins then.
+        guess: ``(H, K, m)`` controls to start from.
+    """
+
+    number: int
+    members: tuple[int, ...]
+    takeover: int
+    problem: Problem
+    guess: FloatArray
+
+
+class Round:
+    """Planning from where the team will be when the plan takes over.
+
+    Args:
+        agenda: Task of the round.
+        mission: The settings.
+        robot: Owner of the node.
+        engine: Engine for rollouts and samples.
+        team: Network for candidates.
+        observer: Called with what the node does, and the digest of the plan that it is about.
+    """
+
+    def __init__(
+        self,
+        agenda: Agenda,
+        mission: Mission,
+        robot: int,
+        engine: Engine,
+        team: Transport,
+        observer: Callable[[Event, str], None],
+    ) -> None:
+        self.agenda = agenda
+        self._mission, self._engine, self._team, self._observer = mission, engine, team, observer
+        self._iterated, self._enough, self._settled, self._over = (threading.Event() for _ in range(4))
+        self._node: Node | None = None
+        self._error: Exception | None = None
+        self._known: dict[str, Candidate] = {}
+        self._learned = threading.Condition()
+        # A node that is at its last iteration must not keep the robot from ending.
+        self._thread = threading.Thread(target=self._work, args=(robot,), daemon=True, name=f"round-{agenda.number}")
+        self._thread.start()
+
+    def _work(self, robot: int) -> None:
+        try:
+            self._node = self._make_node(robot)
+            self._think(self._node)
+        except Exception as error:
+            self._error = error
+        finally:
+            self._iterated.set()
+            self._settled.set()
+
+    def _make_node(self, robot: int) -> Node:
+        agenda, planning = self.agenda, self._mission.planning()
+        nodes, own = len(agenda.members), agenda.members.index(robot)
+        seed = derived_seed(self._mission.seed, Stream.TAKEOVER, agenda.takeover)
+        task = Task(nodes, seed, agenda.guess, planning.selection, planning.k)
+        planner, judge = planning.node_planners(nodes)[own], Evaluator(self._engine, agenda.problem)
+        return Node(own, task, planner, self._team, judge, sequence=SEQUENCE * agenda.number, observer=self._observe)
+
+    def _observe(self, event: Event) -> None:
+        plan = digest(self._engine, self.agenda.problem, event.candidate)
+        with self._learned:
+            self._known[plan] = event.candidate
+            self._learned.notify_all()
+        self._observer(event, plan)
+
+    def _think(self, node: Node) -> None:
+        iterations = 0
+        while not self._enough.is_set():
+            node.step(self._enough, PATIENCE, improve=True)
+            iterations += 1
+            if iterations == self._mission.iterations:
+                self._iterated.set()
+        while not self._over.is_set():
+            if all_have := node.settle(RESEND):
+                self._settled.set()
+            self._over.wait(RESEND if all_have else LOOK)
+
+    def enough(self, timeout: float) -> None:
+        """Begin no further iteration, if the least number is done or the seconds are over: tell the best candidate."""
+        self._iterated.wait(timeout)
+        self._enough.set()
+
+    def settle(self, timeout: float) -> None:
+        """Wait until every robot has sent a candidate as good as the best one here, or the seconds are over."""
+        self._settled.wait(timeout)
+
+    def best(self) -> Course | None:
+        """The best solution that this robot has by now, its own or another's, if there is any.
+
+        Raises:
+            RuntimeError: If the node has failed.
+        """
+        if self._error is not None:
+            raise RuntimeError(f"round {self.agenda.number} has failed: {self._error}") from self._error
+        return None if self._node is None else self._course(self._node.search.best)
+
+    def progress_on(self, problem: Problem) -> FloatArray | None:
+        """``(H, K, m)`` controls that this round ended with, if it was about the same problem; else ``None``."""
+        return self._node.search.best.controls if self._node is not None and problem == self.agenda.problem else None
+
+    def named(self, plan: str, timeout: float) -> Course | None:
+        """The solution of that digest, if this robot has it or gets it within the seconds, and it is one."""
+        with self._learned:
+            self._learned.wait_for(lambda: plan in self._known, timeout)
+            candidate = self._known.get(plan)
+        return None if candidate is None else self._course(candidate)
+
+    def end(self, timeout: float) -> None:
+        """Let go of it; an iteration under way is waited for, so that no two rounds take turns on a core."""
+        self._enough.set()
+        self._over.set()
+        self._thread.join(timeout)
+
+    def _course(self, candidate: Candidate) -> Course | None:
+        return Course.of(self.agenda.takeover, self.agenda.problem, self._engine, candidate)

@@ -1,0 +1,176 @@
+"""The simulated world: it tells all robots where they are, and moves them as they command."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from examples.studies.onboard import wire
+from examples.studies.onboard.mission import Mission
+
+from d4orm_env import navigation_v0
+from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.d_d4orm.transport import Transport
+
+AGAIN = 0.25
+"""Seconds after which robots that have not answered are told again, as messages may get lost."""
+
+FAREWELLS, FAREWELL = 3, 0.1
+"""Number of times that the robots are told that it is over, and the seconds between."""
+
+START = 300.0
+"""Seconds within which every robot must have answered for the first time."""
+
+
+@dataclass
+class Record:
+    """Record of a run, tick by tick.
+
+    Attributes:
+        joints: The joint states, one more than steps.
+        reached: ``(K,)`` who reached a goal, per step.
+        collided: ``(K,)`` who touched something, per step.
+        executing: Plans that the robots said they execute, per step.
+        lost: Robots that had been given up, per step.
+        began: Time at which each tick began, by :func:`time.perf_counter` [s].
+        answered: Seconds until all had answered, per step.
+    """
+
+    joints: list[JointState] = field(default_factory=list)
+    reached: list[Any] = field(default_factory=list)
+    collided: list[Any] = field(default_factory=list)
+    executing: list[set[str]] = field(default_factory=list)
+    lost: list[list[int]] = field(default_factory=list)
+    began: list[float] = field(default_factory=list)
+    answered: list[float] = field(default_factory=list)
+
+    @property
+    def steps(self) -> int:
+        """Ticks that were simulated, to the end of each."""
+        return max(len(self.joints) - 1, 0)
+
+    @property
+    def goals_reached(self) -> int:
+        """Number of goals reached by all robots."""
+        return int(np.sum(self.reached))
+
+    @property
+    def wall(self) -> float:
+        """Seconds that it took."""
+        return self.began[-1] + self.answered[-1] - self.began[0] if self.answered else 0.0
+
+
+class World:
+    """The environment, in lifelong mode, at the other end of the robots' network.
+
+    A tick begins when all robots have answered the one before, but no sooner than real time allows: who is slow
+    holds the world up, and who does not answer within the mission's patience is given up and stops.
+
+    Args:
+        mission: The settings.
+        robots: The network.
+        ticks: Most ticks.
+        speed: Simulated seconds per second at most.
+    """
+
+    def __init__(self, mission: Mission, robots: Transport, ticks: int, speed: float) -> None:
+        self.problem = mission.problem()
+        self.record = Record()
+        self._mission, self._robots, self._speed = mission, robots, speed
+        self._env = navigation_v0.parallel_env(problem=self.problem, lifelong=True, max_cycles=ticks)
+        self._env.reset()
+        # A step may compile, which must not happen while robots wait.
+        self._env.step(dict.fromkeys(self.agents, np.zeros(self.problem.control_size, np.float32)))
+        self._env.reset(seed=mission.seed)
+        self._lost: set[int] = set()
+        self._commands: dict[int, wire.Command] = {}
+
+    def await_robots(self, check: Callable[[], None]) -> None:
+        """Wait for the first answer of every robot.
+
+        Args:
+            check: Called again and again; raises if there is no use in waiting.
+
+        Raises:
+            RuntimeError: If somebody does not answer.
+        """
+        deadline = time.perf_counter() + START
+        while missing := self._ask(0, AGAIN):
+            check()
+            if time.perf_counter() > deadline:
+                raise RuntimeError(f"robots {sorted(missing)} have not answered within {START:g} s")
+
+    def run(self, each_tick: Callable[[int], None]) -> None:
+        """Simulate to the end.
+
+        Args:
+            each_tick: Called with the number of every tick before it begins.
+        """
+        record, due = self.record, time.perf_counter()
+        record.joints.append(split_state(self.problem, self._env.state()))
+        while self._env.agents:
+            tick = record.steps
+            each_tick(tick)
+            time.sleep(max(due - time.perf_counter(), 0))
+            record.began.append(time.perf_counter())
+            due = max(due, record.began[-1] - self.problem.dt / self._speed) + self.problem.dt / self._speed
+            missing = self._ask(tick, self._mission.patience)
+            record.answered.append(time.perf_counter() - record.began[-1])
+            self._lost |= missing
+            self._step()
+
+    def end(self) -> None:
+        """Tell the robots that it is over."""
+        for _ in range(FAREWELLS):
+            self._robots.publish(wire.encode(wire.END))
+            time.sleep(FAREWELL)
+        self._env.close()
+
+    def _ask(self, tick: int, seconds: float) -> set[int]:
+        """Tell where everybody is and collect the commands; who has not answered in time."""
+        state = [float(value) for value in self._env.state()]
+        former = [self._commands.get(robot) for robot in range(len(self.agents))]
+        ballots = ["" if command is None else command.ballot for command in former]
+        rewards = [0.0 if command is None else command.reward for command in former]
+        question = wire.encode(wire.Tick(tick, state, sorted(self._lost), ballots, rewards))
+        deadline, again = time.perf_counter() + seconds, 0.0
+        while missing := {robot for robot in range(len(self.agents)) if self._is_awaited(robot, tick)}:
+            now = time.perf_counter()
+            if now >= deadline:
+                break
+            if now >= again:
+                self._robots.publish(question)
+                again = now + AGAIN
+            for data in self._robots.collect(min(again, deadline) - now):
+                self._take(wire.decode(data, wire.Command), tick)
+        return missing
+
+    @property
+    def agents(self) -> list[str]:
+        """Names of the robots."""
+        return list(self._env.possible_agents)
+
+    def _is_awaited(self, robot: int, tick: int) -> bool:
+        return robot not in self._lost and (robot not in self._commands or self._commands[robot].number != tick)
+
+    def _take(self, command: wire.Command | None, tick: int) -> None:
+        if command is None or command.number != tick or not 0 <= command.robot < len(self.agents):
+            return
+        if command.robot not in self._lost and len(command.control) == self.problem.control_size:
+            self._commands[command.robot] = command
+
+    def _step(self) -> None:
+        record, robots = self.record, range(len(self.agents))
+        moving = [robot for robot in robots if robot not in self._lost]
+        controls = np.zeros((len(self.agents), self.problem.control_size), np.float32)
+        for robot in moving:
+            controls[robot] = self._commands[robot].control
+        _, _, _, _, infos = self._env.step(dict(zip(self.agents, controls, strict=True)))
+        record.executing.append({self._commands[robot].executing for robot in moving})
+        record.lost.append(sorted(self._lost))
+        record.reached.append(np.array([infos[agent]["arrived"] for agent in self.agents]))
+        record.collided.append(np.array([infos[agent]["collided"] for agent in self.agents]))
+        record.joints.append(split_state(self.problem, self._env.state()))

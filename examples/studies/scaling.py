@@ -1,0 +1,94 @@
+"""Planning time of D4orm-D by team size at constant density.
+
+    python -m examples.studies.scaling --seeds 3
+    python -m examples.studies.scaling --seeds 1 --num-robots 2000
+
+Random starts and goals on a square with 1.5625 square metres per robot: 10 m x 10 m for 64 of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from examples.outputs import COLOURS, argument_parser, count, measured, plt, save_figure, save_table, trials_argument
+
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+
+ROBOTS = (8, 16, 32, 64, 100, 200, 500, 1000)
+AREA = 10.0**2 / 64
+"""Square metres per robot."""
+
+
+def draw(rows: list[dict[str, Any]], out: Any) -> None:
+    """Planning time against robots, with the power law that fits it best."""
+    robots = np.array([row["robots"] for row in rows], float)
+    seconds = np.array([float(row["seconds, median"]) for row in rows])
+    figure, ax = plt.subplots(figsize=(4.4, 3.2), layout="constrained")
+    ax.plot(robots, seconds, "o", color=COLOURS["d4orm"], label="median")
+    if len(robots) > 1:
+        power, offset = np.polyfit(np.log(robots), np.log(seconds), 1)
+        ax.plot(robots, np.exp(offset) * robots**power, color="0.5", label=f"robots to the power of {power:.2f}")
+    ax.set(xlabel="robots", ylabel="first solution [s]", xscale="log", yscale="log")
+    ax.set_xticks(robots, [f"{number:g}" for number in robots])
+    ax.minorticks_off()
+    ax.legend()
+    save_figure(figure, out / "scaling.png")
+
+
+def measure(sizes: Sequence[int], seeds: int, time_limit: float) -> list[dict[str, Any]]:
+    """A row per team size and problem."""
+    planner = make_planner("hybrid", max_iterations=1000)
+    rows = []
+    for robots in sizes:
+        for seed in range(seeds):
+            problem = make_problem("random", num_robots=robots, seed=seed, size=(robots * AREA) ** 0.5)
+            plan = planner.solve(problem, seed=seed, time_limit=time_limit)
+            rows.append(
+                {"robots": robots, "seed": seed, "solved": plan.solved, "iterations": plan.iterations,
+                 "seconds": plan.wall_time}
+            )  # fmt: skip
+            print(rows[-1], flush=True)
+    return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row per team size."""
+    table = []
+    for robots in dict.fromkeys(row["robots"] for row in rows):
+        team = [row for row in rows if row["robots"] == robots]
+        seconds = [row["seconds"] for row in team]
+        table.append(
+            {
+                "robots": robots,
+                "side [m]": f"{(robots * AREA) ** 0.5:.1f}",
+                "solved": f"{sum(row['solved'] for row in team)} of {len(team)}",
+                "iterations, median": f"{np.median([row['iterations'] for row in team]):g}",
+                "seconds, median": f"{np.median(seconds):.2f}",
+                "seconds, most": f"{max(seconds):.2f}",
+                "ms per robot": f"{1000 * np.median(seconds) / robots:.1f}",
+            }
+        )
+    return table
+
+
+def main() -> None:
+    """Plan for every team size, and write the table and the plot."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--num-robots", "--robots", type=count, nargs="+", default=ROBOTS)
+    parser.add_argument("--seeds", type=count, default=3, help="problems per team size")
+    parser.add_argument("--time-limit", type=float, default=120.0, help="seconds per plan")
+    trials_argument(parser)
+    arguments = parser.parse_args()
+    sizes, seeds = ((4, 8), 1) if arguments.quick else (arguments.num_robots, arguments.seeds)
+    plans = partial(measure, sizes, seeds, arguments.time_limit)
+    rows = summary(measured(arguments.trials, plans, arguments.out / "scaling.parquet"))
+    save_table(rows, arguments.out / "scaling.csv")
+    draw(rows, arguments.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,155 @@
+"""Reinforcement learning with several seeds: curves of PPO and SAC with 95% intervals of the mean (Student's t).
+
+    python -m examples.studies.training_seeds --seeds 3
+    python -m examples.studies.training_seeds --curves data/training_curves.csv
+
+Trains every learner with every seed, one after another: about three hours of one core. Broken off, it goes on where it
+was. With ``--curves`` it trains nothing, and makes table and picture of a file that it wrote before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from examples.outputs import COLOURS, argument_parser, count, plt, require, save_figure, save_table
+
+require("rl", "stable_baselines3", "tensorboard")
+
+from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.evaluation.summary import mean_interval
+from d4orm_planners.rl.curve import Evaluation
+from d4orm_planners.rl.training import TrainingSettings, train
+
+CROWDS = TrainingSettings(
+    network="sets", mixture=("crowds",), observed_robots=8, num_envs=1536, steps=6_000_000, lessons=12,
+    learning_rate=5e-4, validation_worlds=330,
+)  # fmt: skip
+LEARNERS: Mapping[str, TrainingSettings] = {
+    "PPO, holonomic2d, crowds": replace(CROWDS, model="holonomic2d"),
+    "PPO, differential_drive, crowds": replace(CROWDS, model="differential_drive"),
+    "PPO, holonomic2d, walls": replace(CROWDS, mixture=("walls",), ways=True, lessons=6, validation_worlds=210),
+    "SAC, holonomic2d, crowds": TrainingSettings(
+        algorithm="sac",
+        network="sets",
+        mixture=("crowds",),
+        observed_robots=6,
+        num_envs=64,
+        steps=1_500_000,
+        lessons=10,
+        learner_settings={"gradient_steps": 12},
+        validation_worlds=330,
+    ),
+    "SAC, holonomic2d, 4 random robots": TrainingSettings(
+        algorithm="sac", num_robots=4, steps=400_000, lessons=10, curriculum=True
+    ),
+}
+QUICK = {"steps": 256, "lessons": 2, "validation_worlds": 2, "num_envs": 16}
+Rows = Sequence[Mapping[str, str]]
+
+
+def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, str]]:
+    """A row per learner, seed and lesson."""
+    rows = []
+    for learner, settings in LEARNERS.items():
+        for seed in range(seeds):
+            chosen = replace(settings, seed=seed)
+            if quick:
+                chosen = replace(chosen, **QUICK, mixture=("random 2", "circle 2") if chosen.mixture else ())
+            folder = out / f"{learner.lower().replace(', ', '-').replace(' ', '-')}-{seed}"
+            print(f"{learner}, seed {seed}", flush=True)
+            rows += [_row(learner, seed, point) for point in train(chosen, folder).curve]
+    return rows
+
+
+def _row(learner: str, seed: int, point: Evaluation) -> dict[str, str]:
+    return {
+        "learner": learner,
+        "seed": str(seed),
+        "steps": str(point.steps),
+        "success": f"{point.success_rate:.4f}",
+        "travel_time": f"{point.travel_time:.3f}",
+        "seconds": f"{point.seconds:.1f}",
+        "env_share": f"{point.env_share:.3f}",
+    }
+
+
+def by_learner(rows: Rows) -> dict[str, dict[int, list[Mapping[str, str]]]]:
+    """Rows by learner and steps, a row per seed."""
+    found: dict[str, dict[int, list[Mapping[str, str]]]] = {}
+    for row in rows:
+        found.setdefault(row["learner"], {}).setdefault(int(row["steps"]), []).append(row)
+    return found
+
+
+def summary(rows: Rows) -> list[dict[str, object]]:
+    """A row per learner: what its seeds came to in the end, and what they took."""
+    table: list[dict[str, object]] = []
+    for learner, lessons in by_learner(rows).items():
+        last, every = lessons[max(lessons)], [row for lesson in lessons.values() for row in lesson]
+        ends = [100 * float(row["success"]) for row in last]
+        success, lower, upper = mean_interval(ends)
+        minutes = sum(float(row["seconds"]) for row in every) / len(last) / 60
+        row = {
+            "learner": learner,
+            "seeds": len(last),
+            "robot-steps": f"{max(lessons) / 1e6:.1f} million",
+            "success in the end": f"{success:.0f}%",
+            "95% interval": "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%",
+            "least, most": f"{min(ends):.0f}%, {max(ends):.0f}%",
+            "travel time [s]": f"{np.mean([float(one['travel_time']) for one in last]):.2f}",
+            "minutes each": f"{minutes:.0f}",
+            "environment's share": f"{np.mean([float(one['env_share']) for one in every]):.0%}",
+        }
+        table.append(row)
+    return table
+
+
+def draw(rows: Rows, path: Path) -> None:
+    """Every seed thin, their mean thick, and its interval."""
+    found = by_learner(rows)
+    figure, axes = plt.subplots(1, len(found), figsize=(3.6 * len(found), 3), sharey=True, squeeze=False)
+    for axis, (learner, lessons), colour in zip(axes[0], found.items(), COLOURS.values(), strict=False):
+        steps = np.array(sorted(lessons)) / 1e6
+        seeds = np.array([[100 * float(row["success"]) for row in lessons[number]] for number in sorted(lessons)])
+        ends = [mean_interval(values) for values in seeds.tolist()]
+        axis.plot(steps, seeds, color=colour, linewidth=0.7, alpha=0.6)
+        axis.plot(steps, seeds.mean(axis=1), color=colour, linewidth=2)
+        if all(lower is not None for _, lower, _ in ends):
+            lower, upper = (np.array([end[side] for end in ends], float) for side in (1, 2))
+            axis.fill_between(steps, lower, upper, color=colour, alpha=0.15, linewidth=0)
+        axis.set(title=learner, xlabel="robot-steps [million]", ylim=(0, 100))
+    axes[0, 0].set_ylabel("success on validation instances [%]")
+    figure.tight_layout()
+    save_figure(figure, path)
+
+
+def main() -> int:
+    """Train, or read curves; write the curves, a table of their ends and the picture."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--seeds", type=count, default=3, help="trainings per learner")
+    parser.add_argument("--curves", type=Path, help="train nothing; a training_curves.csv")
+    arguments: argparse.Namespace = parser.parse_args()
+    rows: Rows
+    if arguments.curves is None:
+        rows = measure(arguments.seeds, arguments.out, arguments.quick)
+        path = arguments.out / "training_curves.csv"
+        with replaced_when_done(path) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    else:
+        with arguments.curves.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    save_table(summary(rows), arguments.out / "training_seeds.csv")
+    draw(rows, arguments.out / "training_seeds.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
