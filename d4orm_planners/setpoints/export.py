@@ -28,7 +28,7 @@ class ExportReport:
         files: Their paths.
         duration: Of the motion [s].
         stretch: Times the plan's duration that it takes.
-        deviation: Largest distance from the plan, at the same share of its duration [m].
+        deviation: Largest distance from the plan at its steps [m].
         min_separation: Least gap between two robots [m].
         min_clearance: Least gap to an obstacle or bound [m].
         pieces: Polynomials a robot, or ``None``.

@@ -32,7 +32,7 @@ class Setpoints:
         jerk: ``(T, K, d)`` [m/s^3].
         heading: ``(T, K)`` [rad], not wrapped; zero for robots whose model has none.
         stretch: Times the plan's duration that the motion takes, at least 1.
-        deviation: Largest distance from where the plan has the robots at the same share of its duration [m].
+        deviation: Largest distance from the plan at its steps [m].
         report: What the verification found: least separation and clearance.
     """
 

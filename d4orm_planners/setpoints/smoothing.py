@@ -27,9 +27,9 @@ from d4orm_env.verify.curves import verify_curves
 DEGREE = 5
 SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
 """Weights of the squared third differences of a curve's coefficients, against the squared distances from the plan."""
-SETTLING = 5
-"""Steps after the last arrival in which the team comes to rest."""
-PER_STEP = 16
+GATHERING, SETTLING = 2, 5
+"""Steps before a plan from rest in which the team gathers way, and after the last arrival in which it comes to rest."""
+PER_STEP = 32
 """Times a step at which a motion's speeds, accelerations and jerks are looked at."""
 RESERVE = 1e-3
 """Share of the limits that is left for what happens between these times."""
@@ -218,15 +218,16 @@ def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> Smoo
     """The plan's positions and headings by splines, as they are timed."""
     moving = np.any(trajectory.positions[1:] != trajectory.positions[:-1], axis=(1, 2))
     last = int(np.flatnonzero(moving).max(initial=0)) + 1 + SETTLING
-    rows = np.minimum(np.arange(last + 1), len(trajectory.positions) - 1)
+    velocity, no_turn = _initial_velocity(problem), np.zeros(problem.num_robots)
+    first = 0 if velocity.any() else -GATHERING
+    rows = np.clip(np.arange(first, last + 1), 0, len(trajectory.positions) - 1)
     headings = np.zeros((len(rows), problem.num_robots))
     for robot, model in enumerate(problem.team.robot_models):
         if model.heading_index is not None:
             headings[:, robot] = np.unwrap(trajectory.states[rows, robot, model.heading_index].astype(np.float64))
     places = trajectory.positions[rows].astype(np.float64)
-    velocity, no_turn = _initial_velocity(problem), np.zeros(problem.num_robots)
     curves = fit_spline(places, velocity, problem.dt, smoothness)
-    offset = curves(np.linspace(0, last * problem.dt, last + 1)) - places
+    offset = curves(np.linspace(0, (last - first) * problem.dt, len(rows))) - places
     deviation = float(np.linalg.norm(offset, axis=2).max())
     return SmoothMotion(problem, curves, fit_spline(headings, no_turn, problem.dt, smoothness), deviation)
 

