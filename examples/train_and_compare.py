@@ -24,10 +24,10 @@ def main() -> None:
     parser.add_argument("--steps", type=count, default=5_000_000, help="robot-steps to train")
     parser.add_argument("--trials", type=count, default=20, help="random instances per policy and level of noise")
     arguments = parser.parse_args()
-    settings = TrainingSettings(num_robots=arguments.num_robots, steps=arguments.steps, lessons=20)
+    settings = TrainingSettings(num_robots=arguments.num_robots, steps=arguments.steps, stages=20)
     noise, trials = (0.0, 0.2, 0.5), arguments.trials
     if arguments.quick:
-        settings = TrainingSettings(num_robots=2, steps=2048, num_envs=32, lessons=2, validation_worlds=4)
+        settings = TrainingSettings(num_robots=2, steps=2048, num_envs=32, stages=2, validation_worlds=4)
         noise, trials = (0.0, 0.5), 2
     result = train(settings, arguments.out / "ppo", progress=report)
     policies = {"ppo": {"path": str(result.policy_path)}, "d4orm-c2f": {"refine": "sync"}, "orca": {}}

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 120.0
+TIMEOUT = 120.0
 """Seconds that anything may take on a loaded machine."""
 
 
@@ -43,7 +43,7 @@ class Page:
     def __init__(self, address: str) -> None:
         from websockets.sync.client import connect
 
-        self._socket = connect(address, max_size=None, open_timeout=PATIENCE)
+        self._socket = connect(address, max_size=None, open_timeout=TIMEOUT)
         self._number = 0
         self.complaints: list[str] = []
         self.requests: list[str] = []
@@ -55,7 +55,7 @@ class Page:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=PATIENCE))
+            message = json.loads(self._socket.recv(timeout=TIMEOUT))
             if message.get("id") == self._number:
                 assert "error" not in message, message["error"]
                 return message["result"]
@@ -83,7 +83,7 @@ class Page:
 
     def until(self, expression: str) -> Any:
         """Wait for an expression to become true, and return it."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not (value := self.evaluate(expression)):
             assert time.monotonic() < end, f"{expression} is still {value!r}; {self.complaints}"
             time.sleep(0.05)
@@ -171,7 +171,7 @@ def _address(folder: Path, process: subprocess.Popen[bytes]) -> str:
     """Where the page is debugged, once the browser has written its port."""
     from urllib.request import urlopen
 
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while time.monotonic() < end:
         assert process.poll() is None, (folder / "log.txt").read_text(errors="replace")
         try:

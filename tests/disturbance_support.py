@@ -20,11 +20,11 @@ from d4orm_env.disturbances import (
     Gain,
     Intruder,
     LimitMismatch,
+    Observed,
     Occlusion,
     Push,
     Quantisation,
     Scene,
-    Seen,
     Stall,
     StateDelay,
     StateNoise,
@@ -52,7 +52,7 @@ class Wind(Disturbance[Gusts]):
         states[..., 0] += np.float32(scene.problem.dt) * memory.speed
         return states, controls
 
-    def see(self, seen: Seen, memory: Gusts, scene: Scene, draws: Draws) -> Seen:
+    def see(self, seen: Observed, memory: Gusts, scene: Scene, draws: Draws) -> Observed:
         return seen._replace(states=seen.states + np.float32(0.01) * (np.arange(seen.states.shape[2]) < 2))
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from d4orm_planners.d_d4orm.transport import Transport
 
-PATIENCE = 120.0
+TIMEOUT = 120.0
 """Seconds that anything may take on a busy machine before a test gives up on it."""
 
 
@@ -29,7 +29,7 @@ def port_of(endpoint: str) -> int:
     return int(endpoint.rpartition(":")[2])
 
 
-def wait_until(condition: Callable[[], Any], what: str = "it", seconds: float = PATIENCE) -> None:
+def wait_until(condition: Callable[[], Any], what: str = "it", seconds: float = TIMEOUT) -> None:
     """Return as soon as a condition holds."""
     deadline = time.perf_counter() + seconds
     while not condition():

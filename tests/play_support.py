@@ -17,7 +17,7 @@ from websockets.sync.client import ClientConnection, connect
 from d4orm_env import Problem
 from d4orm_planners.play.playground import Playground
 
-PATIENCE = 60.0
+TIMEOUT = 60.0
 
 
 @contextmanager
@@ -46,7 +46,7 @@ def opened(
 
 def reached(port: int, host: str = "127.0.0.1") -> socket.socket:
     """A connection to a port of this machine."""
-    return socket.create_connection((host, port), timeout=PATIENCE)
+    return socket.create_connection((host, port), timeout=TIMEOUT)
 
 
 def visitor(playground: Playground) -> ClientConnection:
@@ -92,7 +92,7 @@ def drag(phase: str, index: int | None, end: tuple[float, ...] = (0.3, 0.4, 0), 
 
 def until(condition: Callable[[], object]) -> None:
     """Wait for something that another thread does."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)

@@ -44,9 +44,7 @@ def kill(restarts: int, mode: str) -> tuple[list[int], list[int], list[str], boo
         The actors' processes before and after, the notes of the rounds, and whether the team was brought home.
     """
     ray_planner.RESTARTS = restarts
-    planner = make_planner(
-        "d-d4orm", engine="cpu", transport="ray", mode=mode, improve=True, patience=60, num_steps=400
-    )
+    planner = make_planner("d-d4orm", engine="cpu", transport="ray", mode=mode, improve=True, timeout=60, num_steps=400)
     search = SolveRun(planner, make_problem("circle", num_robots=8), 0, None)
     notes: list[str] = []
     try:
@@ -65,14 +63,14 @@ def kill(restarts: int, mode: str) -> tuple[list[int], list[int], list[str], boo
     return before, after, [note for note in notes if note], search.plan("stopped").solved
 
 
-def overdue(patience: float) -> tuple[str, str, int]:
+def overdue(timeout: float) -> tuple[str, str, int]:
     """A second of rounds that would take minutes: the status, the last note, and the denoising steps that were made."""
-    planner = make_planner("d-d4orm", engine="cpu", transport="ray", improve=True, patience=patience, num_steps=200000)
+    planner = make_planner("d-d4orm", engine="cpu", transport="ray", improve=True, timeout=timeout, num_steps=200000)
     plan = planner.solve(make_problem("circle", num_robots=8), time_limit=1)
     return plan.status, plan.history[-1].note, plan.denoising_steps
 
 
-def frozen(patience: float) -> tuple[str, str, int]:
+def frozen(timeout: float) -> tuple[str, str, int]:
     """The same with actors that are stopped before they begin."""
     start = ray_planner.RayPlanner.start
 
@@ -82,7 +80,7 @@ def frozen(patience: float) -> tuple[str, str, int]:
 
     ray_planner.RayPlanner.start = start_and_freeze
     try:
-        return overdue(patience)
+        return overdue(timeout)
     finally:
         ray_planner.RayPlanner.start = start
 
@@ -127,8 +125,8 @@ def main() -> None:
     report("shared", connection.ray.is_initialized())
     for restarts in (3, 0):
         report(f"killed, {restarts} restarts", [kill(restarts, mode) for mode in ("sync", "async")])
-    report("in time", overdue(patience=60))
-    report("frozen", frozen(patience=0.1))
+    report("in time", overdue(timeout=60))
+    report("frozen", frozen(timeout=0.1))
     connection.close()
     heard: set[str] = set()
     planner = make_planner("d-d4orm", transport="ray", **SETTINGS)

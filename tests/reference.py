@@ -22,7 +22,7 @@ ROUNDINGS = 16
 """Operations between a state and the next, at most, each with a rounding of its own."""
 
 
-class Judged(NamedTuple):
+class Evaluated(NamedTuple):
     """``M`` samples of ``K`` robots.
 
     Attributes:
@@ -37,7 +37,7 @@ class Judged(NamedTuple):
     inverse_distance: np.ndarray
 
 
-def judge(task: SamplingTask, controls: np.ndarray) -> Judged:
+def evaluate(task: SamplingTask, controls: np.ndarray) -> Evaluated:
     """Roll out ``controls`` ``(M, H, K, m)`` and score them as the task says."""
     problem = task.problem
     num_samples, d = len(controls), problem.dimension
@@ -55,7 +55,7 @@ def judge(task: SamplingTask, controls: np.ndarray) -> Judged:
         total += 1 - inverse * np.linalg.norm(problem.goal - place, axis=-1)
         total -= task.penalty * problem.collision_penalty * sum((gap <= 0).astype(float) for gap in beyond)
         doubt = np.minimum(doubt, np.abs(np.stack([short, *beyond])).min(axis=(0, 2)))
-    return Judged(total.T / controls.shape[1], doubt, inverse)
+    return Evaluated(total.T / controls.shape[1], doubt, inverse)
 
 
 def position_error(task: SamplingTask, controls: np.ndarray, control_error: float = 0.0) -> float:

@@ -1,4 +1,4 @@
-"""Shortest ways by another road: visibility graphs of inflated obstacles, by shapely and SciPy."""
+"""Shortest paths by another road: visibility graphs of inflated obstacles, by shapely and SciPy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from d4orm_env import World
 
 
 def visible_lengths(world: World, reach: float, source: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Lengths of the shortest ways of a disc of this reach from ``source`` to ``places`` ``(Q, 2)``.
+    """Lengths of the shortest paths of a disc of this reach from ``source`` to ``places`` ``(Q, 2)``.
 
     Inflated corners are polygons inside of the true arcs, so that lengths are never too large, and hardly too small.
     """
@@ -24,7 +24,7 @@ def visible_lengths(world: World, reach: float, source: np.ndarray, places: np.n
         for outline in (oriented.exterior, *oriented.interiors):
             points = np.asarray(outline.coords)[:-1]
             before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
-            # Ways turn only where an obstacle bulges out.
+            # Paths turn only where an obstacle bulges out.
             corners.append(points[before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0])
     nodes = np.concatenate(corners)
     low, high = world.bounds.astype(np.float64)

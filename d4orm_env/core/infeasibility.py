@@ -53,7 +53,7 @@ def prove_infeasible(problem: Problem) -> dict[int, str]:
     proofs |= dict(_crowded(problem, "has a goal", goals, at_rest, "the goal radius"))
     if not proofs and problem.world.num_obstacles:
         robots = _walled_off(problem, starts, goals, float(doubt))
-        proofs = dict.fromkeys(robots, "has no free way to its goal: walls are closed all round the one or the other")
+        proofs = dict.fromkeys(robots, "has no free path to its goal: walls are closed all round the one or the other")
     return proofs
 
 

@@ -44,18 +44,17 @@ def mean_squared_jerk(controls: FloatArray, arrived: BoolArray, dt: float) -> fl
 
 
 def stretch(problem: Problem, trajectory: Trajectory) -> np.ndarray:
-    """``(K,)`` the way that each robot travelled over its shortest free way, :attr:`Problem.shortest_paths`; 1 is the
-    least.
+    """``(K,)`` length that each robot travelled over its shortest path's, :attr:`Problem.shortest_paths`; 1 is least.
 
-    The rest of the way, from where the robot docked to the goal itself, counts as travelled. Infinite for a robot that
-    did not arrive, or that has no free way.
+    The rest of the path, from where the robot docked to the goal itself, counts as travelled. Infinite for a robot that
+    did not arrive, or that has no free path.
 
     Among obstacles the first call for a problem takes some 20 ms per robot, so that it is no part of
     :func:`trajectory_metrics`.
     """
     positions = np.asarray(trajectory.positions, np.float64)
-    way = np.concatenate([positions, problem.goal[None].astype(np.float64)])
-    travelled = np.linalg.norm(np.diff(way, axis=0), axis=-1).sum(axis=0)
+    path = np.concatenate([positions, problem.goal[None].astype(np.float64)])
+    travelled = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum(axis=0)
     shortest = problem.shortest_paths.length
     counts = trajectory.arrived[-1] & np.isfinite(shortest)
     return np.where(counts, travelled / np.maximum(shortest, problem.goal_radius), np.inf)

@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.problem import Problem
 
 WINDING = 10
-"""The longest way that an observation tells, over the farthest that anything may be from a robot."""
+"""The longest path that an observation tells, over the farthest that anything may be from a robot."""
 
 
 class BoundsSlack(NamedTuple):
@@ -94,7 +94,7 @@ class ObservationSlices:
         dimension: ``d``.
         num_neighbors: Neighbours listed, nearest first.
         num_obstacles: Obstacles listed, nearest first; walls of the bounds are among them.
-        observed_path: Whether the way is there.
+        observed_path: Whether the path is there.
     """
 
     dimension: int
@@ -124,7 +124,7 @@ class ObservationSlices:
 
     @cached_property
     def path(self) -> PathParts:
-        """Slices of :meth:`ways`."""
+        """Slices of :meth:`paths`."""
         return PathParts(*_slices(self.dimension, 1))
 
     @cached_property
@@ -151,7 +151,7 @@ class ObservationSlices:
         return rows.reshape(*rows.shape[:-1], self.num_obstacles, self.obstacle[-1].stop)
 
     def paths(self, observations: FloatArray) -> FloatArray:
-        """``(..., .)`` what observations ``(..., D)`` say of the way; empty where they do not."""
+        """``(..., .)`` what observations ``(..., D)`` say of the path; empty where they do not."""
         return observations[..., self._obstacles_end :]
 
     @property
@@ -183,7 +183,7 @@ class ObservationLayout(ObservationSlices):
         num_neighbors: int = 4,
         num_obstacles: int = 4,
         observed_path: bool = False,
-        spare: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
+        slack: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
     ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
 
@@ -191,22 +191,29 @@ class ObservationLayout(ObservationSlices):
             problem: The problem.
             num_neighbors: Neighbours listed.
             num_obstacles: Obstacles listed.
-            observed_path: Whether the way is there.
-            spare: Room beyond that, for what disturbs the motion or what is seen of it.
+            observed_path: Whether the path is there.
+            slack: Slack beyond that, for what disturbs the motion or what is seen of it.
 
         Raises:
             ValueError: If a number of neighbours or obstacles is negative or not whole.
         """
         slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles, observed_path=observed_path)
-        team, reach = problem.team, _reach(problem, spare)
+        team, reach = problem.team, _reach(problem, slack)
         radius, speed, acceleration = (
             float(values.max()) for values in (team.radius, team.max_speed, team.max_acceleration)
         )
         high = np.empty(slices.size, np.float32)
-        seen_speed, widest = speed + spare.speed, max(radius, spare.radius)
-        own = {"velocity": seen_speed, "heading": 1, "speed": seen_speed, "goal": reach, "time_left": 1, "arrived": 1}
+        top_speed, widest = speed + slack.speed, max(radius, slack.radius)
+        own = {
+            "velocity": top_speed,
+            "heading": 1,
+            "speed": top_speed,
+            "goal": reach,
+            "time_left": 1,
+            "arrived": 1,
+        }
         own |= {"radius": radius, "max_speed": speed, "max_acceleration": acceleration}
-        neighbor = {"present": 1, "position": reach, "velocity": 2 * seen_speed, "radius": widest}
+        neighbor = {"present": 1, "position": reach, "velocity": 2 * top_speed, "radius": widest}
         _fill(high, slices.own, own)
         _fill(slices.neighbors(high), slices.neighbor, neighbor)
         _fill(slices.obstacles(high), slices.obstacle, {"present": 1, "position": reach, "gap": reach})
@@ -248,7 +255,7 @@ def _fill(values: FloatArray, parts: NamedTuple, bounds: Mapping[str, float]) ->
         values[..., getattr(parts, name)] = bound
 
 
-def _reach(problem: Problem, spare: BoundsSlack) -> float:
+def _reach(problem: Problem, slack: BoundsSlack) -> float:
     """Farthest that anything may be from a robot [m]."""
     team, places = (
         problem.team,
@@ -257,7 +264,7 @@ def _reach(problem: Problem, spare: BoundsSlack) -> float:
     speed, acceleration = float(team.max_speed.max()), float(team.max_acceleration.max())
     # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
     # step a robot may exceed the speed limit, which is applied at its end.
-    drive = (speed + acceleration * problem.dt / 2 + spare.drift) * problem.duration + spare.distance
+    drive = (speed + acceleration * problem.dt / 2 + slack.drift) * problem.duration + slack.distance
     return float(np.sqrt(np.square(np.ptp(places, axis=0)).sum())) + 2 * drive + 2 * float(team.radius.max())
 
 

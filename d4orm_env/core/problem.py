@@ -252,7 +252,7 @@ class Problem(Frozen):
 
     @cached_property
     def shortest_paths(self) -> ShortestPaths:
-        """The shortest free way of every robot; see :func:`d4orm_env.paths.shortest_paths.shortest_paths`."""
+        """The shortest path of every robot; see :func:`d4orm_env.paths.shortest_paths.shortest_paths`."""
         # The one road up from here: it is compiled.
         from d4orm_env.paths.shortest_paths import shortest_paths
 
@@ -271,7 +271,7 @@ class Problem(Frozen):
             names = ", ".join(f"robot_{robot}" for robot in robots)
             reach = sorted({f"{radius + self.margin:.4g}" for radius in np.asarray(self.team.radius)[robots]})
             raise ValueError(
-                f"{names} {'has' if len(robots) == 1 else 'have'} no way from start to goal that is "
+                f"{names} {'has' if len(robots) == 1 else 'have'} no path from start to goal that is "
                 f"{' or '.join(reach)} m clear of obstacles; move the start or the goal, open the world there, or use "
                 f"a smaller radius or margin"
             )
@@ -344,7 +344,7 @@ class Problem(Frozen):
 
         return plot(self, None, axes)
 
-    def resumed_at(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:
+    def with_state(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:
         """The same team in the same world in other states, for planning on from there.
 
         Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they

@@ -33,7 +33,7 @@ class Stream(IntEnum):
     TRAINING = 16  # first weights (0), then exploration and minibatches by lesson (from 1)
     TAKEOVER = 17  # the seeds of the plans that a team makes on the way, by takeover
     GUIDANCE = 18  # ties of path finding, by try, and which robots are replanned, by iteration
-    NEIGHBOURHOODS = 19  # which robots look for faster ways, and how, by iteration
+    NEIGHBOURHOODS = 19  # which robots look for faster paths, and how, by iteration
     DEMONSTRATIONS = 20  # of an expert, by round and episode
     TRAINING_INSTANCES = 21  # by part of the mixture and number
 

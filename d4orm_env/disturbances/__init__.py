@@ -7,7 +7,7 @@ environments to the bit, and one disturbance draws the same whatever others ther
 """
 
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
-from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Scene, Seen
+from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.intruder import Intruder
 from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
@@ -26,11 +26,11 @@ __all__ = [
     "Gain",
     "Intruder",
     "LimitMismatch",
+    "Observed",
     "Occlusion",
     "Push",
     "Quantisation",
     "Scene",
-    "Seen",
     "Stall",
     "StateDelay",
     "StateNoise",

@@ -43,6 +43,6 @@ def at_work(disturbances: Disturbances, problem: Problem) -> Disturbances:
     return tuple(one for one in disturbances if not one.negligible)
 
 
-def total_spare(disturbances: Disturbances, problem: Problem) -> BoundsSlack:
+def total_slack(disturbances: Disturbances, problem: Problem) -> BoundsSlack:
     """Room that all of them need together."""
-    return reduce(BoundsSlack.joined, (one.spare(problem) for one in disturbances), BoundsSlack())
+    return reduce(BoundsSlack.joined, (one.slack(problem) for one in disturbances), BoundsSlack())

@@ -36,7 +36,7 @@ class Scene(NamedTuple):
         controls: ``(B, K, m)`` executed last.
         arrived: ``(B, K)`` bool.
         steps: ``(B,)`` int64 steps taken since the episode began.
-        bodies: ``(B, N, 2 d + 1)`` what moves among the robots and is none, as it truly is, see :class:`Seen`.
+        bodies: ``(B, N, 2 d + 1)`` what moves among the robots and is none, as it truly is, see :class:`Observed`.
     """
 
     problem: Problem
@@ -67,7 +67,7 @@ class Scene(NamedTuple):
         return self.arrived & self.problem.docks
 
 
-class Seen(NamedTuple):
+class Observed(NamedTuple):
     """The worlds as they are seen, in observations and in ``env.state()``.
 
     Attributes:
@@ -89,8 +89,8 @@ class DisturbanceEffect(NamedTuple):
         pushed: ``(B, K, d)`` velocity that the last step gave to robots [m/s].
         stalled: ``(B, K)`` bool: does not obey.
         lost: ``(B, K)`` bool: will not obey again, so that it need not arrive for the episode to be a success.
-        bodies: ``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`Seen`. Contact with one is a
-            collision.
+        bodies: ``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`Observed`. Contact with one
+            is a collision.
     """
 
     pushed: FloatArray | None = None
@@ -126,7 +126,7 @@ class Disturbance(Generic[M]):
     def check(self, problem: Problem) -> None:
         """Raise ``ValueError``, in one line, where the robots or the world cannot have this disturbance."""
 
-    def spare(self, problem: Problem) -> BoundsSlack:
+    def slack(self, problem: Problem) -> BoundsSlack:
         """Return the slack by which it may lead robots, or what is seen of them, out of their usual bounds.
 
         The spaces grow by so much.
@@ -154,7 +154,7 @@ class Disturbance(Generic[M]):
         """
         return states, controls
 
-    def see(self, seen: Seen, memory: M, scene: Scene, draws: Draws) -> Seen:
+    def see(self, seen: Observed, memory: M, scene: Scene, draws: Draws) -> Observed:
         """Return the worlds as they are seen; called once at a reset and after every step."""
         return seen
 

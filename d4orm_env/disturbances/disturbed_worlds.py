@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, DisturbanceEffect, Memory, Scene, Seen
+from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, DisturbanceEffect, Memory, Observed, Scene
 from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
 
 Worlds = NDArray[np.intp]
@@ -200,24 +200,24 @@ class DisturbedWorlds:
             Two arrays ``(B, K)`` bool; near is within the margin.
         """
         touched, near = np.empty((2, *states.shape[:2]), np.bool_)
-        _judge()(states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near)
+        _contact_kernel()(states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near)
         return touched, near
 
-    def see(self, scene: Scene, worlds: Worlds | None = None) -> Seen:
+    def see(self, scene: Scene, worlds: Worlds | None = None) -> Observed:
         """Return the view of all worlds, or of some, as they are in ``scene``, which is always of all.
 
         Raises:
             ValueError: If a disturbance returns another shape.
         """
         part = scene if worlds is None else scene.of(worlds)
-        seen = Seen(part.states, part.controls, part.bodies)
+        seen = Observed(part.states, part.controls, part.bodies)
         for one in self._seeing:
             memory = one.memory if worlds is None else one.memory_of(worlds)
             draws = self._draws(one, scene, _Purpose.SEE)
             draws = draws if worlds is None else draws.of(worlds)
             changed = one.disturbance.see(seen, memory, part, draws)
             states, controls, bodies = changed
-            seen = Seen(
+            seen = Observed(
                 _checked(states, seen.states.shape, one, "see"),
                 _checked(controls, seen.controls.shape, one, "see"),
                 _checked(bodies, seen.bodies.shape, one, "see"),
@@ -244,12 +244,12 @@ class DisturbedWorlds:
 
 
 @cache
-def _judge() -> Callable[..., None]:
+def _contact_kernel() -> Callable[..., None]:
     # Here, because importing the compiler takes longer than importing all the rest of the package.
     from d4orm_env.engine.moving_obstacles import meet_bodies
 
-    judge: Callable[..., None] = meet_bodies
-    return judge
+    kernel: Callable[..., None] = meet_bodies
+    return kernel
 
 
 def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:

@@ -19,8 +19,8 @@ _TRIES = 16
 
 
 class Courses(NamedTuple):
-    """Bodies ``(B, N, 2 d + 1)``, as in :class:`~d4orm_env.disturbances.Seen`, and how long ``(B, N)`` each still takes
-    to leave the area [s].
+    """Bodies ``(B, N, 2 d + 1)``, as in :class:`~d4orm_env.disturbances.Observed`, and how long ``(B, N)`` each still
+    takes to leave the area [s].
     """
 
     bodies: FloatArray
@@ -63,7 +63,7 @@ class Intruder(Disturbance[Courses]):
     def replayable(self) -> bool:
         return True  # it changes neither states nor controls
 
-    def spare(self, problem: Problem) -> BoundsSlack:
+    def slack(self, problem: Problem) -> BoundsSlack:
         faster = max(0.0, self.speed - float(problem.team.max_speed.max()))
         return BoundsSlack(distance=2 * self._room(problem) + self.speed * problem.dt, speed=faster, radius=self.radius)
 

@@ -13,7 +13,7 @@ import numpy as np
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, Memory, Scene, Seen
+from d4orm_env.disturbances.disturbance import Disturbance, Memory, Observed, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.levels import MAX_DELAY, standard_deviation
 
@@ -68,7 +68,7 @@ class StateNoise(Disturbance[Scales]):
                 "out, or use a model that has one"
             )
 
-    def spare(self, problem: Problem) -> BoundsSlack:
+    def slack(self, problem: Problem) -> BoundsSlack:
         return BoundsSlack(*(_FARTHEST * std for std in (self.position_std, self.velocity_std, self.heading_std)))
 
     def begin(self, scene: Scene, draws: Draws) -> Scales:
@@ -81,13 +81,13 @@ class StateNoise(Disturbance[Scales]):
                 scales.states[:, robot, model.heading_index] = self.heading_std
         return scales
 
-    def see(self, seen: Seen, memory: Scales, scene: Scene, draws: Draws) -> Seen:
+    def see(self, seen: Observed, memory: Scales, scene: Scene, draws: Draws) -> Observed:
         states, bodies = draws.normal(*seen.states.shape[1:]), seen.bodies
         states *= memory.states
         states += seen.states
         if bodies.shape[1]:
             bodies = bodies + memory.bodies * draws.normal(*bodies.shape[1:])
-        return Seen(states, seen.controls, bodies)
+        return Observed(states, seen.controls, bodies)
 
 
 class Past(NamedTuple):
@@ -120,13 +120,13 @@ class StateDelay(Disturbance[Past]):
         parts, length = (scene.states, scene.controls, scene.bodies), self.steps + 1
         return Past(*(np.zeros((len(part), length, *part.shape[1:]), np.float32) for part in parts))
 
-    def see(self, seen: Seen, memory: Past, scene: Scene, draws: Draws) -> Seen:
+    def see(self, seen: Observed, memory: Past, scene: Scene, draws: Draws) -> Observed:
         worlds, length = np.arange(len(scene.steps)), self.steps + 1
         for past, present in zip(memory, seen):
             past[worlds, scene.steps % length] = present
         # What is older than the episode stands where its first moment was written.
         then = np.maximum(scene.steps - self.steps, 0) % length
-        return Seen(*(past[worlds, then] for past in memory))
+        return Observed(*(past[worlds, then] for past in memory))
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Occlusion(Disturbance[Memory]):
     def negligible(self) -> bool:
         return self.range == math.inf
 
-    def see(self, seen: Seen, memory: Memory, scene: Scene, draws: Draws) -> Seen:
+    def see(self, seen: Observed, memory: Memory, scene: Scene, draws: Draws) -> Observed:
         if not seen.bodies.shape[1]:
             return seen
         d = scene.problem.dimension

@@ -53,7 +53,7 @@ class Push(Disturbance[Given]):
     def negligible(self) -> bool:
         return not (self.rate and self.speed)
 
-    def spare(self, problem: Problem) -> BoundsSlack:
+    def slack(self, problem: Problem) -> BoundsSlack:
         return BoundsSlack(drift=self.speed)
 
     def begin(self, scene: Scene, draws: Draws) -> Given:

@@ -24,7 +24,7 @@ from d4orm_env.engine.tiles import (
     motion_reader,
     robot_mover,
 )
-from d4orm_env.engine.world_tiles import judge, load, load_world, store_world
+from d4orm_env.engine.world_tiles import check_contacts, load, load_world, store_world
 
 STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
 """Orders for a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
@@ -218,7 +218,7 @@ def advance_worlds_kernel(
             measure_goal_distance(num_robots, dimension, w)
             if moving:
                 _move_tile(move_robot, arrays, batch, orders, first, count, w)
-            judge(arrays, batch, first, w, near)
+            check_contacts(arrays, batch, first, w, near)
             for b in range(first, first + count):
                 if orders[b] == SKIP:
                     continue

@@ -113,22 +113,22 @@ def _near_indexed(
     triangles: FloatArray,
     reach: np.float32,
     places: FloatArray,
-    spare: FloatArray,
+    buffer: FloatArray,
 ) -> np.uint64:
     """Return where a body of this radius, centred at the first rows of ``places``, touches an obstacle."""
     use_wide_registers()
     third = 2 * TILE if index.low.shape[0] == 3 else 0
-    cells = spare[TILE : 2 * TILE].view(np.uint32)
+    cells = buffer[TILE : 2 * TILE].view(np.uint32)
     for s in range(TILE):
         cells[s] = 0
     for axis in range(index.low.shape[0]):
         _count_steps(index, axis, places[axis * TILE : (axis + 1) * TILE], cells)
     for s in range(TILE):
-        spare[s] = index.clearance[cells[s]]
-    near = at_most(spare, 0, reach + index.slack)
+        buffer[s] = index.clearance[cells[s]]
+    near = at_most(buffer, 0, reach + index.slack)
     if near == NOWHERE:
         return near
-    sure = at_most(spare, 0, reach - index.slack)
+    sure = at_most(buffer, 0, reach - index.slack)
     unsure = near & ~sure
     while unsure != NOWHERE:
         sample = np.int64(_trailing_zeros(unsure))
@@ -140,21 +140,21 @@ def _near_indexed(
 
 
 @inlined
-def near_obstacles(arrays: ProblemArrays, reach: np.float32, places: FloatArray, spare: FloatArray) -> np.uint64:
+def near_obstacles(arrays: ProblemArrays, reach: np.float32, places: FloatArray, buffer: FloatArray) -> np.uint64:
     """Return where a body of this radius, centred at the first rows of ``places``, touches an obstacle or the bounds.
 
-    ``spare`` is two rows to overwrite.
+    ``buffer`` is two rows to overwrite.
     """
     mask = NOWHERE
     if arrays.grid.clearance.shape[0] > 0:
-        mask = _near_indexed(arrays.grid, arrays.boxes, arrays.triangles, reach, places, spare)
+        mask = _near_indexed(arrays.grid, arrays.boxes, arrays.triangles, reach, places, buffer)
     for axis in range(arrays.goal.shape[1]):
         lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
         if lower > -np.inf or upper < np.inf:
             row = places[axis * TILE : (axis + 1) * TILE]
             for s in range(TILE):
-                spare[s] = ZERO if collision.leaves(row[s], reach, lower, upper) else ONE
-            mask |= at_most(spare, 0, ZERO)
+                buffer[s] = ZERO if collision.leaves(row[s], reach, lower, upper) else ONE
+            mask |= at_most(buffer, 0, ZERO)
     return mask
 
 
@@ -166,7 +166,7 @@ def may_touch(
     boxes: FloatArray,
     begin: Whole,
     axis_step: int,
-    spare: FloatArray,
+    buffer: FloatArray,
 ) -> bool:
     """Check whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.simd.enclose`.
 
@@ -177,11 +177,11 @@ def may_touch(
         boxes: The lanes, those of the first axis from ``begin`` on, those of the next ``axis_step`` later.
         begin: See ``boxes``.
         axis_step: See ``boxes``.
-        spare: Two rows to overwrite.
+        buffer: Two rows to overwrite.
     """
     use_wide_registers()
-    middles, squares, beyond = spare[:CHUNK], spare[CHUNK : 2 * CHUNK], spare[2 * CHUNK : 3 * CHUNK]
-    cells = spare[3 * CHUNK : 4 * CHUNK].view(np.uint32)
+    middles, squares, beyond = buffer[:CHUNK], buffer[CHUNK : 2 * CHUNK], buffer[2 * CHUNK : 3 * CHUNK]
+    cells = buffer[3 * CHUNK : 4 * CHUNK].view(np.uint32)
     for lane in range(CHUNK):
         squares[lane] = beyond[lane] = ZERO
         cells[lane] = 0

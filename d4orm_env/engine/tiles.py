@@ -29,7 +29,7 @@ from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, square
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
 # set.
-STATE, CONTROL, GOAL, DOCKED, DISTANCE2, SPARE, ROWS = 0, 6, 10, 13, 14, 15, 17
+STATE, CONTROL, GOAL, DOCKED, DISTANCE2, BUFFER, ROWS = 0, 6, 10, 13, 14, 15, 17
 STRIDE = ROWS * TILE
 
 # Columns of ``near``.
@@ -123,20 +123,20 @@ def mark_pairs(arrays: ProblemArrays, extra: np.float32, w: FloatArray, near: ND
 
 
 @inlined
-def near_round(reach: np.float32, centre: FloatArray, axes: int, places: FloatArray, spare: FloatArray) -> np.uint64:
+def near_round(reach: np.float32, centre: FloatArray, axes: int, places: FloatArray, buffer: FloatArray) -> np.uint64:
     """Return where the first rows of ``places`` are within ``reach`` of a centre, over two or three axes.
 
-    ``spare`` is a row to overwrite.
+    ``buffer`` is a row to overwrite.
     """
     if axes == 2:
         point = (centre[0], centre[1])
         for s in range(TILE):
-            spare[s] = squared_gap2(read2(places, 0, s), point)
+            buffer[s] = squared_gap2(read2(places, 0, s), point)
     else:
         spot = (centre[0], centre[1], centre[2])
         for s in range(TILE):
-            spare[s] = squared_gap3(read3(places, 0, s), spot)
-    return at_most(spare, 0, reach * reach)
+            buffer[s] = squared_gap3(read3(places, 0, s), spot)
+    return at_most(buffer, 0, reach * reach)
 
 
 def _motion_reader(model: Model) -> Callable[..., None]:

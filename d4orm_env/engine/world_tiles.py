@@ -1,4 +1,4 @@
-"""Many worlds of one problem in tiles: loaded, stored and judged."""
+"""Many worlds of one problem in tiles: loaded, stored and checked for contacts."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from d4orm_env.engine import obstacles
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
+    BUFFER,
     CONTROL,
     DISTANCE2,
     DOCKED,
@@ -21,7 +22,6 @@ from d4orm_env.engine.tiles import (
     OBSTACLE,
     ROBOT,
     ROWS,
-    SPARE,
     STATE,
     STRIDE,
     mark_pairs,
@@ -96,7 +96,7 @@ def _bit(mask: np.uint64, s: int) -> np.uint64:
 
 
 @compiled
-def judge(
+def check_contacts(
     arrays: ProblemArrays, worlds: WorldArrays | WorldBatch, first: int, w: FloatArray, near: NDArray[np.uint64]
 ) -> None:
     """Flag contacts and margin violations of the worlds of a tile, and compute rewards."""
@@ -110,8 +110,8 @@ def judge(
         mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
-            places, spare = robot[STATE * TILE : CONTROL * TILE], robot[SPARE * TILE : ROWS * TILE]
-            near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, spare)
+            places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
+            near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
         for s in range(min(TILE, flags.shape[0] - first)):
             for k in range(num_robots):
                 flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE

@@ -23,7 +23,7 @@ from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, robot_mover
 from d4orm_env.engine.types import ObservationInputs
-from d4orm_env.engine.world_tiles import WorldArrays, judge, load, load_world, store_world
+from d4orm_env.engine.world_tiles import WorldArrays, check_contacts, load, load_world, store_world
 
 
 @cache
@@ -31,7 +31,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
     """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
     ``moments`` is a :class:`WorldArrays` of ``H+1`` rows, of which the first is the start and has no control. The
-    motion comes first; then 64 moments at a time are judged, as if they were worlds.
+    motion comes first; then 64 moments at a time are checked, as if they were worlds.
     """
     move_robot = robot_mover(names)
 
@@ -56,7 +56,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
         for first in range(0, state.shape[0], TILE):
             load(moments, first, w)
             measure_goal_distance(num_robots, dimension, w)
-            judge(arrays, moments, first, w, near)
+            check_contacts(arrays, moments, first, w, near)
 
     return roll_out
 

@@ -110,7 +110,7 @@ def state_bounds(
     problem: Problem,
     places: FloatArray,
     max_cycles: int,
-    spare: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
+    slack: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
     num_bodies: int = 0,
 ) -> tuple[FloatArray, FloatArray]:
     """Finite bounds that every joint state of an episode keeps.
@@ -121,13 +121,13 @@ def state_bounds(
         problem: The problem.
         places: ``(2, d)`` box that holds every start and goal [m].
         max_cycles: Steps in an episode.
-        spare: Room beyond that, for what disturbs the motion or what is seen of it.
+        slack: Slack beyond that, for what disturbs the motion or what is seen of it.
         num_bodies: Number of bodies beside the robots.
 
     Returns:
         Lowest and highest joint state vector.
     """
-    low, high = _robot_bounds(problem, places, max_cycles * problem.dt, spare)
+    low, high = _robot_bounds(problem, places, max_cycles * problem.dt, slack)
     limits = problem.team.control_limits
     controls = np.where(limits > 0, limits, 1.0).ravel()
     lowest = np.concatenate([low.ravel(), np.tile(places[0], problem.num_robots), -controls])
@@ -135,10 +135,10 @@ def state_bounds(
     lowest, highest = lowest - 1e-3 * (1 + np.abs(lowest)), highest + 1e-3 * (1 + np.abs(highest))
     flags = np.ones(problem.num_robots)
     # An unseen body is all zeros, and its like may be anywhere round the team.
-    far = np.abs(places).max() + 2 * np.linalg.norm(np.ptp(places, axis=0)) + spare.distance + 1.0
-    fastest = float(problem.team.max_speed.max()) + spare.speed
+    far = np.abs(places).max() + 2 * np.linalg.norm(np.ptp(places, axis=0)) + slack.distance + 1.0
+    fastest = float(problem.team.max_speed.max()) + slack.speed
     d = problem.dimension
-    body = np.tile([far] * d + [fastest] * d + [max(spare.radius, 1.0)], num_bodies)
+    body = np.tile([far] * d + [fastest] * d + [max(slack.radius, 1.0)], num_bodies)
     nearest = np.tile([-far] * d + [-fastest] * d + [0.0], num_bodies)
     return (
         np.concatenate([lowest, 0 * flags, [0], nearest]).astype(np.float32),
@@ -146,18 +146,18 @@ def state_bounds(
     )
 
 
-def _robot_bounds(problem: Problem, places: FloatArray, duration: float, spare: BoundsSlack) -> tuple[Floats, Floats]:
+def _robot_bounds(problem: Problem, places: FloatArray, duration: float, slack: BoundsSlack) -> tuple[Floats, Floats]:
     """``(K, n)`` lowest and highest states within that time [s]."""
     team, dimension = problem.team, problem.dimension
     limits = team.limits.astype(np.float64)
     speed, acceleration = limits[:, SPEED], limits[:, ACCELERATION]
     # Within a step a robot may exceed the speed limit, which is applied at its end.
-    reach = (speed + acceleration * problem.dt / 2 + spare.drift) * duration + spare.distance
+    reach = (speed + acceleration * problem.dt / 2 + slack.drift) * duration + slack.distance
     high = np.ones((problem.num_robots, problem.state_size))
     for robot, model in enumerate(team.robot_models):
         high[robot, dimension : model.state_size] = LARGEST  # what no limit bounds
-        high[robot, list(model.speed_indices)] = speed[robot] + spare.speed
-        high[robot, list(model.angles)] = MAX_ANGLE + spare.heading
+        high[robot, list(model.speed_indices)] = speed[robot] + slack.speed
+        high[robot, list(model.angles)] = MAX_ANGLE + slack.heading
         for index, column in model.state_limits:
             high[robot, index] = limits[robot, column]
     low = -high

@@ -53,7 +53,7 @@ def fresh_goal(
 ) -> FloatArray:
     """A random goal where ``robot`` would keep the margin to every body, every other goal, obstacles and bounds.
 
-    Among obstacles it is one that has a free way to the robot's first goal, unless its start has none.
+    Among obstacles it is one that has a free path to the robot's first goal, unless its start has none.
 
     Args:
         problem: The problem; its goals are not looked at.

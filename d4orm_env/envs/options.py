@@ -48,7 +48,7 @@ class EnvOptions:
             shortest free ``"path"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles.
             Not for
             ``lifelong``.
-        observed_path: Whether an observation ends with direction and length of the shortest free way. Not for
+        observed_path: Whether an observation ends with direction and length of the shortest path. Not for
             ``lifelong``.
         observed_robots: Nearest robots in an observation; missing ones are marked absent.
         observed_obstacles: Nearest obstacles in an observation; likewise.
@@ -128,7 +128,7 @@ class EnvOptions:
         return "circle" if self.scenario is None else self.scenario
 
     @property
-    def vouched(self) -> bool:
+    def stochastic(self) -> bool:
         """True if the scenario is known to draw instances that differ in positions and obstacles only."""
         return self.problem is None and find_scenario(self._scenario).draws
 
@@ -146,7 +146,7 @@ class EnvOptions:
         if self.randomize_instance is False:
             return first, None
         draw = partial(_draw, self._scenario, settings)
-        if self.vouched or draw(0 if self.scenario_settings.get("seed") else 1) != first:
+        if self.stochastic or draw(0 if self.scenario_settings.get("seed") else 1) != first:
             return first, draw
         if self.randomize_instance:
             raise ValueError(

@@ -22,7 +22,7 @@ class RewardInput:
 
     Every array is a read-only copy with the leading axes ``...``: none in the PettingZoo and the joint environment, so
     that ``(..., K)`` is ``(K,)``, and ``(B,)`` in the batched one, so that it is ``(B, K)``. All robots are there,
-    docked ones too. Distances are straight, or along the shortest free ways where the environment says so.
+    docked ones too. Distances are straight, or along the shortest paths where the environment says so.
 
     Attributes:
         previous_states: ``(..., K, n)`` before the step.
@@ -31,7 +31,7 @@ class RewardInput:
         goals: ``(..., K, d)`` the goals during the step [m].
         previous_distances: ``(..., K)`` to the goals before the step [m].
         distances: ``(..., K)`` after it [m].
-        initial_distances: ``(..., K)`` where the way to the goal began, at least the goal radius [m].
+        initial_distances: ``(..., K)`` where the path to the goal began, at least the goal radius [m].
         previously_arrived: ``(..., K)`` bool: docked before the step.
         arrived: ``(..., K)`` bool: docked after it; in lifelong mode, reached a goal in this step.
         collided: ``(..., K)`` bool, hard contact.
@@ -84,11 +84,11 @@ class TrainingReward:
     """A reward to learn from, per robot and step; zero once a robot has docked.
 
     The paper's reward pays a robot for every step that it spends close to its goal, and an episode ends with the
-    arrival: who learns from it does not arrive. This one pays the way made, which is a potential (A. Y. Ng, D. Harada
+    arrival: who learns from it does not arrive. This one pays progress, which is a potential (A. Y. Ng, D. Harada
     and S. Russell, ICML 1999), and the arrival.
 
     Attributes:
-        progress: For every step's way at full speed towards the goal.
+        progress: For every step's distance at full speed towards the goal.
         arrival: Once, on arriving.
         margin: Taken off in every step within the margin of anything.
         contact: Taken off in every step in contact with anything.
@@ -125,14 +125,14 @@ def paper_reward(step: RewardInput) -> FloatArray:
     return step.paper
 
 
-def along_ways(step: RewardInput, initial: Floats, previous: Floats, present: Floats) -> RewardInput:
-    """The same step with all distances, the paper's reward included, along the shortest free ways.
+def along_paths(step: RewardInput, initial: Floats, previous: Floats, present: Floats) -> RewardInput:
+    """The same step with all distances, the paper's reward included, along the shortest paths.
 
-    A distance stays straight where a robot has got to that no way leads from, as inside an obstacle.
+    A distance stays straight where a robot has got to that no path leads from, as inside an obstacle.
 
     Args:
         step: One of ``(..., K)``.
-        initial: ``(..., K)`` length of the ways from the starts [m].
+        initial: ``(..., K)`` length of the paths from the starts [m].
         previous: ``(..., K)`` length from where the robots were before the step [m].
         present: ``(..., K)`` length from where they are after it [m].
     """

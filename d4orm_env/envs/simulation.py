@@ -17,8 +17,8 @@ from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
-from d4orm_env.disturbances.chosen import total_spare
-from d4orm_env.disturbances.disturbance import DisturbanceEffect, Scene, Seen
+from d4orm_env.disturbances.chosen import total_slack
+from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.disturbances.recorded_events import marks_of
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldEngine
@@ -30,7 +30,7 @@ from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import (
     RewardFunction,
     RewardInput,
-    along_ways,
+    along_paths,
     compute_rewards,
     find_reward,
     no_terms,
@@ -56,11 +56,11 @@ class Simulation:
 
     def __init__(self, options: EnvOptions) -> None:
         problem, self._redraw = options.instances()
-        self.vouched = options.vouched
+        self.stochastic = options.stochastic
         self.problem = problem
         self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
         self.disturbances = options.disturbances_of(problem)
-        self._spare = self._spare_of(problem)
+        self._slack = self._slack_of(problem)
         self.lifelong = options.lifelong
         self.reward = find_reward(options.reward)
         self.layout = ObservationLayout.for_problem(
@@ -68,13 +68,13 @@ class Simulation:
             num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, _MAX_OBSERVED),
             num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, _MAX_OBSERVED),
             observed_path=options.observed_path,
-            spare=self._spare,
+            slack=self._slack,
         )
         self._disturbed: DisturbedWorlds | None = None
         self._disturb(0)  # to know what bodies there are
         # In an open world the two are the same.
-        self.along_ways = options.progress == "path" and problem.world.num_obstacles > 0
-        if self.along_ways:
+        self.along_paths = options.progress == "path" and problem.world.num_obstacles > 0
+        if self.along_paths:
             self.reward = self.reward or paper_reward
             problem.check_reachable()
         # Here, because importing the compiler takes longer than importing all the rest of the package.
@@ -105,7 +105,7 @@ class Simulation:
     def state_bounds(self) -> tuple[FloatArray, FloatArray]:
         """Finite bounds of :meth:`state`, for the present ``max_cycles``."""
         num_bodies = 0 if self._disturbed is None else self._disturbed.bodies.shape[1]
-        return state_bounds(self.problem, self._places, self.max_cycles, self._spare, num_bodies)
+        return state_bounds(self.problem, self._places, self.max_cycles, self._slack, num_bodies)
 
     @property
     def out_of_time(self) -> bool:
@@ -143,7 +143,7 @@ class Simulation:
                 f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
                 f"{places.tolist()} m, where the state space ends; use a scenario whose seed changes places only"
             )
-        if self.along_ways:
+        if self.along_paths:
             drawn.check_reachable()
         return drawn
 
@@ -208,9 +208,9 @@ class Simulation:
         self.record.add(rewards, arrived, result.collided, result.margin_violated)
         return self._report(rewards, arrived, result.margin_violated)
 
-    def _spare_of(self, problem: Problem) -> BoundsSlack:
+    def _slack_of(self, problem: Problem) -> BoundsSlack:
         """Room beyond the limits of the robots that the spaces need."""
-        return total_spare(self.disturbances, problem)
+        return total_slack(self.disturbances, problem)
 
     def _move(self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> StepResult:
         """One step of the bodies, which another physics overrides; arguments as of the engine's step."""
@@ -246,7 +246,7 @@ class Simulation:
         """:meth:`state` as it truly is, whatever is seen."""
         return self._joined(None)
 
-    def _joined(self, seen: Seen | None) -> FloatArray:
+    def _joined(self, seen: Observed | None) -> FloatArray:
         self.require_reset()
         states, controls, bodies = self.states, self.controls, None
         if seen is not None:
@@ -280,7 +280,7 @@ class Simulation:
 
     def _disturb(self, seed: int) -> None:
         """Begin the disturbances of an episode."""
-        self._seen: Seen | None = None
+        self._seen: Observed | None = None
         if not self.disturbances:
             return
         problem, disturbed = self.problem, self._disturbed
@@ -327,9 +327,9 @@ class Simulation:
             team=self.problem.team,
             dt=self.problem.dt,
         )
-        if self.along_ways:
-            ways = self.problem.shortest_paths
-            step = along_ways(step, ways.length, ways.distance(step.previous_positions), ways.distance(step.positions))
+        if self.along_paths:
+            lengths = map(self.problem.shortest_paths.distance, (step.previous_positions, step.positions))
+            step = along_paths(step, self.problem.shortest_paths.length, *lengths)
         rewards, self._terms = compute_rewards(reward, step)
         return rewards
 

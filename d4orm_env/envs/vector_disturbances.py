@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.disturbances.disturbance import Scene, Seen
+from d4orm_env.disturbances.disturbance import Observed, Scene
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.envs.simulation import Simulation
 
@@ -35,7 +35,7 @@ class DisturbedBatch:
         self._disturbed = DisturbedWorlds(template.disturbances, problem, len(worlds.steps), cycles)
         self._penalty = problem.arrays.collision_penalty
         self._limits = self._disturbed.true_limits(problem.arrays.limits)
-        self._seen: Seen | None = None
+        self._seen: Observed | None = None
         self._nothing = not template.disturbances
 
     @property
@@ -49,10 +49,10 @@ class DisturbedBatch:
         return self._disturbed.effect(self._scene).lost
 
     @property
-    def seen(self) -> Seen:
+    def seen(self) -> Observed:
         """Return the view of all worlds, which is the truth unless something alters it."""
         worlds = self._worlds
-        return self._seen or Seen(worlds.state, worlds.control, self._disturbed.bodies)
+        return self._seen or Observed(worlds.state, worlds.control, self._disturbed.bodies)
 
     def true(self, arrays: ProblemArrays) -> ProblemArrays:
         """A problem with the limits that its robots truly have."""
@@ -99,7 +99,7 @@ class DisturbedBatch:
             self._seen = seen
         else:
             # Not in place: of what was seen last some may be the worlds' own arrays, or a disturbance's memory.
-            self._seen = Seen(*(np.array(part) for part in self.seen))
+            self._seen = Observed(*(np.array(part) for part in self.seen))
             for past, new in zip(self._seen, seen):
                 past[worlds] = new
         states, controls, bodies = (part[rows] for part in self._seen)

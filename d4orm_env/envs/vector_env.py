@@ -18,7 +18,7 @@ from d4orm_env.envs.episode_record import EpisodeCounts, episode_metrics
 from d4orm_env.envs.inputs import checked_states, joint_controls
 from d4orm_env.envs.joint_env import joint_spaces
 from d4orm_env.envs.options import EnvOptions
-from d4orm_env.envs.rewards import RewardInput, along_ways, compute_rewards, no_terms
+from d4orm_env.envs.rewards import RewardInput, along_paths, compute_rewards, no_terms
 from d4orm_env.envs.simulation import Simulation
 from d4orm_env.envs.team_step import Info
 from d4orm_env.envs.vector_disturbances import DisturbedBatch
@@ -127,10 +127,10 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._apart = False
         self.robot_rewards = np.zeros((count, problem.num_robots), np.float32)
         self._terms = no_terms(self._template.reward, self.robot_rewards.shape)
-        # Of the shortest free ways from where the robots are, and from their starts.
-        self._way_direction = np.zeros((*self.robot_rewards.shape, problem.dimension))
-        self._way_length, self._first_length = (np.zeros(self.robot_rewards.shape) for _ in range(2))
-        if self._template.along_ways:
+        # Of the shortest paths from where the robots are, and from their starts.
+        self._path_direction = np.zeros((*self.robot_rewards.shape, problem.dimension))
+        self._path_length, self._first_length = (np.zeros(self.robot_rewards.shape) for _ in range(2))
+        if self._template.along_paths:
             self._first_length[:] = problem.shortest_paths.length
         shape = (count, problem.num_robots, self._template.layout.size)
         self._observations = np.empty(shape, np.float32)
@@ -204,7 +204,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._require_episodes()
         controls = joint_controls(actions, self._action_shape, self.problem.num_robots)
         ended = self._ended
-        before, length, worlds = self._before(), self._way_length.copy(), self._worlds
+        before, length, worlds = self._before(), self._path_length.copy(), self._worlds
         np.copyto(worlds.control, self._disturbances.act(controls))
         if ended.any():
             self._begin(np.flatnonzero(ended))
@@ -305,12 +305,12 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 advance(true(self._arrays[world]), layout, cycles, orders[one], part, made[one])
         self._disturbances.meet(orders == STEP)
         altered = self._disturbances.alters_sight
-        if self._template.along_ways or (layout.observed_path and not altered):
-            self._way_direction[going], self._way_length[going] = self._ahead(going, self._worlds.state[going])
+        if self._template.along_paths or (layout.observed_path and not altered):
+            self._path_direction[going], self._path_length[going] = self._ahead(going, self._worlds.state[going])
         if altered:
             self._look(going, out)
         elif layout.observed_path:
-            observe_paths(out, layout, self._way_direction, self._way_length)
+            observe_paths(out, layout, self._path_direction, self._path_length)
         return out.reshape(self.num_envs, -1)
 
     def _look(self, worlds: NDArray[np.intp], out: FloatArray) -> None:
@@ -330,7 +330,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             out[worlds] = seen
 
     def _ahead(self, worlds: NDArray[np.intp], states: FloatArray) -> tuple[Floats, Floats]:
-        """Directions ``(b, K, d)`` and lengths ``(b, K)`` of the ways in some worlds, from ``states`` ``(b, K, n)``."""
+        """Directions ``(b, K, d)`` and lengths ``(b, K)`` of paths in some worlds, from ``states`` ``(b, K, n)``."""
         places = states[..., : self.problem.dimension]
         if not self._template.redraws:
             return self.problem.shortest_paths.ahead(places)
@@ -344,7 +344,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         return worlds._replace(**{name: getattr(worlds, name).copy() for name in _READ_BEFORE})
 
     def _reward(self, before: WorldBatch | None, length: Floats, moved: BoolArray) -> None:
-        """Give the robots of the worlds that have ``moved`` from ``before``, with ways of ``length``, their rewards."""
+        """Give the robots of the worlds that have ``moved`` from ``before``, with paths of ``length``, rewards."""
         worlds, reward = self._worlds, self._template.reward
         self.robot_rewards = np.where(moved[:, None], worlds.rewards, np.float32(0))
         if reward is None or before is None:
@@ -365,9 +365,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             team=self.problem.team,
             dt=self.problem.dt,
         )
-        if self._template.along_ways:
-            previous = np.where(moved[:, None], length, self._way_length)
-            step = along_ways(step, self._first_length, previous, self._way_length)
+        if self._template.along_paths:
+            previous = np.where(moved[:, None], length, self._path_length)
+            step = along_paths(step, self._first_length, previous, self._path_length)
         rewards, terms = compute_rewards(reward, step)
         self.robot_rewards = np.where(moved[:, None], rewards, np.float32(0))
         self._terms = {name: np.where(moved[:, None], term, np.float32(0)) for name, term in terms.items()}
@@ -387,7 +387,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 self._worlds.inverse[world] = problem.arrays.inverse_initial_distance
                 self._arrays[world] = problem.arrays_to_observe(self._template.layout.num_obstacles)
                 self._apart |= bool(self._draws.differing(problem))
-                if self._template.along_ways:
+                if self._template.along_paths:
                     self._first_length[world] = problem.shortest_paths.length
         self._disturbances.begin(indices, self._draws.seeds)
 

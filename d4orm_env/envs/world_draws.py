@@ -46,7 +46,7 @@ class WorldDraws:
         self.needed = bool(template.disturbances) or template.redraws
         self._generators: list[np.random.Generator | None] = [None] * num_worlds
         self.seeds: NDArray[np.int64] = np.zeros(num_worlds, np.int64)
-        if template.redraws and not template.vouched:
+        if template.redraws and not template.stochastic:
             self._drawn(np.random.default_rng(0))
 
     def seed(self, world: int, seed: int) -> None:

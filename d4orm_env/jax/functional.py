@@ -29,7 +29,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward, term_names
-from d4orm_env.jax.jax_engine import Worlds, advance_worlds, goal_distance, judge
+from d4orm_env.jax.jax_engine import Worlds, advance_worlds, check_contacts, goal_distance
 from d4orm_env.jax.jax_observation import observe_team
 
 __all__ = ["State", "Step", "observe", "reset", "step"]
@@ -112,7 +112,7 @@ def step(
     d = arrays.goal.shape[1]
     worlds = Worlds(state.states[..., None], state.arrived[..., None], jnp.zeros_like(controls)[..., None])
     worlds = advance_worlds(problem.team.models, arrays, worlds, controls[..., None])
-    collided, margin_violated, rewards = judge(arrays, worlds.state[:, :d])
+    collided, margin_violated, rewards = check_contacts(arrays, worlds.state[:, :d])
     before, after = (goal_distance(arrays, states[:, :d])[:, 0] for states in (state.states[..., None], worlds.state))
     steps = state.steps + 1
     happened = Step(
@@ -167,10 +167,10 @@ def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycle
         ``(K, D)``.
 
     Raises:
-        ValueError: If the layout has the shortest free way, which is not known here.
+        ValueError: If the layout has the shortest path, which is not known here.
     """
     if layout.observed_path:
-        raise ValueError("the functional API does not know the shortest free ways; leave observed_path out")
+        raise ValueError("the functional API does not know the shortest paths; leave observed_path out")
     cycles = problem.horizon if max_cycles is None else max_cycles
     time_left = jnp.maximum(0, 1 - state.steps.astype(jnp.float32) / np.float32(cycles))
     world = Worlds(state.states, state.arrived, state.controls)

@@ -55,7 +55,7 @@ class Worlds(NamedTuple):
 
 Given: TypeAlias = Array | FloatArray
 """An array of the problem: inside a compiled function it is traced."""
-Verdict: TypeAlias = tuple[Array, Array, Array]
+Contacts: TypeAlias = tuple[Array, Array, Array]
 """Flags of collision and of margin violation, and rewards, each ``(K, S)``."""
 
 
@@ -191,7 +191,7 @@ def rewards_of(arrays: ProblemArrays, place: Array, pair_violation: Array, obsta
     )
 
 
-def judge(arrays: ProblemArrays, place: Array) -> Verdict:
+def check_contacts(arrays: ProblemArrays, place: Array) -> Contacts:
     """``(collided, margin violated, reward)`` of teams at rest at ``place`` ``(K, d, S)``, each ``(K, S)``."""
     zero = jnp.float32(0)
     contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
@@ -200,20 +200,20 @@ def judge(arrays: ProblemArrays, place: Array) -> Verdict:
 
 
 @partial(jax.jit, static_argnums=0)
-def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> tuple[Worlds, Verdict]:
+def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> tuple[Worlds, Contacts]:
     worlds = advance_worlds(models, arrays, worlds, control)
-    return worlds, judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    return worlds, check_contacts(arrays, worlds.state[:, : arrays.goal.shape[1]])
 
 
 @partial(jax.jit, static_argnums=0)
 def _rollout(
     models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, controls: Array
-) -> tuple[Verdict, tuple[Worlds, Verdict]]:
-    def advance(worlds: Worlds, control: Array) -> tuple[Worlds, tuple[Worlds, Verdict]]:
-        worlds, verdict = _step(models, arrays, worlds, control)
-        return worlds, (worlds, verdict)
+) -> tuple[Contacts, tuple[Worlds, Contacts]]:
+    def advance(worlds: Worlds, control: Array) -> tuple[Worlds, tuple[Worlds, Contacts]]:
+        worlds, contacts = _step(models, arrays, worlds, control)
+        return worlds, (worlds, contacts)
 
-    first = judge(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    first = check_contacts(arrays, worlds.state[:, : arrays.goal.shape[1]])
     return first, jax.lax.scan(advance, worlds, controls)[1]
 
 
@@ -226,8 +226,8 @@ class JaxEngine:
         """See :meth:`d4orm_env.engine.types.Engine.step`."""
         models = names_of_codes(arrays.model_codes)
         before = states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None]
-        worlds, verdict = _step(models, arrays, Worlds(*map(jnp.asarray, before)), jnp.asarray(controls)[..., None])
-        collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in verdict)
+        worlds, contacts = _step(models, arrays, Worlds(*map(jnp.asarray, before)), jnp.asarray(controls)[..., None])
+        collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in contacts)
         state, docked, control = (np.asarray(value)[..., 0] for value in worlds)
         return StepResult(state, control, docked, collided, margin_violated, rewards)
 
@@ -244,16 +244,16 @@ class JaxEngine:
             jnp.zeros((num_robots, 1), bool),
             jnp.zeros((num_robots, problem.control_size, 1), jnp.float32),
         )
-        first, (worlds, verdicts) = _rollout(problem.team.models, problem.arrays, start, jnp.asarray(wanted[..., None]))
+        first, (worlds, contacts) = _rollout(problem.team.models, problem.arrays, start, jnp.asarray(wanted[..., None]))
         states = np.concatenate([problem.start[None], np.asarray(worlds.state)[..., 0]])
         collided, margin_violated = (
-            np.concatenate([np.asarray(first[i])[None, :, 0], np.asarray(verdicts[i])[..., 0]]) for i in range(2)
+            np.concatenate([np.asarray(first[i])[None, :, 0], np.asarray(contacts[i])[..., 0]]) for i in range(2)
         )
         return Trajectory(
             states=states,
             positions=np.ascontiguousarray(states[..., : problem.dimension]),
             controls=np.asarray(worlds.control)[..., 0],
-            rewards=np.asarray(verdicts[2])[..., 0],
+            rewards=np.asarray(contacts[2])[..., 0],
             arrived=np.concatenate([np.zeros((1, num_robots), bool), np.asarray(worlds.docked)[..., 0]]),
             collided=collided,
             margin_violated=margin_violated,

@@ -52,10 +52,10 @@ class MujocoSimulation(Simulation):
             bodies.begin()
         return step
 
-    def _spare_of(self, problem: Problem) -> BoundsSlack:
+    def _slack_of(self, problem: Problem) -> BoundsSlack:
         # Who is run into may be faster for a moment than it can drive.
         fastest = float(problem.team.max_speed.max())
-        return super()._spare_of(problem).joined(BoundsSlack(speed=fastest, drift=fastest))
+        return super()._slack_of(problem).joined(BoundsSlack(speed=fastest, drift=fastest))
 
     def set_state(self, states: object) -> TeamStep:
         """See :meth:`d4orm_env.envs.simulation.Simulation.set_state`."""
@@ -91,7 +91,7 @@ class MujocoSimulation(Simulation):
             model = self.problem.team.robot_models[robot]
             states[robot, : model.state_size] = model.functions.rest(states[robot, : model.state_size], np.float32(0))
         self.bodies.hold(docking)
-        return self._judged(arrays, states, controls, arrived, touched)
+        return self._checked(arrays, states, controls, arrived, touched)
 
     def _limited(self, controls: FloatArray, limits: FloatArray, standing: BoolArray) -> FloatArray:
         """``controls`` within the robots' limits, zero for those at rest."""
@@ -105,17 +105,17 @@ class MujocoSimulation(Simulation):
     def _measured(self, states: FloatArray, standing: BoolArray) -> FloatArray:
         """Return the known states: robots at rest are where they docked, and no speed is beyond the spaces."""
         states = np.where(standing[:, None], self.states, states)
-        most = self._spare.speed + self.problem.team.max_speed
+        most = self._slack.speed + self.problem.team.max_speed
         for robot, model in enumerate(self.problem.team.robot_models):
             columns = list(model.speed_indices)
             states[robot, columns] = np.clip(states[robot, columns], -most[robot], most[robot])
         return states
 
-    def _judged(
+    def _checked(
         self, arrays: ProblemArrays, states: FloatArray, controls: FloatArray, arrived: BoolArray, touched: BoolArray
     ) -> StepResult:
         """Return the result of a step: flags and rewards of a team at rest where it is now, and who was touched."""
         still = np.ones(len(states), np.bool_)
-        verdict = self._engine.step(arrays._replace(docks=np.bool_(True)), states, still, np.zeros_like(controls))
-        judged = verdict._replace(states=states, controls=controls, arrived=arrived)
-        return judged.with_contacts(touched, touched & ~verdict.margin_violated, arrays.collision_penalty)
+        checked = self._engine.step(arrays._replace(docks=np.bool_(True)), states, still, np.zeros_like(controls))
+        outcome = checked._replace(states=states, controls=controls, arrived=arrived)
+        return outcome.with_contacts(touched, touched & ~checked.margin_violated, arrays.collision_penalty)

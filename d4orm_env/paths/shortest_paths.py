@@ -1,4 +1,4 @@
-"""The shortest ways to the goals through the space that obstacles leave free."""
+"""The shortest paths to the goals through the space that obstacles leave free."""
 
 from __future__ import annotations
 
@@ -35,16 +35,15 @@ REFINEMENTS = 2
 
 @dataclass(frozen=True, eq=False)
 class ShortestPaths:
-    """The shortest free way of every robot of a problem to its goal, other robots not counted.
+    """The shortest path of every robot of a problem to its goal, other robots not counted.
 
-    A free way keeps the radius of the robot and the margin to obstacles and bounds. A place that is nearer to something
-    already (a goal may be, and a robot may have got there) is left and reached on lines that come no nearer than it is.
-    Lengths are at most 2% above the least. Gaps that are wider than radius and margin need by less than a sixteenth
-    of that may be missed.
+    A free path keeps the radius of the robot and the margin to obstacles and bounds. A place that is nearer to
+    something, as a goal may be, is left and reached on lines that come no nearer than it is. Lengths are at most 2%
+    above the least. Gaps that are wider than radius and margin need by less than a sixteenth of that may be missed.
 
     Attributes:
         problem: The problem.
-        length: ``(K,)`` float64 from start to goal [m]; infinite where there is no way.
+        length: ``(K,)`` float64 from start to goal [m]; infinite where there is no path.
     """
 
     problem: Problem
@@ -52,17 +51,17 @@ class ShortestPaths:
     _world: tuple[Space, Fields] | None
 
     def distance(self, points: ArrayLike) -> Floats:
-        """``(..., K)`` float64 length of the ways from points ``(..., K, d)`` to the goals [m]."""
+        """``(..., K)`` float64 length of the paths from points ``(..., K, d)`` to the goals [m]."""
         return self._look(points)[1]
 
     def distance_from(self, robot: int, places: Floats) -> Floats:
-        """``(Q,)`` float64 length of the ways of one robot from places ``(Q, d)`` to its goal [m]."""
+        """``(Q,)`` float64 length of the paths of one robot from places ``(Q, d)`` to its goal [m]."""
         if self._world is None:
             return np.linalg.norm(places - self.problem.goal[robot], axis=1)
         return _find(self._world, robot, in_space(places)[None])[1][0]
 
     def direction(self, points: ArrayLike) -> Floats:
-        """``(..., K, d)`` float64 unit vectors along the ways; zero at a goal and where there is no way."""
+        """``(..., K, d)`` float64 unit vectors along the paths; zero at a goal and where there is no path."""
         return self.ahead(points)[0]
 
     def ahead(self, points: ArrayLike) -> tuple[Floats, Floats]:
@@ -72,7 +71,7 @@ class ShortestPaths:
         return _towards(places, target), length
 
     def path(self, robot: int) -> Floats:
-        """``(w, d)`` float64 corners of the way of a robot, its start first and its goal last; empty if there is none.
+        """``(w, d)`` float64 corners of the path of a robot, its start first and its goal last; empty if there is none.
 
         Args:
             robot: Its number.
@@ -89,8 +88,8 @@ class ShortestPaths:
         while anchor >= 0:
             corners.append(fields.points[first + anchor, :d])
             anchor = int(fields.parents[first + anchor])
-        way = np.stack(corners)
-        return way[np.append(True, (np.diff(way, axis=0) != 0).any(axis=1))]
+        points = np.stack(corners)
+        return points[np.append(True, (np.diff(points, axis=0) != 0).any(axis=1))]
 
     def _look(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Return the next position to head for, and the whole distance."""
@@ -117,7 +116,7 @@ def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floa
 
 
 def shortest_paths(problem: Problem) -> ShortestPaths:
-    """The shortest free ways of a team.
+    """The shortest paths of a team.
 
     In a world without obstacles they are straight, and there is nothing to compute. Otherwise a wavefront spreads from
     every goal over a grid; see :mod:`d4orm_env.paths.wavefront`.
@@ -164,8 +163,8 @@ def _towards(places: Floats, targets: Floats) -> Floats:
     return direction
 
 
-def ahead_in_each(ways: Sequence[ShortestPaths], places: FloatArray) -> tuple[Floats, Floats]:
-    """:meth:`ShortestPaths.ahead` in ``B`` worlds, each with ways of its own, from places ``(B, K, d)``."""
+def ahead_in_each(paths: Sequence[ShortestPaths], places: FloatArray) -> tuple[Floats, Floats]:
+    """:meth:`ShortestPaths.ahead` in ``B`` worlds, each with paths of its own, from places ``(B, K, d)``."""
     from d4orm_env.paths.wavefront import look
 
     given = places.astype(np.float64)
@@ -173,7 +172,7 @@ def ahead_in_each(ways: Sequence[ShortestPaths], places: FloatArray) -> tuple[Fl
     # Each robot is one row of one place.
     spatial = in_space(given.reshape(-1, given.shape[-1])).reshape(*given.shape[:-1], 1, 3)
     found, lengths, anchors = np.empty(spatial.shape), length[:, :, None], np.empty(spatial.shape[:3], np.int32)
-    for world, own in enumerate(ways):
+    for world, own in enumerate(paths):
         if own._world is None:
             target[world], length[world] = own._look(given[world])
         else:
@@ -183,13 +182,13 @@ def ahead_in_each(ways: Sequence[ShortestPaths], places: FloatArray) -> tuple[Fl
 
 
 def observe_paths(observations: FloatArray, layout: ObservationLayout, direction: Floats, length: Floats) -> None:
-    """Fill in what robots see of their ways.
+    """Fill in what robots see of their paths.
 
     Args:
         observations: ``(..., K, D)``.
         layout: Their layout.
-        direction: ``(..., K, d)`` of the ways, unit vectors.
-        length: ``(..., K)`` of the ways [m].
+        direction: ``(..., K, d)`` of the paths, unit vectors.
+        length: ``(..., K)`` of the paths [m].
     """
     seen, parts = layout.paths(observations), layout.path
     seen[..., parts.direction] = direction
@@ -197,7 +196,7 @@ def observe_paths(observations: FloatArray, layout: ObservationLayout, direction
 
 
 def _first_or_finer(problem: Problem, space: Space, reach: float, before: Lattice | None) -> Lattice:
-    """The lattice that ways are looked for on at first, or one that is twice as fine as the one before."""
+    """The lattice that paths are looked for on at first, or one that is twice as fine as the one before."""
     most = min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
     if before is None:
         return lay_lattice(problem, space, reach, STEP * reach, most, MAX_NODES)
@@ -213,7 +212,7 @@ def lay_lattice(
     most_points: int = MAX_POINTS,
     pad: float = 0.0,
 ) -> Lattice:
-    """Nodes so far apart wherever ways may lead; farther apart where there would be too many.
+    """Nodes so far apart wherever paths may lead; farther apart where there would be too many.
 
     Args:
         problem: The starts, goals and bounds.
@@ -224,7 +223,7 @@ def lay_lattice(
         most_points: Most points, blocked ones included.
         pad: Distance beyond starts, goals and obstacles that paths may lead, at least twice the reach [m].
     """
-    low, high = _where_ways_lead(problem, space, max(pad, 2 * reach))
+    low, high = _extent(problem, space, max(pad, 2 * reach))
     most_points = most if space is None else most_points
     while True:
         while np.floor((high - low) / step + 1).prod() > most_points:
@@ -236,8 +235,8 @@ def lay_lattice(
         step *= STRETCH * root(count / most, problem.dimension)
 
 
-def _where_ways_lead(problem: Problem, space: Space | None, pad: float) -> tuple[Floats, Floats]:
-    """Lowest and highest corner of where ways may lead [m]."""
+def _extent(problem: Problem, space: Space | None, pad: float) -> tuple[Floats, Floats]:
+    """Lowest and highest corner of where paths may lead [m]."""
     d, bounds = problem.dimension, problem.world.bounds.astype(np.float64)
     places = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
     if space is not None:

@@ -1,9 +1,9 @@
-"""Shortest free ways to one place, compiled with numba: a wavefront over a grid, any-angle, in the plane and in space.
+"""Shortest free paths to one place, compiled with numba: a wavefront over a grid, any-angle, in the plane and in space.
 
 As in Lazy Theta* (A. Nash, S. Koenig and C. Tovey, AAAI 2010) a node of the grid is worth the value of its anchor and
 the straight line to it, which is tested when the node's turn comes. Anchors are not tied to the grid: where a line is
 blocked, it is turned about its far end until it just passes, and the place where it then touches is the new anchor. So
-ways are nearly as short as they can be on grids that are no finer than the robot.
+paths are nearly as short as they can be on grids that are no finer than the robot.
 
 Whether a line is free is found by marching along it with steps that the clearance allows. Where there is hardly any
 room, steps are a quarter of the distance to keep: what is convex and comes no nearer than that at both ends of such a
@@ -27,7 +27,7 @@ from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 
 _HALVINGS = 6
 """Number of halvings of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
-_PUSHES, _SPARE = 4, 0.03
+_PUSHES, _SLACK = 4, 0.03
 """Number of times a node is pushed away from an obstacle, and the excess of a push, as a share of the reach; a third of
 it each time, so as to end in the middle of narrow gaps."""
 _TOLERANCE = 5e-6
@@ -99,8 +99,8 @@ class Front(NamedTuple):
     Attributes:
         anchor: ``(N,)`` int32 the anchor that each node sees; -1 for a node out of reach.
         points: ``(A, 3)`` the anchors; the first is the goal [m].
-        values: ``(A,)`` length of the way from each to the goal [m].
-        parents: ``(A,)`` int32 the anchor that comes next on that way; -1 for the goal.
+        values: ``(A,)`` length of the path from each to the goal [m].
+        parents: ``(A,)`` int32 the anchor that comes next on that path; -1 for the goal.
         room: Clearance at the goal [m].
     """
 
@@ -367,7 +367,7 @@ def _settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tupl
 
     And whether it does.
     """
-    half, probe, spare = lattice.step / 2, lattice.step / 64, reach * _SPARE
+    half, probe, slack = lattice.step / 2, lattice.step / 64, reach * _SLACK
     x, y, z = place
     clearance = clearance_at(space, x, y, z)
     for _ in range(_PUSHES):
@@ -379,8 +379,8 @@ def _settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tupl
         norm = np.sqrt(gx * gx + gy * gy + gz * gz)
         if norm == 0.0:
             break
-        push = (reach + spare - clearance) / norm
-        spare /= 3
+        push = (reach + slack - clearance) / norm
+        slack /= 3
         x = min(max(x + push * gx, place[0] - half), place[0] + half)
         y = min(max(y + push * gy, place[1] - half), place[1] + half)
         z = min(max(z + push * gz, place[2] - half), place[2] + half)
@@ -419,7 +419,7 @@ class _Nodes(NamedTuple):
     """State of the nodes.
 
     Attributes:
-        value: ``(N,)`` length of the way [m].
+        value: ``(N,)`` length of the path [m].
         anchor: ``(N,)`` int32.
         hidden: ``(N,)`` int32 the anchor last found to be hidden.
         tested: ``(N,)`` bool, whether the anchor is known to be seen.
@@ -452,7 +452,7 @@ def _seen_anchor(
     values: Floats,
     n: Whole,
 ) -> tuple[np.int32, float]:
-    """The best anchor of the neighbours of a node that it sees, and the way by it; -1 for none."""
+    """The best anchor of the neighbours of a node that it sees, and the path by it; -1 for none."""
     (i, j, k), q, tried = _indices(lattice.size, lattice.points[n]), _place(lattice.places, n), nodes.tried
     best, chosen, count = np.inf, _NOBODY, 0
     for move in range(lattice.moves.shape[0]):
@@ -475,10 +475,10 @@ def _seen_anchor(
 
 
 @compiled
-def _way_round(
+def _detour(
     space: Space, lattice: Lattice, reach: float, nodes: _Nodes, n: Whole, q: Place
 ) -> tuple[np.int64, float, Place]:
-    """The best neighbour to go on from to a node at ``q``, -1 for none, the way by it, and where it bends.
+    """The best neighbour to go on from to a node at ``q``, -1 for none, the path by it, and where it bends.
 
     In a narrow gap neighbours may see each other by way of a place between them only; elsewhere it is ``q``.
     """
@@ -539,7 +539,7 @@ def _spread(
         if not nodes.tested[n] and not _sees(space, reach, _place(points, a), _kept(a, own_goal, reach), q, reach):
             hidden[n] = a
             a, value[n] = _seen_anchor(space, lattice, reach, own_goal, nodes, points, values, n)
-            p, via, bend = _way_round(space, lattice, reach, nodes, n, q)
+            p, via, bend = _detour(space, lattice, reach, nodes, n, q)
             if via < value[n]:
                 b, c, parent = _place(lattice.places, p), bend, anchor[p]
                 if c == q:
@@ -568,7 +568,7 @@ def _spread(
                 continue
             place = _place(lattice.places, p)
             length = values[a] + _distance(at, place)
-            # What is hidden from one that has no way yet may still be reached by going round.
+            # What is hidden from one that has no path yet may still be reached by going round.
             if length >= value[p] or (hidden[p] == a and value[p] < np.inf):
                 continue
             if nodes.tested[p] and not _sees(space, reach, at, own, place, reach):
@@ -671,15 +671,15 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Plac
 def look(
     space: Space, fields: Fields, first: int, places: Floats, target: Floats, length: Floats, anchor: Ints
 ) -> None:
-    """The ways of some robots from places.
+    """The paths of some robots from places.
 
     Args:
         space: The world.
         fields: The wavefronts of all robots.
         first: Number of the first of these robots, which follow each other.
         places: ``(R, Q, 3)``.
-        target: ``(R, Q, 3)`` where to go first, the place itself where there is no way; output.
-        length: ``(R, Q)`` of the whole way; infinite where there is none, output.
+        target: ``(R, Q, 3)`` where to go first, the place itself where there is no path; output.
+        length: ``(R, Q)`` of the whole path; infinite where there is none, output.
         anchor: ``(R, Q)`` int32 the anchor that is the target or comes next, output; -1 where there is none.
     """
     for r in range(places.shape[0]):

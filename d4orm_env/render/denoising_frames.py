@@ -50,7 +50,7 @@ class Denoising:
 
 @own_style()
 def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, panels: int = 6) -> Path:
-    """Write a picture of a plan's denoising: the ways of its candidate, from the first step to the last.
+    """Write a picture of a plan's denoising: the paths of its candidate, from the first step to the last.
 
     Faint lines are samples. Spatial problems are seen from above.
 
@@ -81,8 +81,8 @@ def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, pan
 def _draw_step(layer: TeamLayer, denoising: Denoising, step: int) -> None:
     panel, problem = layer.panel, layer.problem
     for sample, alpha in zip(denoising.samples[step], denoising.alpha[step]):
-        ways = panel.flatten(sample).swapaxes(0, 1)
-        panel.segments(ways, colors=layer.colors, linewidths=0.6, alpha=float(alpha), zorder=3)
+        paths = panel.flatten(sample).swapaxes(0, 1)
+        panel.segments(paths, colors=layer.colors, linewidths=0.6, alpha=float(alpha), zorder=3)
     waiting = np.zeros(problem.num_robots, bool)
     nobody = np.empty((0, problem.dimension))
     layer.update(problem.start, waiting, problem.goal, denoising.paths[step], nobody)

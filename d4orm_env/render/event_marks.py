@@ -10,7 +10,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import BODY, INK, PUSH, Array, Axes2D
 
 _ARROW_SECONDS = 1.0
-"""An arrow is as long as the way at its speed in this time."""
+"""An arrow is as long as what its speed covers in this time."""
 _SHOWN_SECONDS = 0.5
 """Time for which a moving picture shows a push."""
 
@@ -26,11 +26,11 @@ class MarkLayer:
         self.panel, self.problem = panel, problem
         self.radius = np.asarray(problem.team.radius, np.float64)
         empty = np.empty((0, 4, len(panel.right)))
-        self.ways = panel.segments(empty, colors=BODY, linewidths=1.0, linestyles=":", zorder=1.6)
+        self.paths = panel.segments(empty, colors=BODY, linewidths=1.0, linestyles=":", zorder=1.6)
         self.bodies = panel.polygons(empty, facecolors=BODY, edgecolors=INK, linewidths=0.7, zorder=4.8)
         self.pushes = panel.segments(empty, colors=PUSH, linewidths=1.8, zorder=6.6)
         self.stalls = panel.segments(empty, colors=INK, linewidths=1.8, zorder=6.7)
-        self.artists = [self.ways, self.bodies, self.pushes, self.stalls]
+        self.artists = [self.paths, self.bodies, self.pushes, self.stalls]
 
     def show_last(self, marks: DisturbanceEvents, positions: Array) -> None:
         """Show the last moment of ``marks``, with ``(T + 1, K, d)`` positions of the robots."""
@@ -50,9 +50,9 @@ class MarkLayer:
         self.bodies.set_verts(self.panel.outlines(bodies[-1, :, :d], bodies[-1, :, -1]))
         # A body that has left comes again somewhere else.
         turns = (bodies[1:, :, d : 2 * d] != bodies[:-1, :, d : 2 * d]).any(axis=-1)
-        ways = self.panel.flatten(bodies[..., :d])
-        parts = [np.split(ways[:, i], np.flatnonzero(turns[:, i]) + 1) for i in range(bodies.shape[1])]
-        self.ways.set_segments([path for paths in parts for path in paths if len(path) > 1])
+        flat = self.panel.flatten(bodies[..., :d])
+        parts = [np.split(flat[:, i], np.flatnonzero(turns[:, i]) + 1) for i in range(bodies.shape[1])]
+        self.paths.set_segments([path for paths in parts for path in paths if len(path) > 1])
 
     def _draw_pushes(self, pushed: Array, positions: Array, begin: int) -> None:
         given = np.asarray(pushed[begin:], np.float64)
@@ -73,7 +73,7 @@ class MarkLayer:
         centres = self.panel.flatten(positions[where])
         reach = 1.2 * np.broadcast_to(self.radius, where.shape)[where][:, None]
         one, other = self.panel.right + self.panel.up, self.panel.right - self.panel.up
-        crosses = [np.stack([centres - reach * way, centres + reach * way], axis=1) for way in (one, other)]
+        crosses = [np.stack([centres - reach * arm, centres + reach * arm], axis=1) for arm in (one, other)]
         self.stalls.set_segments(np.concatenate(crosses))
 
 

@@ -114,14 +114,14 @@ class FrameRenderer:
         team, d = self._checked(np.asarray(states)), self.problem.dimension
         docked = np.asarray(arrived, bool)
         places = self.problem.goal if goals is None else np.asarray(goals)
-        way = np.empty((0, len(team), d)) if trail is None else np.asarray(trail)
+        path = np.empty((0, len(team), d)) if trail is None else np.asarray(trail)
         stars = np.concatenate([np.reshape(contacts, (-1, d)), team[np.asarray(collided, bool), :d]])
         self._keep_in_view(np.concatenate([team[:, :d], places]))
         for layer in self._layers:
-            layer.update(team, docked, places, way, stars)
+            layer.update(team, docked, places, path, stars)
         if marks is not None:
             for mark_layer in self._mark_layers:
-                mark_layer.show_last(marks, way[-len(marks.pushed) :])
+                mark_layer.show_last(marks, path[-len(marks.pushed) :])
         self._caption.set_text(f"arrived {docked.sum()} of {len(docked)}" if caption is None else caption)
         return self._paint()
 

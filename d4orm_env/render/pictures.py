@@ -78,8 +78,8 @@ def plot_trajectory(
         problem: The problem that the trajectory belongs to.
         trajectory: Motion to draw.
         title: Title of the figure; by default the problem's name and the outcome, ``""`` for none.
-        marks: Its disturbances, ``episode.marks``: arrows are pushes, as long as the way in a second at their
-            speed, crosses are where a robot stops obeying, and grey discs with dotted ways are intruders.
+        marks: Its disturbances, ``episode.marks``: arrows are pushes, as long as the distance in a second at their
+            speed, crosses are where a robot stops obeying, and grey discs with dotted paths are intruders.
 
     Returns:
         A figure that belongs to no window; save it with ``figure.savefig`` or display it in a notebook.

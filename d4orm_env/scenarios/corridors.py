@@ -1,4 +1,4 @@
-"""Two rooms with one way between them: a corridor with passing bays, or just a door."""
+"""Two rooms with one path between them: a corridor with passing bays, or just a door."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def _two_rooms(
     require_plane(settings)
     name, width = passage
     # A bay is deep enough that a robot in it lets another pass.
-    apart = settings.spacing + 2 * reach_of(settings)
-    depth = max(width, apart - width + 0.1) if bays else 0.0
+    separation = settings.spacing + 2 * reach_of(settings)
+    depth = max(width, separation - width + 0.1) if bays else 0.0
     least = width + 2 * depth
     if room_size is None:
         room_size = max(3.0, 1.25 * float(np.sqrt(settings.num_robots)), 1.1 * least)

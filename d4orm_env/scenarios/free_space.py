@@ -50,8 +50,8 @@ class FreeSpace:
         return bool(within and self.inside[tuple(index)])
 
     @cached_property
-    def longest_way(self) -> float:
-        """About the longest of all shortest ways within the region [m], to some 10%."""
+    def longest_path(self) -> float:
+        """About the longest of all shortest paths within the region [m], to some 10%."""
         inside = np.pad(self.inside, 1)
         steps = np.array(list(product((-1, 0, 1), repeat=inside.ndim)))
         around = steps @ (np.array(inside.strides) // inside.itemsize)

@@ -68,8 +68,8 @@ def four_obstacles(settings: Settings, *, diameter: float = 5.0, obstacle_distan
     """The circle with four round obstacles about its centre.
 
     The paper gives no coordinates for its "2D Holo 4 Obs". Here the obstacles are at ``(+-1, 0)`` and ``(0, +-1)``,
-    radius 0.15 m (``obstacle_radius``): on the straight ways of robots 0, K/4, K/2 and 3K/4, and around the point where
-    all ways cross. In 3D they are vertical cylinders. Random obstacles come on top.
+    radius 0.15 m (``obstacle_radius``): on the straight paths of robots 0, K/4, K/2 and 3K/4, and around where all
+    paths cross. In 3D they are vertical cylinders. Random obstacles come on top.
 
     Args:
         settings: The common arguments.

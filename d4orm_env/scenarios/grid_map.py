@@ -73,7 +73,7 @@ class GridMap:
         return np.array(self.low) + self.cell * np.column_stack([column + 0.5, len(self.blocked) - row - 0.5])
 
     def lattice_step(self, reach: float) -> float:
-        """Step of a lattice that finds every way one cell wide which robots of that reach have [m]."""
+        """Step of a lattice that finds every path one cell wide which robots of that reach have [m]."""
         half = self.cell / 2
         if half <= reach:
             return half * max(1, int(reach / 2 / half))

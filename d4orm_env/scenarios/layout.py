@@ -96,7 +96,7 @@ def default_horizon(team: Team, dt: float, distance: float) -> int:
     if steps > MAX_HORIZON:
         raise ValueError(
             f"a straight drive of {distance:g} m with dt {dt:g} s needs {steps:.3g} steps; "
-            f"use a larger dt, faster robots or a shorter way, or give the horizon"
+            f"use a larger dt, faster robots or a shorter path, or give the horizon"
         )
     return max(MIN_HORIZON, 10 * math.ceil(steps / 10))
 
@@ -105,10 +105,10 @@ def start_states(team: Team, starts: Points, goals: Points) -> Points:
     """``(K, n)`` states at rest; a model that has a heading faces its goal (as in the paper's reference code)."""
     states = np.zeros((team.num_robots, team.state_size))
     states[:, : team.dimension] = starts
-    way = goals - starts
+    offset = goals - starts
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is not None:
-            states[robot, model.heading_index] = arctan2(way[robot, 1], way[robot, 0])
+            states[robot, model.heading_index] = arctan2(offset[robot, 1], offset[robot, 0])
     return states
 
 

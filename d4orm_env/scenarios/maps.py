@@ -84,7 +84,7 @@ def map(
     space = free_space(grid.world, reach, step)
     if scenario_file is None:
         remedy = "a larger map, larger cells or smaller robots"
-        return populate(settings, grid.world, step, space.longest_way, remedy)
+        return populate(settings, grid.world, step, space.longest_path, remedy)
     starts, goals, travel = _listed_places(settings, grid, space, Path(scenario_file))
     world = with_obstacles(settings, grid.world, np.vstack([starts, goals]))
     with _named(Path(scenario_file)):  # whose rows may start or end in one place
@@ -92,7 +92,7 @@ def map(
 
 
 def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:
-    """Starts and goals of a Moving AI scenario, and the longest way [m].
+    """Starts and goals of a Moving AI scenario, and the longest path [m].
 
     Raises:
         ValueError: If the file is bad, or a robot does not fit where it begins or ends; the message names the line.
@@ -111,7 +111,7 @@ def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Pa
                     )
     starts, goals = (grid.centres(np.array([getattr(task, what) for task in tasks])) for what in ("start", "goal"))
     straight = np.linalg.norm(goals - starts, axis=1)
-    return starts, goals, float(max(straight.max(), grid.cell * max(task.way for task in tasks)))
+    return starts, goals, float(max(straight.max(), grid.cell * max(task.path_length for task in tasks)))
 
 
 @contextmanager

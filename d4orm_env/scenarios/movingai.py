@@ -69,12 +69,12 @@ def _size(lines: list[bytes]) -> tuple[int, int]:
 
 
 class MapTask(NamedTuple):
-    """A row of a ``.scen`` file: cells as column and row, the upper left one being (0, 0), and the way in cells."""
+    """A row of a ``.scen`` file: cells as column and row, the upper left one being (0, 0), and the path in cells."""
 
     line: int
     start: tuple[int, int]
     goal: tuple[int, int]
-    way: float
+    path_length: float
 
 
 def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[MapTask]:
@@ -104,7 +104,7 @@ def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[M
 def _task(line: str, number: int, shape: tuple[int, int]) -> MapTask:
     try:
         width, height, *cells = (int(value) for value in line.split()[-7:-1])
-        start, goal, way = (cells[0], cells[1]), (cells[2], cells[3]), float(line.split()[-1])
+        start, goal, path_length = (cells[0], cells[1]), (cells[2], cells[3]), float(line.split()[-1])
     except (ValueError, IndexError):
         raise ValueError(
             f"has a line {number} that is not bucket, map, width, height, start x, start y, goal x, goal y and length"
@@ -117,9 +117,9 @@ def _task(line: str, number: int, shape: tuple[int, int]) -> MapTask:
     for column, row in (start, goal):
         if not (0 <= column < width and 0 <= row < height):
             raise ValueError(f"names the cell ({column}, {row}) in line {number}, which is not on the map")
-    if not (math.isfinite(way) and way >= 0):
-        raise ValueError(f"gives a length of {way} in line {number}; it must be zero or more and finite")
-    return MapTask(number, start, goal, way)
+    if not (math.isfinite(path_length) and path_length >= 0):
+        raise ValueError(f"gives a length of {path_length} in line {number}; it must be zero or more and finite")
+    return MapTask(number, start, goal, path_length)
 
 
 def _count(text: bytes, name: str) -> int:

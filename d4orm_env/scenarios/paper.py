@@ -1,6 +1,6 @@
 """The scenarios that the paper's authors measure on, as their published code of 2026 defines them (section IV-B).
 
-All have 100 steps, whatever the way, and no bounds unless asked for.
+All have 100 steps, whatever the path, and no bounds unless asked for.
 """
 
 from __future__ import annotations
@@ -121,10 +121,10 @@ def _starts(random: np.random.Generator, goals: Points, spacing: float) -> Point
         candidates = random.uniform(-SIDE / 2, SIDE / 2, (CANDIDATES, 2))
         distance = np.linalg.norm(candidates - goal, axis=1)
         candidates = candidates[(distance >= NEAREST) & (distance <= FURTHEST)]
-        apart = np.linalg.norm(candidates[:, None] - starts, axis=-1).min(axis=1, initial=np.inf) >= spacing
-        if not apart.any():
+        separation = np.linalg.norm(candidates[:, None] - starts, axis=-1).min(axis=1, initial=np.inf) >= spacing
+        if not separation.any():
             break
-        starts = np.vstack([starts, candidates[np.argmax(apart)]])
+        starts = np.vstack([starts, candidates[np.argmax(separation)]])
     return starts
 
 

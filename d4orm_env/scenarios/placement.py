@@ -87,7 +87,7 @@ def with_random_obstacles(settings: Settings, world: World, places: Points, area
     """The world and ``settings.num_obstacles`` random circles, or spheres in space.
 
     They keep more than the margin to every start and goal, and leave the largest robot a passage with its margin on
-    both sides, between each other and to everything else: no obstacle closes a way.
+    both sides, between each other and to everything else: no obstacle closes a path.
 
     Args:
         settings: Number and radius of obstacles, team, seed.

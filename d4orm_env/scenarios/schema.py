@@ -75,16 +75,16 @@ class RobotEntry(Entry):
         """The start state, defaults filled in; a robot with a heading faces its goal."""
         model = get_model(self.model)
         state = list(self.start)
-        way = np.subtract(self.goal, self.start)
+        offset = np.subtract(self.goal, self.start)
         if "state" in start_fields(model):
             rest = [0.0] * (model.state_size - model.dimension)
             if model.heading_index is not None:
-                rest[model.heading_index - model.dimension] = float(arctan2(way[1], way[0]))
+                rest[model.heading_index - model.dimension] = float(arctan2(offset[1], offset[0]))
             state += self.state or rest
         if "velocity" in start_fields(model):
             state += self.velocity or [0.0] * model.dimension
         if "heading" in start_fields(model):
-            state += [float(arctan2(way[1], way[0])) if self.heading is None else self.heading]
+            state += [float(arctan2(offset[1], offset[0])) if self.heading is None else self.heading]
         if "speed" in start_fields(model):
             state += [0.0 if self.speed is None else self.speed]
         return state

@@ -14,7 +14,7 @@ WALL = 0.1
 """Thickness of a wall [m]."""
 
 SAMPLES, TRIES = 16, 1000
-"""Drawings that say how long ways usually get, and drawings until one is no longer than these."""
+"""Drawings that say how long paths usually get, and drawings until one is no longer than these."""
 
 
 class Openings(NamedTuple):
@@ -23,7 +23,7 @@ class Openings(NamedTuple):
     Attributes:
         right: ``(rows, columns - 1)`` between a square and the next to its right.
         above: ``(rows - 1, columns)`` between a square and the next above.
-        longest: About the most walls on the shortest way from a square to another.
+        longest: About the most walls on the shortest path from a square to another.
     """
 
     right: Mask
@@ -34,7 +34,7 @@ class Openings(NamedTuple):
 def draw_openings(random: np.random.Generator, columns: int, rows: int, share: float) -> Openings:
     """Random openings: a spanning tree, and that share of all other walls.
 
-    Ways are no longer than in half of some other drawings, so that one horizon suits every seed.
+    Paths are no longer than in half of some other drawings, so that one horizon suits every seed.
 
     Raises:
         ValueError: If they do all the same, however often they are drawn.
@@ -45,7 +45,7 @@ def draw_openings(random: np.random.Generator, columns: int, rows: int, share: f
         if openings.longest <= longest:
             return openings._replace(longest=longest)
     raise ValueError(
-        f"{TRIES} drawings of {columns} x {rows} squares have ways of more than {longest}; try another seed"
+        f"{TRIES} drawings of {columns} x {rows} squares have paths of more than {longest}; try another seed"
     )
 
 

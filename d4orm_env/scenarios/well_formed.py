@@ -1,8 +1,8 @@
 """Starts and goals among walls, such that every robot gets by those at rest.
 
-Such an instance is called well-formed (Cap, Novak, Kleiner and Selecky, 2015): each robot has a way from its start to
+Such an instance is called well-formed (Cap, Novak, Kleiner and Selecky, 2015): each robot has a path from its start to
 its goal that keeps clear of all other starts and goals. One after another, in any order, all of them arrive, and none
-that has docked closes the way of another.
+that has docked closes the path of another.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ENOUGH_POINTS = 2**18
 """Lattice points that do where nothing is narrow."""
 
 WINDOW = {2: 32, 3: 8}
-"""Least distance, in lattice points, within which a way round a place is looked for."""
+"""Least distance, in lattice points, within which a path round a place is looked for."""
 
 TRIES, ROUNDS = 200, 3
 """Places looked at for each start or goal in one attempt to find all of them, and attempts."""
@@ -48,7 +48,7 @@ class _Placing:
 
         self._label, self._dilation = label, binary_dilation
         self.places, self.count = np.empty((most, inside.ndim), np.int64), 0
-        # Whoever goes round a place finds a way within the wide window about it, or is held to find none.
+        # Whoever goes round a place finds a path within the wide window about it, or is held to find none.
         self._narrow = 2 * int(separation) + 1
         self._wide = max(self._narrow, WINDOW[inside.ndim])
         self._free = np.pad(inside, self._wide)

@@ -66,16 +66,16 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     """
     array = _checked_controls(problem, controls)
     if not np.isfinite(array).all():
-        return _unjudged(problem, _non_finite(array, problem.dt))
+        return _left_out(problem, _non_finite(array, problem.dt))
     motion = TeamMotion(problem, array)
     sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR * problem.team.radius.astype(np.float64))))
     if sub_steps.max() > MAX_SUB_STEPS:
-        return _unjudged(problem, list(_too_violent(sub_steps, motion, problem)))
+        return _left_out(problem, list(_too_violent(sub_steps, motion, problem)))
     course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem.start.astype(np.float64))
-    return _judged(problem, motion, course)
+    return _report(problem, motion, course)
 
 
-def _judged(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
+def _report(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
     radius = problem.team.radius.astype(np.float64)
     pairs, obstacles = Pairs(docking.robot, radius), surroundings(problem.world, docking.robot, radius)
@@ -104,11 +104,11 @@ class _Course:
         self._motion, self._sub_steps = motion, sub_steps
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
-        ways = [self._way(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]
-        self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *ways]), axis=0)
+        displacements = [self._displacement(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]
+        self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *displacements]), axis=0)
 
-    def _way(self, steps: slice) -> Floats:
-        return self._motion.way(steps, self._sub_steps)
+    def _displacement(self, steps: slice) -> Floats:
+        return self._motion.displacement(steps, self._sub_steps)
 
     def _parts(self, horizon: int, numbers: int) -> Iterator[slice]:
         size = max(1, MAX_NUMBERS // numbers)
@@ -120,13 +120,13 @@ class _Course:
         stop = np.minimum(docking.steps, horizon)
         docked = self.ends[stop, robot]
         for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
-            way, place = self._way(steps), self.ends[:-1][steps]
-            if len(robot) > way.shape[2]:  # copying is not free, and one reading each is the rule
-                way, place = way[:, :, robot], place[:, robot]
+            displacement, place = self._displacement(steps), self.ends[:-1][steps]
+            if len(robot) > displacement.shape[2]:  # copying is not free, and one reading each is the rule
+                displacement, place = displacement[:, :, robot], place[:, robot]
             stands = np.arange(horizon)[steps, None] >= docking.steps
-            way[np.broadcast_to(stands[:, None], way.shape[:3])] = 0.0
+            displacement[np.broadcast_to(stands[:, None], displacement.shape[:3])] = 0.0
             place = np.where(stands[..., None], docked, place)
-            yield Stretch(place[:, None] + way, norm(way).max(axis=1), steps.start * dt, dt)
+            yield Stretch(place[:, None] + displacement, norm(displacement).max(axis=1), steps.start * dt, dt)
 
 
 def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
@@ -142,7 +142,7 @@ def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
     return array
 
 
-def _unjudged(problem: Problem, violations: list[Violation]) -> VerificationReport:
+def _left_out(problem: Problem, violations: list[Violation]) -> VerificationReport:
     return VerificationReport(np.nan, np.nan, np.full(len(problem.team.models), np.inf), violations)
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SIZE = np.float32(0.15)
 """Radius of robots whose places are judged in metres [m]: those of others in proportion, and speeds by their limits."""
 SUB_STEPS = 20
-"""To find how much the way bends within a control step."""
+"""To find how much the path bends within a control step."""
 STATE_ERROR = 1e-7
 """Largest error of a control step's integration that one with more sub-steps reveals, in units of states."""
 GAP = 1e-10
@@ -65,11 +65,11 @@ class Integrated:
         self._begins = states[:, :-1]
         velocity = self._call(model.functions.velocity, states[:, 1:], self._commands)
         self.pace: Floats = norm(np.moveaxis(velocity, 0, 2))
-        way = self.way(slice(None), SUB_STEPS)
-        change = np.diff(way, n=2, axis=1) * (SUB_STEPS / dt) ** 2
+        displacement = self.displacement(slice(None), SUB_STEPS)
+        change = np.diff(displacement, n=2, axis=1) * (SUB_STEPS / dt) ** 2
         self.bend: Floats = BEND_MARGIN * norm(change).max(axis=1)
         coarse = self._advanced(self._begins, self._commands, dt) - self._begins
-        self.step_error: Floats = norm(np.moveaxis(coarse[: model.dimension], 0, 2) - way[:, -1])
+        self.step_error: Floats = norm(np.moveaxis(coarse[: model.dimension], 0, 2) - displacement[:, -1])
 
     def _states(self, start: Floats) -> Floats:
         """``(n, H+1, R)`` at the beginning of every step and after the last, integrated as finely as it takes.
@@ -153,15 +153,15 @@ class Integrated:
         rows: Floats = np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])
         return rows
 
-    def way(self, steps: slice, sub_steps: int) -> Floats:
+    def displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S+1, R, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""
         x, u = self._begins[:, steps], self._commands[:, steps]
         begin = x[: self._model.dimension]
-        ways = [np.zeros_like(begin)]
+        displacements = [np.zeros_like(begin)]
         for _ in range(sub_steps):
             x = self._advanced(x, u, self._dt / sub_steps)
-            ways.append(x[: self._model.dimension] - begin)
-        return np.moveaxis(np.stack(ways), (0, 1), (1, 3))
+            displacements.append(x[: self._model.dimension] - begin)
+        return np.moveaxis(np.stack(displacements), (0, 1), (1, 3))
 
 
 def _ops() -> Any:

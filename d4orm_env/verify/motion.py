@@ -126,18 +126,18 @@ class TeamMotion:
         self._velocity, self._speed, self.pace = np.array(velocities), np.array(speeds), np.array(paces)
         self._heading = np.cumsum(np.concatenate([heading[None], self._turn_rate * dt]), axis=0)
 
-    def way(self, steps: slice, sub_steps: int) -> Floats:
+    def displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S+1, K, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""
         time = np.linspace(0.0, self.dt, sub_steps + 1)[:, None, None]
-        way: Floats = self._velocity[steps, None] * time + self._acceleration[steps, None] * (time * time / 2)
+        displacement: Floats = self._velocity[steps, None] * time + self._acceleration[steps, None] * (time * time / 2)
         if self.wheeled.any():
-            way[:, 1:, self.wheeled] = self._wheeled_way(steps, sub_steps)
+            displacement[:, 1:, self.wheeled] = self._wheeled_displacement(steps, sub_steps)
         for group in self.groups:
-            way[:, :, group.robots] = group.way(steps, sub_steps)
-        return way
+            displacement[:, :, group.robots] = group.displacement(steps, sub_steps)
+        return displacement
 
-    def _wheeled_way(self, steps: slice, sub_steps: int) -> Floats:
-        """``(T, S, ., 2)`` the differential drives' part of :meth:`way`, but for its beginning."""
+    def _wheeled_displacement(self, steps: slice, sub_steps: int) -> Floats:
+        """``(T, S, ., 2)`` the differential drives' part of :meth:`displacement`, but for its beginning."""
         turn_rate, thrust, speed, heading = (
             values[steps, self.wheeled] for values in (self._turn_rate, self._thrust, self._speed, self._heading[:-1])
         )
@@ -151,5 +151,5 @@ class TeamMotion:
             cosine, sine = cosine * turn_cosine - sine * turn_sine, sine * turn_cosine + cosine * turn_sine
         rate = np.stack(rates, axis=1)
         six_means = rate[:, :-1:2] + 4 * rate[:, 1::2] + rate[:, 2::2]
-        way: Floats = np.cumsum(six_means, axis=1) * (half / 3)
-        return way
+        displacement: Floats = np.cumsum(six_means, axis=1) * (half / 3)
+        return displacement

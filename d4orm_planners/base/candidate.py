@@ -1,4 +1,4 @@
-"""Controls and what they lead to: how every planner's results are judged."""
+"""Controls and what they lead to: how every planner's results are evaluated."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Candidate:
 
 
 def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
-    """Roll controls ``(H, K, m)`` out and judge them: failures at some steps, a solution at all."""
+    """Roll controls ``(H, K, m)`` out and evaluate them: failures at some steps, a solution at all."""
     reach = PLAN_REACH * problem.team.control_limits
     bounded = np.clip(controls, -reach, reach)
     trajectory = engine.rollout(problem, bounded)

@@ -131,7 +131,7 @@ class Controller:
         left = 1 - (self.reserve if self.mode == "nominal" else 0.0)
         team = problem.team
         limits = {name: left * getattr(team, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
-        self._open(problem.resumed_at(start, problem.goal, team=team.replace(**limits)), seed)
+        self._open(problem.with_state(start, problem.goal, team=team.replace(**limits)), seed)
         self.policy.reset(self._env, seed=seed)
         self._time = float(time) - problem.dt
         self._setpoint = self._described(self._joint, self._joint.controls, held=False)

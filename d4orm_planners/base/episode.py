@@ -72,7 +72,7 @@ class Episode(DisplayMixin):
 
     @cached_property
     def stretch(self) -> float:
-        """Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`.
+        """Path travelled over the shortest path, see :func:`d4orm_env.core.metrics.mean_stretch`.
 
         In lifelong mode, where goals change, it means nothing.
         """

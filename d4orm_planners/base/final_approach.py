@@ -22,13 +22,13 @@ SHARES = (1.0, 0.5, 0.75, 0.25)
 """Shares of its control in the first of these steps: a stride that ends at the radius must begin elsewhere."""
 
 
-def drive_further_in(search: SolveRun, candidate: Candidate, judge: Callable[[FloatArray], Candidate]) -> Candidate:
+def drive_further_in(search: SolveRun, candidate: Candidate, evaluate: Callable[[FloatArray], Candidate]) -> Candidate:
     """The candidate, or if rounding alone decides who has arrived in it, one whose robots drive further in.
 
     Args:
         search: The search.
         candidate: Result of an iteration.
-        judge: Function that makes a candidate of controls ``(H, K, m)``.
+        evaluate: Function that makes a candidate of controls ``(H, K, m)``.
     """
     report = candidate.report
     if report is None or report.ok or any(violation.kind != "not arrived" for violation in report.violations):
@@ -41,7 +41,7 @@ def drive_further_in(search: SolveRun, candidate: Candidate, judge: Callable[[Fl
             step = int(arrivals[robot]) - earlier
             if step < 0 or search.should_stop():
                 break
-            other = judge(_driven(search, candidate, robot, step, share))
+            other = evaluate(_driven(search, candidate, robot, step, share))
             if other.rank[:2] > candidate.rank[:2]:
                 candidate = other
                 break
@@ -53,6 +53,6 @@ def _driven(search: SolveRun, candidate: Candidate, robot: int, step: int, share
     part, controls = search.problem.select([robot]), candidate.controls.copy()
     own = np.ascontiguousarray(controls[:, [robot], : part.control_size])
     own[step] *= np.float32(share)
-    way = drives(part, search.engine.rollout(part, own).states, own, [[step + 1]])
-    controls[:, robot, : part.control_size] = way.controls[:, 0, 0]
+    path = drives(part, search.engine.rollout(part, own).states, own, [[step + 1]])
+    controls[:, robot, : part.control_size] = path.controls[:, 0, 0]
     return controls

@@ -49,7 +49,7 @@ class IterationRecord:
         excluded: Samples of this iteration that were left out because their reward was not finite.
         note: Remark of the method on how the iteration ended; ``ipopt`` has IPOPT's return status here,
             ``d-d4orm`` the nodes that were lost and the messages that were dropped, and path finding why it found none.
-        unreachable: Robots for which path finding found no way to their goals.
+        unreachable: Robots for which path finding found no path to their goals.
         controls: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history.
         trajectory: Their rollout, likewise.
     """
@@ -133,7 +133,7 @@ class Plan(DisplayMixin):
 
     @cached_property
     def stretch(self) -> float:
-        """Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`; found when it is
+        """Path travelled over the shortest path, see :func:`d4orm_env.core.metrics.mean_stretch`; found when it is
         first asked for, so that solving does not wait for it.
         """
         return mean_stretch(self.problem, self.trajectory)
@@ -170,7 +170,7 @@ class Plan(DisplayMixin):
                 gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
                 faults.append(f"ends {gap:.2g} m from its goal")
             if robot in unreachable:
-                faults.append(f"has no way from start to goal that is {reach[robot]:.4g} m clear of obstacles")
+                faults.append(f"has no path from start to goal that is {reach[robot]:.4g} m clear of obstacles")
             others = [f"robot_{other}" for other in sorted(near[robot])]
             if others:
                 faults.append(f"comes within the margin of {', '.join(others)}")

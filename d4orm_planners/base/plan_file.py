@@ -69,7 +69,7 @@ def read_plan(path: str | os.PathLike[str]) -> Plan:
         history = tuple(_read_record(record) for record in header.pop("history"))
         made = header.pop("provenance", None)
         provenance = None if made is None else Provenance(**made)
-        return _judged(problem, history, claimed, _checked(header) | {"provenance": provenance})
+        return _evaluated(problem, history, claimed, _checked(header) | {"provenance": provenance})
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no plan at {source}") from None
     except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
@@ -78,7 +78,7 @@ def read_plan(path: str | os.PathLike[str]) -> Plan:
         ) from error
 
 
-def _judged(
+def _evaluated(
     problem: Problem, history: tuple[IterationRecord, ...], claimed: Trajectory, scalars: dict[str, Any]
 ) -> Plan:
     """The plan of a file, with what is true of its controls."""

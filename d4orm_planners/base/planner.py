@@ -49,16 +49,16 @@ class Iteration:
         denoising_steps: Sample-score-update steps spent.
         excluded: Samples left out because their reward was not finite.
         note: Remark of the method on how the iteration ended, where it has a word for it.
-        judged: Result of :func:`~d4orm_planners.base.candidate.evaluate_controls` for these controls, if the iteration
-            asked; else the loop does.
-        unreachable: Robots for which path finding found no way to their goals.
+        evaluated: Result of :func:`~d4orm_planners.base.candidate.evaluate_controls` for these controls, if the
+            iteration asked; else the loop does.
+        unreachable: Robots for which path finding found no path to their goals.
     """
 
     controls: FloatArray
     denoising_steps: int = 0
     excluded: int = 0
     note: str = ""
-    judged: Candidate | None = None
+    evaluated: Candidate | None = None
     unreachable: tuple[int, ...] = ()
 
 

@@ -73,7 +73,7 @@ Whole = Annotated[int, BeforeValidator(_whole), Field(le=LARGEST_WHOLE)]
 Count = Annotated[Whole, Field(ge=1)]
 Samples = Annotated[Whole, Field(ge=2, le=10**7)]
 Steps = Annotated[Whole, Field(ge=1, le=10**6)]
-"""A number of samples or steps, no more than memory and patience can hold."""
+"""A number of samples or steps, no more than memory and time allow."""
 Number = Annotated[float, BeforeValidator(_number), Field(le=LARGEST_NUMBER)]
 Positive = Annotated[Number, Field(gt=0)]
 Seconds = Annotated[Number, Field(ge=0, le=LARGEST)]

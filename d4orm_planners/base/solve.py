@@ -44,7 +44,7 @@ class SolveRun:
         seed: Non-negative.
         initial_controls: ``(H, K, m)`` to start from; zeros by default.
         engine: Engine for rollouts and samples, if not the planner's own.
-        judge: Function that makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
+        evaluate: Function that makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
         check_interval: Failures are looked for at every so many steps only (paper, section VI-A); a solution keeps the
             margin at all steps.
 
@@ -70,7 +70,7 @@ class SolveRun:
         seed: int,
         initial_controls: ArrayLike | None = None,
         engine: SamplingEngine | None = None,
-        judge: Callable[[FloatArray], Candidate] | None = None,
+        evaluate: Callable[[FloatArray], Candidate] | None = None,
         check_interval: int = 1,
     ) -> None:
         self.planner = planner
@@ -91,9 +91,9 @@ class SolveRun:
             self.engine.rollout(problem, controls)
         # A plan of fewer steps is looked at where it ends.
         self.check_interval = min(check_interval, problem.horizon)
-        evaluate = partial(evaluate_controls, self.engine, problem, check_interval=self.check_interval)
-        self.current = self.best = evaluate(controls)
-        self._judge = judge or evaluate
+        of_controls = partial(evaluate_controls, self.engine, problem, check_interval=self.check_interval)
+        self.current = self.best = of_controls(controls)
+        self._evaluate = evaluate or of_controls
         self.iteration = 0
         self.denoising_steps = 0
         self.history: list[IterationRecord] = []
@@ -144,11 +144,11 @@ class SolveRun:
         return derived_seed(self.seed, stream, self.iteration, number)
 
     def advance(self) -> IterationRecord:
-        """Run one iteration, judge it and remember the best; the record that is kept has no arrays."""
+        """Run one iteration, evaluate it and remember the best; the record that is kept has no arrays."""
         if not self._began:
             self.state, self._began = self.planner.init(self), True
         self.state, iteration = self.planner.iterate(self, self.state)
-        self.current = drive_further_in(self, iteration.judged or self._judge(iteration.controls), self._judge)
+        self.current = drive_further_in(self, iteration.evaluated or self._evaluate(iteration.controls), self._evaluate)
         self.iteration += 1
         self.denoising_steps += iteration.denoising_steps
         if self.current.rank > self.best.rank:

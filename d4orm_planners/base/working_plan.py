@@ -53,7 +53,7 @@ class WorkingPlan:
         margin = self.problem.margin + self.problem.rounding
         self.index = PathIndex(trajectory.positions, self.problem.team.radius, margin)
         self._interval = search.check_interval
-        # Who fails is looked for at some steps only, ways around others are at all of them.
+        # Who fails is looked for at some steps only, paths around others are at all of them.
         self._checked = self.index
         if self._interval > 1:
             self._checked = PathIndex(trajectory.positions[:: self._interval], self.problem.team.radius, margin)
@@ -88,41 +88,43 @@ class WorkingPlan:
             rounding decides to one. And ``(R,)`` the step of the first fault, for those that have any.
         """
         index = np.asarray(robots)
-        costs, first = self._judged(index, self.states[:, index, None], self.arrived[index, None])
+        costs, first = self._costs(index, self.states[:, index, None], self.arrived[index, None])
         refused = self.refused[index]
         return np.floor(costs[:, 0]) + (refused <= self.problem.horizon), np.minimum(first[:, 0], refused)
 
-    def take_best(self, robots: ArrayLike, ways: Rollouts, *, or_longer: bool = False) -> None:
-        """Let one robot after the other take the best of its ways, if that is better than what it does.
+    def take_best(self, robots: ArrayLike, paths: Rollouts, *, or_longer: bool = False) -> None:
+        """Let one robot after the other take the best of its paths, if that is better than what it does.
 
         Args:
             robots: ``(R,)``.
-            ways: ``V`` of each. The best has the fewest faults, and of those with as many takes the least time.
+            paths: ``V`` of each. The best has the fewest faults, and of those with as many takes the least time.
             or_longer: Take it even if it takes longer, as long as it has no more faults.
         """
         for i, robot in enumerate(np.asarray(robots).tolist()):
-            costs, _ = self._judged([robot], ways.states[:, [i]], ways.arrived[[i]])
-            present, _ = self._judged([robot], self.states[:, [robot], None], self.arrived[[robot], None])
+            costs, _ = self._costs([robot], paths.states[:, [i]], paths.arrived[[i]])
+            present, _ = self._costs([robot], self.states[:, [robot], None], self.arrived[[robot], None])
             if self.refused[robot] <= self.problem.horizon:
                 present += 1
-                costs[0] += (ways.states[:, i] == self.states[:, robot, None, : ways.states.shape[3]]).all(axis=(0, 2))
+                costs[0] += (paths.states[:, i] == self.states[:, robot, None, : paths.states.shape[3]]).all(
+                    axis=(0, 2)
+                )
             best = int(costs[0].argmin())
             before = np.floor(present[0, 0]) + 1 if or_longer else present[0, 0]
             if costs[0, best] < before:
-                self.move([robot], ways.controls[:, [i], best], ways.states[:, [i], best], ways.arrived[[i], best])
+                self.move([robot], paths.controls[:, [i], best], paths.states[:, [i], best], paths.arrived[[i], best])
 
-    def _judged(self, robots: ArrayLike, states: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:
-        """``(R, V)`` faults of ways, plus the share of the horizon that they take, which is less than one; and the step
-        of the first fault.
+    def _costs(self, robots: ArrayLike, states: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:
+        """``(R, V)`` faults of paths, plus the share of the horizon that they take, less than one; and the step of the
+        first fault.
         """
-        from d4orm_planners.engine.path_index import judge_alone
+        from d4orm_planners.engine.path_index import check_alone
 
         paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
         checked = paths[:, :, :: self._interval]
         met, meeting = self._checked.count_meetings(robots, checked)
-        touching, moves, unsure = judge_alone(self.problem.arrays, robots, paths)
+        touching, moves, unsure = check_alone(self.problem.arrays, robots, paths)
         if self._interval > 1:
-            touching = judge_alone(self.problem.arrays, robots, checked)[0] * self._interval
+            touching = check_alone(self.problem.arrays, robots, checked)[0] * self._interval
             # What there is none of comes after the last step.
             meeting = np.minimum(meeting * self._interval, horizon + 1)
         faults = met + (unsure <= horizon) + MISSING * (~arrived | (touching <= horizon))

@@ -21,7 +21,7 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
 from d4orm_planners.tracking.steering import (
-    goals_along_ways,
+    goals_along_paths,
     preferred_velocities,
     present_velocities,
     track_velocities,
@@ -48,7 +48,7 @@ class OrcaConfig(CheckedSettings):
         max_neighbors: So many of the nearest robots are looked at.
         clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
             distance, which leaves robots with inertia some room: they cannot take a new velocity at once.
-        ways: Whether robots prefer to follow their shortest free ways among obstacles, or else the straight line.
+        shortest_paths: Whether robots prefer to follow their shortest paths among obstacles, or else the straight line.
         deviation: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per
             episode [rad]. Without it robots in a symmetric formation block each other, as the authors note.
 
@@ -61,7 +61,7 @@ class OrcaConfig(CheckedSettings):
     neighbor_distance: Positive = 100.0
     max_neighbors: Neighbors = 10
     clearance: NotNegative | None = None
-    ways: bool = True
+    shortest_paths: bool = True
     deviation: NotNegative = 0.1
 
 
@@ -93,8 +93,8 @@ class Orca(StatePolicy):
 
     def _controls(self, joint: JointState) -> FloatArray:
         problem, goals = self.problem, joint.goals
-        if self.config.ways:
-            goals = goals_along_ways(problem, joint.states[:, : problem.dimension], goals)
+        if self.config.shortest_paths:
+            goals = goals_along_paths(problem, joint.states[:, : problem.dimension], goals)
         preferred = preferred_velocities(problem, joint.states, goals)
         preferred = np.einsum("ijk,kj->ki", self._turn, preferred)
         return track_velocities(problem, joint.states, self._avoid(joint, preferred))

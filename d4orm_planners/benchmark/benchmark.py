@@ -84,7 +84,7 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for what, measurement in (("one environment", measure_env), (f"{settings.num_worlds} worlds", measure_worlds)):
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
-    yield "environments", "rooms, along ways", partial(measure_rooms, settings)
+    yield "environments", "rooms, along paths", partial(measure_rooms, settings)
     yield "environments", f"{settings.num_worlds} worlds in JAX", partial(measure_functional, settings)
     for model in RIGID if find_spec("mujoco") else ():
         yield "environments", f"one environment of {model} in MuJoCo", partial(measure_rigid, settings, model)

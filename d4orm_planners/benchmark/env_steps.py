@@ -69,12 +69,12 @@ def measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Se
 
 
 def measure_rooms(settings: BenchmarkSettings) -> Row:
-    """The same in eight rooms that worlds draw from, where robots see their ways and are paid along them."""
+    """The same in eight rooms that worlds draw from, where robots see their paths and are paid along them."""
     size = max(1, settings.num_worlds // 8)
     along = {"observed_path": True, "progress": "path", "reward": "training"}
     seconds = _measure_batch(settings, size, scenario="rooms", num_robots=8, num_instances=8, **along)
     num_boxes = make_problem("rooms", num_robots=8).world.num_obstacles
-    return _rate("make_vec, rooms along ways", size, num_boxes, (), seconds)
+    return _rate("make_vec, rooms along paths", size, num_boxes, (), seconds)
 
 
 def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Spread:

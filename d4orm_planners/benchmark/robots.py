@@ -12,7 +12,7 @@ from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.benchmark.timing import Row, Spread, measure
 
 NUM_ROBOTS = 10
-PATIENCE = 10
+WARMUP = 10
 """Loops at the beginning that do not count: they may compile."""
 
 
@@ -33,7 +33,7 @@ def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Row:
     return {
         "mode": mode,
         "num_robots": NUM_ROBOTS,
-        "loop": Spread.of(seconds[PATIENCE:]),
-        "loop_95": float(np.percentile(seconds[PATIENCE:], 95)),
+        "loop": Spread.of(seconds[WARMUP:]),
+        "loop_95": float(np.percentile(seconds[WARMUP:], 95)),
         "sample": sampling,
     }

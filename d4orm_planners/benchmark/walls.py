@@ -26,7 +26,7 @@ CELL, BLOCKED = 0.6, 0.2
 
 
 def boxed_problem(num_boxes: int, where: Where, horizon: int = 100) -> Problem:
-    """The circle of 8 robots with small boxes in its middle, where all ways cross, or far away from everybody."""
+    """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from everybody."""
     problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=horizon)
     random = np.random.default_rng(0)
     if where == "near":
@@ -45,7 +45,7 @@ def measure_obstacles(
     Args:
         iterate: Function to time.
         num_boxes: Number of boxes.
-        where: Near the robots' ways, or far from them.
+        where: Near the robots' paths, or far from them.
         repetitions: Pairs at most.
         time_limit: Seconds after which no further pair begins.
     """

@@ -46,8 +46,8 @@ def show_warehouse(out: Path, num_robots: int, seed: int, engine: str) -> None:
     require_solved(plan)
     episode = run_episode(navigation_v0.parallel_env(problem=problem), OpenLoop(plan=plan), seed)
     report = verify(problem, plan.controls)
-    verdict = "yes" if report.ok else "no: " + "; ".join(map(str, report.violations[:3]))
-    rows = [("verified", verdict), ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces")]
+    outcome = "yes" if report.ok else "no: " + "; ".join(map(str, report.violations[:3]))
+    rows = [("verified", outcome), ("closest approach", f"{report.min_separation * 100:.1f} cm between surfaces")]
     print_table("Executed in the environment", [*episode_rows(episode), *rows])
     _tell(_write(plan, episode, out))
     if not episode.metrics["success"]:

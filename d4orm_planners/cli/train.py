@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 IMITATION = "imitation"
 _REINFORCEMENT_ONLY = (
-    "steps", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "ways",
+    "steps", "num_envs", "curriculum", "stages", "start_from", "network", "observed_robots", "shortest_paths",
     "learning_rate", "learner_settings", "reward_settings", "mixture",
 )  # fmt: skip
 _IMITATION_ONLY = ("expert", "expert_settings", "dataset", "episodes", "rounds", "epochs")
@@ -46,7 +46,7 @@ class TrainOptions:
         int | None, typer.Option("--num-envs", help="Robots that act at once; 1024 for ppo, 64 for sac.")
     ] = None
     curriculum: Annotated[bool, typer.Option(help="Begin with smaller teams.")] = False
-    lessons: Annotated[int, typer.Option("--lessons", help="Parts with a checkpoint and an evaluation each.")] = 50
+    stages: Annotated[int, typer.Option("--stages", help="Parts with a checkpoint and an evaluation each.")] = 50
     start_from: Annotated[
         Path | None, typer.Option("--start-from", help="A policy file of the same algorithm that learns on.")
     ] = None
@@ -54,8 +54,8 @@ class TrainOptions:
         "flat"
     )
     observed_robots: Annotated[int, typer.Option("--observed-robots", help="Neighbours in observations.")] = 4
-    ways: Annotated[
-        bool, typer.Option("--ways", help="Robots head along their shortest free ways; for worlds with walls.")
+    shortest_paths: Annotated[
+        bool, typer.Option("--shortest-paths", help="Robots head along their shortest paths; for worlds with walls.")
     ] = False
     learning_rate: Annotated[
         float | None, typer.Option("--learning-rate", help="At the beginning; it falls to a tenth. 3e-4 for ppo.")
@@ -74,7 +74,7 @@ class TrainOptions:
         list[str] | None,
         typer.Option(
             "--mixture",
-            help="A scenario, team size and settings to practise with others at once, as 'random 8 size=4', or the "
+            help="A scenario, team size and settings to train on with others at once, as 'random 8 size=4', or the "
             "name of a mixture, crowds; repeatable.",
         ),
     ] = None
@@ -136,14 +136,14 @@ def _reinforcement(options: TrainOptions) -> Callable[..., TrainingResult]:
     if not (math.isfinite(steps) and steps == int(steps) >= 1):
         raise ValueError(f"--steps is {steps:g}; it must be a whole number of at least 1")
     same = (
-        "algorithm", "num_envs", "curriculum", "lessons", "start_from", "network", "observed_robots", "ways",
+        "algorithm", "num_envs", "curriculum", "stages", "start_from", "network", "observed_robots", "shortest_paths",
         "learning_rate",
     )  # fmt: skip
     own = {name: getattr(options, name) for name in same}
     own |= {"steps": int(steps), "mixture": tuple(options.mixture or ())}
     own["learner_settings"] = parse_settings(options.learner_settings, "--learner-set")
     own["reward_settings"] = parse_settings(options.reward_settings, "--reward-set")
-    settings = training.TrainingSettings(**_practice(options), **own)
+    settings = training.TrainingSettings(**_config_options(options), **own)
     return partial(training.train, settings)
 
 
@@ -153,11 +153,11 @@ def _imitation(options: TrainOptions) -> Callable[..., TrainingResult]:
     refuse_options(options.context, _REINFORCEMENT_ONLY, "is for ppo and sac; leave it out")
     own = {name: getattr(options, name) for name in ("expert", "dataset", "episodes", "rounds", "epochs")}
     expert_settings = parse_settings(options.expert_settings, "--expert-set")
-    settings = imitation.ImitationSettings(**_practice(options), **own, expert_settings=expert_settings)
+    settings = imitation.ImitationSettings(**_config_options(options), **own, expert_settings=expert_settings)
     return partial(imitation.imitate, settings)
 
 
-def _practice(options: TrainOptions) -> dict[str, object]:
+def _config_options(options: TrainOptions) -> dict[str, object]:
     """Return the settings that both have in common."""
     return {
         **{name: getattr(options, name) for name in ("scenario", "num_robots", "seed", "model", "validation_worlds")},

@@ -104,7 +104,7 @@ def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     run.moments(_RULES.weights(rewards, np), with_second=False)
     get_sampling_engine("cpu").rollout(problem, _no_controls(problem))
     if drives:
-        # What it drives by itself, and how it looks for ways around others.
+        # What it drives by itself, and how it looks for paths around others.
         planner = make_planner(engine="cpu")
         planner.init(SolveRun(planner, problem, seed=0))
 
@@ -117,8 +117,8 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
         get_sampling_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
 
 
-def find_ways() -> None:
-    """Find the shortest free ways among walls, and guide a team along them."""
+def find_paths() -> None:
+    """Find the shortest paths among walls, and guide a team along them."""
     problem = make_problem("doorway", num_robots=4)
     problem.shortest_paths.distance(problem.goal)
     make_planner("mapf", engine="cpu").solve(problem, seed=0)
@@ -141,7 +141,7 @@ def warm_up() -> WarmupReport:
     other.wait()
     sample_once(TEAMS)
     roll_out_once(TEAMS[0])
-    find_ways()
+    find_paths()
     _evade()
     _plan()
     seconds = time.perf_counter() - begin

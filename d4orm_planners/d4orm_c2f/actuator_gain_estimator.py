@@ -84,7 +84,7 @@ class Weakness:
         share = np.maximum(share - held_back, WEAKEST)
         if (share != self._share).any():
             self._share = share
-            self.problem = self._first.resumed_at(self._first.start, self._first.goal, team=self._team(share))
+            self.problem = self._first.with_state(self._first.start, self._first.goal, team=self._team(share))
 
     def _persistent(self, added: NDArray[np.float64]) -> NDArray[np.float64]:
         """``(K,)`` effort that is added for some time, now that ``added`` ``(K, m)`` is."""

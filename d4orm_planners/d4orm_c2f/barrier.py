@@ -110,9 +110,9 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
 
     reaction, near = problem.dt if caution else 0.0, _near(problem)
     offsets = places[:, None] - places
-    apart = np.linalg.norm(offsets, axis=2)
-    for i, j in np.argwhere(np.triu((apart > 0) & (apart < near) & (free[:, None] | free))).tolist():
-        normal, room = offsets[i, j] / apart[i, j], float(apart[i, j]) - radius[i] - radius[j] - gap
+    separation = np.linalg.norm(offsets, axis=2)
+    for i, j in np.argwhere(np.triu((separation > 0) & (separation < near) & (free[:, None] | free))).tolist():
+        normal, room = offsets[i, j] / separation[i, j], float(separation[i, j]) - radius[i] - radius[j] - gap
         add(i if free[i] else -1, j if free[j] else -1, normal, room, braking[i] + braking[j])
     able = np.flatnonzero(free).tolist()
     for body in joint.bodies[joint.bodies[:, -1] > 0] if len(joint.bodies) else ():

@@ -40,7 +40,7 @@ class CoarsePlan(CoarseWaypoints):
 
 def coarse_problem(problem: Problem, factor: int) -> Problem:
     """The problem with steps ``factor`` times as long and as many fewer of them (paper, Algorithm 4, line 1)."""
-    return problem.resumed_at(
+    return problem.with_state(
         problem.start, problem.goal, horizon=max(-(-problem.horizon // factor), 1), dt=problem.dt * factor
     )
 
@@ -100,5 +100,5 @@ def rest_of(guidance: CoarsePlan, index: int, factor: int) -> tuple[Problem, Flo
     """The coarse problem that is left from a waypoint on, and the controls of the coarse plan for it."""
     step = min(-(-index // factor), len(guidance.controls) - 1)
     coarse = guidance.problem
-    left = coarse.resumed_at(guidance.states[step], coarse.goal, horizon=coarse.horizon - step)
+    left = coarse.with_state(guidance.states[step], coarse.goal, horizon=coarse.horizon - step)
     return left, guidance.controls[step:]

@@ -25,7 +25,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     subgoal_indices,
 )
 from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, StagnationMonitor, keep_time
-from d4orm_planners.d4orm_c2f.lookahead import within_sight
+from d4orm_planners.d4orm_c2f.line_of_sight import visible_subgoals
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_c2f.warm_start import episode_of
 from d4orm_planners.d4orm_d.planner import D4ormD
@@ -34,7 +34,7 @@ from d4orm_planners.engine.sampling_types import SamplingEngine
 from d4orm_planners.hybrid.planner import Hybrid
 from d4orm_planners.hybrid.settings import HybridConfig
 from d4orm_planners.mapf.planner import RoadmapSolution
-from d4orm_planners.mapf.relay import relay_ways
+from d4orm_planners.mapf.relay import relay_paths
 from d4orm_planners.tracking.steering import straight_drives
 
 NEARER = 1 / 3
@@ -79,23 +79,23 @@ class CoarsePlanTracker:
         self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
         self._last_step, self._astray = last_step, config.replan_distance * problem.stride
         self._refiner, self._background = refiner, background
-        # Ways that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
-        # the team does not get on there may be no other ways.
+        # Paths that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
+        # the team does not get on there may be no other paths.
         self._planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
     def begin(self, joint: JointState, docked: BoolArray) -> None:
         """Plan for the episode, in which those ``docked`` ``(K,)`` stay where they are."""
         everybody = np.ones(self.problem.num_robots, bool)
         self._patience, self.stuck = StagnationMonitor(joint), ~everybody
-        self.guidance, self.index = self.plan(joint, docked, self._guess(joint), self._config.coarse_iterations), 0
+        self.guidance, self.index = self.plan(joint, docked, self._warm_start(joint), self._config.coarse_iterations), 0
         self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
 
-    def _guess(self, joint: JointState) -> FloatArray | None:
+    def _warm_start(self, joint: JointState) -> FloatArray | None:
         """``(H_c, K, m)`` what a policy does from where the team is, if the coarse plan is to begin with that."""
-        if self._config.first_guess is None:
+        if self._config.warm_start is None:
             return None
-        coarse = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), self._config.coarse_factor)
-        return episode_of(self._config.first_guess, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps))
+        coarse = coarse_problem(self.problem.with_state(joint.states, joint.goals), self._config.coarse_factor)
+        return episode_of(self._config.warm_start, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps))
 
     def _follow(self, joint: JointState, guidance: CoarseWaypoints, anew: BoolArray) -> None:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
@@ -116,7 +116,7 @@ class CoarsePlanTracker:
         """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
         # Whoever has docked at the rim of its goal could leave it within a coarse step.
         goals = np.where(docked[:, None], joint.states[:, : self.problem.dimension], joint.goals)
-        coarse = coarse_problem(self.problem.resumed_at(joint.states, goals), self._config.coarse_factor)
+        coarse = coarse_problem(self.problem.with_state(joint.states, goals), self._config.coarse_factor)
         chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
         left = (self._last_step - joint.steps) // self._config.coarse_factor
         if (
@@ -126,7 +126,7 @@ class CoarsePlanTracker:
             and not chosen.trajectory.arrived[left].all()
         ):
             # It would come too late. Plans that come too late are none, if there are others.
-            in_time = coarse.resumed_at(coarse.start, coarse.goal, horizon=left)
+            in_time = coarse.with_state(coarse.start, coarse.goal, horizon=left)
             hurried, other = self._planned(in_time, joint.steps, initial, iterations, thorough)
             if not hurried.failed.any():
                 return other
@@ -166,10 +166,10 @@ class CoarsePlanTracker:
             self.index = round(float(self._indices[going].mean()))
         lag = len(path) if self._config.max_lag is None else self._config.max_lag
         targets = subgoal_indices(self._indices, self.index, offset, lag, len(path) - 1)
-        if not self._config.sight:
+        if not self._config.line_of_sight:
             return targets
         walls = self.guidance.ordered
-        return within_sight(self.problem, positions, path, self._indices, targets, docked, walls)
+        return visible_subgoals(self.problem, positions, path, self._indices, targets, docked, walls)
 
     def followed(self, joint: JointState, engine: SamplingEngine, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path, from where on it it is."""
@@ -225,27 +225,27 @@ class CoarsePlanTracker:
         return True
 
     def _relayed(self, joint: JointState, changed: BoolArray) -> CoarseWaypoints | None:
-        """New ways on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""
+        """Paths on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""
         if not (self._lifelong and self.guidance.ordered):
             return None
         factor, seed = self._config.coarse_factor, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
-        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
-        ways = relay_ways(present, self.guidance.path[self.index :: factor], changed, seed)
-        return None if ways is None else CoarseWaypoints(path=interpolate(ways, factor), ordered=True)
+        present = coarse_problem(self.problem.with_state(joint.states, joint.goals), factor)
+        paths = relay_paths(present, self.guidance.path[self.index :: factor], changed, seed)
+        return None if paths is None else CoarseWaypoints(path=interpolate(paths, factor), ordered=True)
 
     def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
-        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` back to and along their ways.
+        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` back to and along their paths.
 
-        ``None`` among walls: there the whole team's ways are found anew on the roadmap.
+        ``None`` among walls: there the whole team's paths are found anew on the roadmap.
         """
         if self.guidance.ordered or not isinstance(self.guidance, CoarsePlan):
             return None
         factor = self._config.coarse_factor
-        present = coarse_problem(self.problem.resumed_at(joint.states, joint.goals), factor)
+        present = coarse_problem(self.problem.with_state(joint.states, joint.goals), factor)
         initial = straight_drives(present).controls[:, :, 0]
         if keep.any():
-            ways = self.guidance.path[::factor]
-            along = keep_time(present, self._refiner, joint, ways, self._clock() // factor, present.horizon)
+            paths = self.guidance.path[::factor]
+            along = keep_time(present, self._refiner, joint, paths, self._clock() // factor, present.horizon)
             initial[:, keep] = along[:, keep]
         return initial
 

@@ -125,7 +125,7 @@ class Deviation:
     def arrays(self, joint: JointState) -> ProblemArrays:
         """Return the arrays to step on from there: with the limits that robots are believed to have now."""
         radius = docking_radius(self.problem, self._docks)
-        return self.problem.resumed_at(joint.states, joint.goals, goal_radius=radius).arrays
+        return self.problem.with_state(joint.states, joint.goals, goal_radius=radius).arrays
 
     def _moved(self, joint: JointState, controls: FloatArray) -> JointState:
         d = self.problem.dimension

@@ -30,7 +30,7 @@ def docking_radius(problem: Problem, docks: bool) -> float:
     return problem.goal_radius if docks else PASSING * problem.goal_radius
 
 
-def drive_home(
+def direct_final_approach(
     window: Problem, engine: Engine, controls: FloatArray, near: BoolArray, docked: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """The controls, but straight drives for robots that dock by these no later, or manoeuvres (:func:`come_again`).
@@ -63,7 +63,7 @@ def drive_home(
         if not (near & ~home).any():
             break
         aimed = window.goal + beyond * offsets / np.maximum(away, window.goal_radius)
-        passing = window.resumed_at(window.start, aimed, goal_radius=docking_radius(window, docks=False))
+        passing = window.with_state(window.start, aimed, goal_radius=docking_radius(window, docks=False))
         straight = straight_drives(passing).controls[:, :, 0]
         trajectory = engine.rollout(window, straight)
         sooner = near & ~home & (_docking_times(trajectory) <= latest)
@@ -99,22 +99,22 @@ def come_again(
         return controls, coming
     circle, speed = window.team.turning_radius[robots], window.team.limits[robots, SPEED]
     steps = round(float((LENGTH * circle / speed).max() + RESERVE) / window.dt)
-    alone = window.resumed_at(window.start, window.goal, horizon=steps).select(robots.tolist())
+    alone = window.with_state(window.start, window.goal, horizon=steps).select(robots.tolist())
     angle = 2 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)
     directions = np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
     # A robot turns to its goal as soon as it is so near to the point before.
     away = np.float32(NEAR_VIA * alone.team.largest_radius) + circle[:, None] * np.array(BEYOND)
     vias = alone.start[:, None, None, :2] + away[:, :, None, None] * directions
     vias = vias.reshape(len(robots), -1, 1, 2).astype(np.float32)
-    ways = drives(alone, *standing(alone), np.zeros(vias.shape[:2], int), vias)
-    clear = _keeps_clear(window, ways.positions, robots, docked)
-    moves = (ways.states[1:] != ways.states[:-1]).any(axis=3)
+    rollouts = drives(alone, *standing(alone), np.zeros(vias.shape[:2], int), vias)
+    clear = _keeps_clear(window, rollouts.positions, robots, docked)
+    moves = (rollouts.states[1:] != rollouts.states[:-1]).any(axis=3)
     # The last step in which it moves.
     length = len(moves) - moves[::-1].argmax(axis=0)
-    length = np.where(ways.arrived & clear, length, len(moves) + 1)
+    length = np.where(rollouts.arrived & clear, length, len(moves) + 1)
     best, every = length.argmin(axis=1), np.arange(len(robots))
     found = length[every, best] <= len(moves)
-    chosen = ways.controls[: len(controls), every, best]
+    chosen = rollouts.controls[: len(controls), every, best]
     controls = controls.copy()
     controls[:, robots[found], : chosen.shape[2]] = chosen[:, found]
     coming[robots[found]] = True
@@ -122,7 +122,7 @@ def come_again(
 
 
 def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, docked: BoolArray) -> BoolArray:
-    """``(R, V)`` whether ways ``(T, R, V, d)`` keep the margin to all at rest, or come no nearer than at first."""
+    """``(R, V)`` whether paths ``(T, R, V, d)`` keep the margin to all at rest, or come no nearer than at first."""
     radius = np.asarray(window.team.radius, np.float64)
     room = window.world.clearance(positions) - radius[robots, None]
     clear = _no_nearer(room, window)

@@ -10,7 +10,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.d4orm_c2f.direct_final_approach import docking_radius, drive_home
+from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach, docking_radius
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine, SamplingRules, SamplingTask
 from d4orm_planners.tracking.steering import track_velocities
@@ -79,7 +79,7 @@ class Window:
 
     def prepare(self, joint: JointState) -> None:
         """Compile, so that the first control loop is as quick as the others."""
-        window = self.problem.resumed_at(joint.states, joint.goals, horizon=self._config.predict_horizon)
+        window = self.problem.with_state(joint.states, joint.goals, horizon=self._config.predict_horizon)
         task = SamplingTask(window, self.no_controls(), arrived=joint.arrived)
         self._engine.prepare(task, self._rules, self._noise_scale, self._config.num_samples)
 
@@ -99,14 +99,14 @@ class Window:
         controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
         radius = docking_radius(problem, self._docks)
         joint, horizon = now.joint, config.predict_horizon
-        truth = problem.resumed_at(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
+        truth = problem.with_state(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
         if not config.safe_mix:
             positions = self._engine.rollout(truth, controls).positions
             return Prediction(controls, positions, least_gap(truth, positions[1:]))
         special = now.stuck
-        if config.drive_home and self._docks:
+        if config.direct_final_approach and self._docks:
             near = self._near_goals(now) & ~now.docked & ~now.stuck
-            controls, home = drive_home(truth, self._engine, controls, near, now.docked)
+            controls, home = direct_final_approach(truth, self._engine, controls, near, now.docked)
             special = special | home
         return self._safe_mix(truth, controls, special, sampled, now)
 
@@ -119,7 +119,7 @@ class Window:
         """Deform the base so that all head for their subgoals, or goals where these are near."""
         problem, config, goals = self.problem, self._config, now.joint.goals
         near = self._near_goals(now)
-        window = problem.resumed_at(
+        window = problem.with_state(
             now.joint.states,
             np.where((near | now.docked)[:, None], goals, now.subgoals),
             horizon=config.predict_horizon,
@@ -134,7 +134,7 @@ class Window:
             moving=self._bodies(now.joint, config.predict_horizon),
             arrived=now.docked,
             penalty=config.penalty,
-            reference_distance=None if config.relative_distance else reach,
+            reference_distance=None if config.normalise_distance else reach,
         )
 
     def _bodies(self, joint: JointState, horizon: int) -> MovingObstacles | None:
@@ -164,7 +164,7 @@ class Window:
     def stop(self, joint: JointState, docked: BoolArray) -> FloatArray:
         """``(H_predict + S, K, m)`` controls that bring everyone to rest now."""
         nothing = self.no_controls()
-        present = self.problem.resumed_at(joint.states, joint.goals, horizon=len(nothing))
+        present = self.problem.with_state(joint.states, joint.goals, horizon=len(nothing))
         return self._with_stop(present, nothing, 0, docked)
 
     def _safe_mix(
@@ -181,7 +181,7 @@ class Window:
         before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
         before[: len(now.left)] = now.left
         controls = self._with_stop(window, fresh, horizon, now.docked)
-        window_to_rest = window.resumed_at(window.start, window.goal, horizon=len(controls))
+        window_to_rest = window.with_state(window.start, window.goal, horizon=len(controls))
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
         trajectory, violated = self._violations(window_to_rest, controls, now)
@@ -211,7 +211,7 @@ class Window:
             places = trajectory.positions[0]
             gap = min(least_gap(window, places[None]), float((window.world.clearance(places) - radius).min()))
             allowed = min(gap - window.rounding, window.margin / 2 if now.stuck.any() else window.margin)
-            nearer = window.resumed_at(window.start, window.goal, margin=max(allowed, 0.0))
+            nearer = window.with_state(window.start, window.goal, margin=max(allowed, 0.0))
             violated[lenient] = self._engine.rollout(nearer, controls).margin_violated[1:, lenient].any(axis=0)
         return trajectory, violated | self._meets_bodies(now.joint, trajectory, window.margin)
 
@@ -228,7 +228,7 @@ class Window:
     def touching(self, joint: JointState, docked: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
         """``(K,)`` robots within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
         radius = docking_radius(self.problem, self._docks)
-        present = self.problem.resumed_at(
+        present = self.problem.with_state(
             joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius
         )
         trajectory = self._engine.rollout(present, controls)

@@ -70,7 +70,7 @@ def keep_time(
         ``(horizon, K, m)``.
     """
     every, last, states = np.arange(len(indices)), len(path) - 1, joint.states
-    arrays, nobody = problem.resumed_at(joint.states, joint.goals).arrays, np.zeros(problem.num_robots, bool)
+    arrays, nobody = problem.with_state(joint.states, joint.goals).arrays, np.zeros(problem.num_robots, bool)
     controls = np.empty((horizon, problem.num_robots, problem.control_size), np.float32)
     for t in range(horizon):
         now = path[np.minimum(indices + t, last), every]

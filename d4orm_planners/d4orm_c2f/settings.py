@@ -22,12 +22,12 @@ PAPER_CONTROL = {
     "num_steps": PAPER["num_steps"],
     "weight_cutoff": PAPER["weight_cutoff"],
     "max_lag": None,
-    "sight": False,
+    "line_of_sight": False,
     "credit": "team",
     "penalty": 1.0,
-    "relative_distance": True,
+    "normalise_distance": True,
     "safe_mix": False,
-    "drive_home": False,
+    "direct_final_approach": False,
     "reaction_time": 0.0,
     "delay": 0,
     "filter_states": False,
@@ -52,7 +52,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         coarse_steps: ``N`` of the coarse plan.
         coarse_repair_steps: The same of repairs of the coarse plan.
         coarse_preset: Preset of D4orm-D that plans coarsely: ``"paper"`` or, by default, ``None``.
-        first_guess: Name of a policy whose episode, in coarse steps, the first coarse plan begins with; ``None`` begins
+        warm_start: Name of a policy whose episode, in coarse steps, the first coarse plan begins with; ``None`` begins
             as D4orm-D does.
         coarse_iterations: Iterations after which the coarse plan is taken as it is.
         replan_iterations: The same when only some robots have new goals.
@@ -61,15 +61,15 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
         max_lag: Waypoints that a robot may be behind the others without its subgoal staying behind too. ``None`` for
             any number: the subgoals of all are always those of one moment, as in the paper.
-        sight: Whether a subgoal behind robots at rest is exchanged for the furthest waypoint in sight before it.
+        line_of_sight: Whether a subgoal behind robots at rest is exchanged for the furthest in sight before it.
         num_samples: ``M`` of a control loop.
         num_steps: ``N`` of a control loop.
         credit: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop.
         penalty: Factor of the problem's collision penalty in a control loop, 1 in the paper.
-        relative_distance: Whether distances to subgoals count relative to the initial one, as in the paper, rather than
+        normalise_distance: Whether distances to subgoals count relative to the initial one, as in the paper, not
             to how far robots get in ``m`` steps: then a robot next to its subgoal has no more to lose than others.
         safe_mix: Whether robots follow a fine plan only as far as it keeps the margin.
-        drive_home: Whether robots that dock no later if they drive straight to their goals do so.
+        direct_final_approach: Whether robots that dock no later if they drive straight to their goals do so.
         extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
         reaction_time: The margin in control loops grows by how far robots come within so many seconds from where they
             were expected, by the largest deviation of late: nothing while they do as they are told [s].
@@ -105,21 +105,21 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     coarse_steps: Steps = 50
     coarse_repair_steps: Steps = 20
     coarse_preset: CoarsePreset = None
-    first_guess: str | None = None
+    warm_start: str | None = None
     coarse_iterations: Count = 20
     replan_iterations: Count = 2
     predict_horizon: Steps = 20
     execute_horizon: Steps = 1
     subgoal_offset: Steps = 15
     max_lag: Annotated[Whole, Field(ge=0)] | None = 5
-    sight: bool = True
+    line_of_sight: bool = True
     num_samples: Samples = 128
     num_steps: Steps = 20
     credit: Credit = "robot"
     penalty: Positive = 10.0
-    relative_distance: bool = False
+    normalise_distance: bool = False
     safe_mix: bool = True
-    drive_home: bool = True
+    direct_final_approach: bool = True
     extra_margin: NotNegative = 0.0
     reaction_time: NotNegative = 0.4
     delay: Annotated[Whole, Field(ge=0, le=100)] | None = None

@@ -131,14 +131,14 @@ class _Repair:
         # In its last step a robot drives nowhere else: the deformation as it is.
         switch = np.maximum(nearest[:, None] - np.array(RULES.earlier), 0)
         switch = np.concatenate([np.full((len(index), 1), self.problem.horizon), switch], axis=1)
-        # Some at a time, for all ways of a big team take room.
+        # Some at a time, for all paths of a big team take room.
         order = np.argsort(-nearest, kind="stable")
         for some in np.array_split(order, -(-len(order) // RULES.batch)):
             if self.search.should_stop():
                 break
             alone = part.select(some.tolist())
             states = trajectory.states[:, some, : alone.state_size]
-            ways = drives(alone, states, trajectory.controls[:, some, : alone.control_size], switch[some])
-            self.team.take_best(index[some], ways, or_longer=True)
+            rollouts = drives(alone, states, trajectory.controls[:, some, : alone.control_size], switch[some])
+            self.team.take_best(index[some], rollouts, or_longer=True)
         faults, _ = self.team.faults(index)
         self.failures[index] = np.where(faults > 0, self.failures[index] + 1, 0)

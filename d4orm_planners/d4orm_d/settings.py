@@ -61,7 +61,7 @@ class RepairRules:
         joint_robots: ... and they are so few: robots that only together can get out of each other's way.
         shortenings: Number of times in turn that robots look for shorter final approaches.
         earlier: Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal.
-        batch: Robots that look for ways home at the same time: all ways of a big team take room.
+        batch: Robots that look for paths home at the same time: all paths of a big team take room.
     """
 
     noise_factors: tuple[float, ...] = (1.0, 2.0)

@@ -1,4 +1,4 @@
-"""State shared by the nodes of one process: their candidates, each judged once, and the word to stop."""
+"""State shared by the nodes of one process: their candidates, each evaluated once, and the word to stop."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Evaluator:
         Raises:
             Stopped: If it is no longer wanted.
         """
-        # The judge holds the interpreter's lock: two at once would both be half as fast.
+        # Evaluation holds the interpreter's lock: two at once would both be half as fast.
         with self._lock:
             if self.stop.is_set():
                 raise Stopped

@@ -1,4 +1,4 @@
-"""Messages that a node has received: the newest candidate of every other node, judged anew, and a count of the rest."""
+"""Messages that a node has received: the newest candidate of every other node, evaluated, and a count of the rest."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Report:
     Attributes:
         node: Its sender.
         sequence: Number of the candidate.
-        candidate: Rolled out and judged by the receiver.
+        candidate: Rolled out and evaluated by the receiver.
     """
 
     node: int
@@ -39,7 +39,7 @@ class Inbox:
     """Takes messages from a transport; nothing that arrives makes it raise.
 
     Args:
-        judge: Evaluator of the candidates.
+        evaluator: Evaluator of the candidates.
         transport: Transport of the messages.
         num_nodes: Number of nodes.
         own: The node that it belongs to, or ``None`` for an observer's.
@@ -51,8 +51,8 @@ class Inbox:
         namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
     """
 
-    def __init__(self, judge: Evaluator, transport: Transport, num_nodes: int, own: int | None = None) -> None:
-        self._judge, self._transport = judge, transport
+    def __init__(self, evaluator: Evaluator, transport: Transport, num_nodes: int, own: int | None = None) -> None:
+        self._evaluator, self._transport = evaluator, transport
         self._num_nodes, self._own = num_nodes, own
         self._owner = "the observer" if own is None else f"node {own}"
         self._logged: set[str] = set()
@@ -75,22 +75,22 @@ class Inbox:
         for message in stale:
             self._drop("stale", f"number {message.sequence} of node {message.node}, which has sent a newer one")
         fresh = [newest[node] for node in sorted(newest)]
-        reports = [self._judged(item) for item in fresh if isinstance(item, Message)]
+        reports = [self._evaluated(item) for item in fresh if isinstance(item, Message)]
         self.newest |= {report.node: report for report in reports}
         return reports
 
     def _decoded(self, data: bytes) -> Message:
-        message = decode(data, self._judge.problem, self._num_nodes)
+        message = decode(data, self._evaluator.problem, self._num_nodes)
         if message.node == self._own:
             self.namesake = message.sequence
             raise MessageError("node", f"claims to be from node {message.node}, which has received it")
         return message
 
-    def _judged(self, message: Message) -> Report:
+    def _evaluated(self, message: Message) -> Report:
         # What is sent again, by the same node or another, need not be verified again, which takes its time.
         known = (report.candidate for report in self.newest.values())
         same = (candidate for candidate in known if np.array_equal(candidate.planned, message.controls))
-        candidate = next(same, None) or self._judge.received(message.controls)
+        candidate = next(same, None) or self._evaluator.received(message.controls)
         reward = candidate.reward
         if candidate.solved != message.feasible or abs(reward - message.reward) > TOLERANCE:
             self.false_claims += 1

@@ -15,28 +15,30 @@ logger = logging.getLogger(__name__)
 
 
 class NetworkNodePool(SyncNodePool):
-    """A single node here; a round is over when the others were heard from, or patience has ended.
+    """A single node here; a round is over when the others were heard from, or the timeout has passed.
 
     Args:
         node: The node.
         transport: Its access to the others.
-        patience: See :class:`~d4orm_planners.d_d4orm.node_pool.NodePool`.
-        judge: See :class:`~d4orm_planners.d_d4orm.node_pool.NodePool`.
-        linger: Seconds that a solution is sent to the others in the end, see :meth:`Node.settle`.
+        timeout: See :class:`~d4orm_planners.d_d4orm.node_pool.NodePool`.
+        evaluator: See :class:`~d4orm_planners.d_d4orm.node_pool.NodePool`.
+        grace_period: Seconds that a solution is sent to the others in the end, see :meth:`Node.settle`.
     """
 
-    def __init__(self, node: Node, transport: Transport, patience: float, judge: Evaluator, linger: float) -> None:
-        super().__init__([node], [transport], patience, judge)
-        self._node, self._linger = node, linger
+    def __init__(
+        self, node: Node, transport: Transport, timeout: float, evaluator: Evaluator, grace_period: float
+    ) -> None:
+        super().__init__([node], [transport], timeout, evaluator)
+        self._node, self._grace_period = node, grace_period
         self._seen: set[int] = set()
 
     def close(self) -> Candidate:
         """See :meth:`Crew.close`; before it, a solution is sent to the others."""
-        self._judge.stop.set()
+        self._evaluator.stop.set()
         try:
             for job in self._jobs:
-                job.wait(self.patience)
-            self._node.settle(self._linger)
+                job.wait(self.timeout)
+            self._node.settle(self._grace_period)
             self._report_new_nodes()
         except KeyboardInterrupt:
             logger.info("interrupted while telling the others")
@@ -49,8 +51,8 @@ class NetworkNodePool(SyncNodePool):
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         """See :meth:`Crew._round`."""
         left = time_left()
-        patience = self.patience if left is None else min(self.patience, max(left, 0.0))
-        self._all(lambda node: node.step(self._judge.stop, patience, improve), time_left)
+        timeout = self.timeout if left is None else min(self.timeout, max(left, 0.0))
+        self._all(lambda node: node.step(self._evaluator.stop, timeout, improve), time_left)
         self._node.check_number()
         if not self.alive:
             # What others have sent is not lost with the planner here.

@@ -57,7 +57,7 @@ class Node:
         task: Common task of the nodes.
         planner: Planner that refines its candidate.
         transport: Its access to the others.
-        judge: Evaluator, in common with other nodes of this process.
+        evaluator: Evaluator, in common with other nodes of this process.
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
             network the time at which it began, by which two nodes of one number know which was first.
         observer: Called with every :class:`~d4orm_planners.d_d4orm.node_events.Event`, in the node's own thread.
@@ -77,17 +77,17 @@ class Node:
         task: Task,
         planner: Planner,
         transport: Transport,
-        judge: Evaluator,
+        evaluator: Evaluator,
         sequence: int = 0,
         observer: Observer | None = None,
     ) -> None:
         self.number = number
         seed = node_seed(task.seed, number)
-        self.search = SolveRun(planner, judge.problem, seed, task.controls, judge.engine, judge.own)
-        self.search.cancelled = judge.stop
+        self.search = SolveRun(planner, evaluator.problem, seed, task.controls, evaluator.engine, evaluator.own)
+        self.search.cancelled = evaluator.stop
         self.candidate = self.search.current
         self.transport = TrafficStats(transport)
-        self.inbox = Inbox(judge, self.transport, task.num_nodes, number)
+        self.inbox = Inbox(evaluator, self.transport, task.num_nodes, number)
         self.excluded = 0
         self._task = task
         self._sequence = self._began = sequence
@@ -108,20 +108,20 @@ class Node:
         self._gather()
         self._choose()
 
-    def run(self, stop: threading.Event, patience: float, improve: bool) -> None:
+    def run(self, stop: threading.Event, timeout: float, improve: bool) -> None:
         """Refine and exchange until asked to stop, or until there is a solution unless it is to be improved.
 
-        It waits for the others no longer than ``patience`` [s].
+        It waits for the others no longer than ``timeout`` [s].
         """
-        while self.step(stop, patience, improve):
+        while self.step(stop, timeout, improve):
             pass
 
-    def step(self, stop: threading.Event, patience: float, improve: bool) -> bool:
+    def step(self, stop: threading.Event, timeout: float, improve: bool) -> bool:
         """One round of :meth:`run`; whether there is to be another one."""
         self.refine()
         if stop.is_set() or self.search.time_left == 0 or (self.search.best.solved and not improve):
             return False
-        self._await_others(stop, patience)
+        self._await_others(stop, timeout)
         if self.search.best.solved and not improve:
             return False
         self._choose()
@@ -182,9 +182,9 @@ class Node:
         """Let go of what the planner left open."""
         self.search.close()
 
-    def _await_others(self, stop: threading.Event, patience: float) -> None:
-        """Gather until all heard from the last time are heard from again, or patience ends."""
-        deadline = time.perf_counter() + patience
+    def _await_others(self, stop: threading.Event, timeout: float) -> None:
+        """Gather until all heard from the last time are heard from again, or the timeout passes."""
+        deadline = time.perf_counter() + timeout
         heard = self._gather()
         while not (stop.is_set() or heard >= self._awaited):
             rest = deadline - time.perf_counter()

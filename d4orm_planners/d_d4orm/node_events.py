@@ -22,7 +22,7 @@ class Event:
         end: Time at which it was done, likewise. Messages take no time here.
         of: The node that the candidate came from.
         sequence: Number among that node's messages, from 1; 0 for one that was not sent yet.
-        candidate: The candidate, as judged by ``node``.
+        candidate: The candidate, as evaluated by ``node``.
         size: Bytes of the message that was sent, else 0.
     """
 

@@ -93,16 +93,16 @@ class NodePool(ABC):
     Args:
         nodes: The nodes.
         transports: All ends to close in the end.
-        patience: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
-        judge: The nodes' common judge.
+        timeout: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
+        evaluator: Evaluator of all nodes.
     """
 
     def __init__(
-        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Evaluator
+        self, nodes: Sequence[Node], transports: Sequence[Transport], timeout: float, evaluator: Evaluator
     ) -> None:
         self.alive = list(nodes)
-        self.patience = patience
-        self._judge = judge
+        self.timeout = timeout
+        self._evaluator = evaluator
         self._nodes = tuple(nodes)
         self._transports = tuple(transports)
         self._jobs: list[_Job] = []
@@ -145,14 +145,14 @@ class NodePool(ABC):
     def close(self) -> Candidate:
         """Part the nodes, and give the best candidate that they have seen.
 
-        A thread leaves what it is at where it can, and it is waited for no longer than patience.
+        A thread leaves what it is at where it can, and it is waited for no longer than the timeout.
         """
-        self._judge.stop.set()
+        self._evaluator.stop.set()
         for node in self._nodes:
             node.close()
         for transport in self._transports:
             transport.close()
-        deadline = time.perf_counter() + self.patience
+        deadline = time.perf_counter() + self.timeout
         for job in self._jobs:
             if job.node in self.alive:
                 job.wait(max(deadline - time.perf_counter(), 0))
@@ -248,9 +248,9 @@ class SyncNodePool(NodePool):
         for job in self._jobs:
             while job.running:
                 left = time_left()
-                if left is not None and left + self.patience <= 0:
+                if left is not None and left + self.timeout <= 0:
                     break
-                job.wait(None if left is None else left + self.patience)
+                job.wait(None if left is None else left + self.timeout)
             if job.running:
                 job.leave()
                 self._lose(job, "did not finish in time")
@@ -262,20 +262,25 @@ class SyncNodePool(NodePool):
 
 
 class AsyncNodePool(NodePool):
-    """Every node runs on by itself; a round is over when each was heard from, or patience ended after the first.
+    """Every node runs on by itself; a round is over when each was heard from, or the timeout passed after the first.
 
     Args:
         nodes: The nodes.
         transports: All ends to close in the end.
-        patience: See :class:`NodePool`.
-        judge: See :class:`NodePool`.
+        timeout: See :class:`NodePool`.
+        evaluator: See :class:`NodePool`.
         observer: Observer of the nodes for the solve itself.
     """
 
     def __init__(
-        self, nodes: Sequence[Node], transports: Sequence[Transport], patience: float, judge: Evaluator, observer: Inbox
+        self,
+        nodes: Sequence[Node],
+        transports: Sequence[Transport],
+        timeout: float,
+        evaluator: Evaluator,
+        observer: Inbox,
     ) -> None:
-        super().__init__(nodes, transports, patience, judge)
+        super().__init__(nodes, transports, timeout, evaluator)
         self._observer = observer
 
     def close(self) -> Candidate:
@@ -300,7 +305,7 @@ class AsyncNodePool(NodePool):
             candidates = [self._observer.newest[number].candidate for number in sorted(heard)]
             if (
                 heard >= {node.number for node in self.alive}
-                or (first is not None and now - first >= self.patience)
+                or (first is not None and now - first >= self.timeout)
                 or (left is not None and left <= 0)
                 or ended
                 or (not improve and any(candidate.solved for candidate in candidates))
@@ -309,16 +314,16 @@ class AsyncNodePool(NodePool):
 
     def _run(self, improve: bool) -> None:
         """Start idle nodes: at first all, later those that stopped at what proved to be no solution here."""
-        self._judge.solution_ends = not improve
+        self._evaluator.solution_ends = not improve
         running = [job for job in self._jobs if job.running]
         failed = [job for job in self._jobs if job.error is not None]
         self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
         idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
         if not running:
-            self._judge.stop.clear()
+            self._evaluator.stop.clear()
 
         def run(node: Node) -> None:
-            node.run(self._judge.stop, self.patience, improve)
+            node.run(self._evaluator.stop, self.timeout, improve)
 
         begun = [_Job(node, run) for node in idle]
         self._jobs = [*running, *failed, *begun]

@@ -90,10 +90,10 @@ class DD4orm(Planner):
         assert config.node is not None
         planner = config.node_planners(task.num_nodes)[config.node]
         transport = ZenohTransport(zenoh)
-        judge = Evaluator(get_sampling_engine(config.engine), search.problem)
+        evaluator = Evaluator(get_sampling_engine(config.engine), search.problem)
         # Numbered by the clock, what a restarted node sends is newer than what it sent before.
-        node = Node(config.node, task, planner, transport, judge, sequence=time.time_ns())
-        return NetworkNodePool(node, transport, config.patience, judge, zenoh.linger)
+        node = Node(config.node, task, planner, transport, evaluator, sequence=time.time_ns())
+        return NetworkNodePool(node, transport, config.timeout, evaluator, zenoh.grace_period)
 
     def _local_crew(self, search: SolveRun, task: Task, opened: ExitStack) -> NodePool:
         """All nodes, in threads of this process; what is to be closed after them is ``opened``."""
@@ -107,12 +107,12 @@ class DD4orm(Planner):
                 planners = list(ray_planners(connection, planners, problem, seeds))
         # Nodes of one machine share its cores.
         engine = get_sampling_engine(config.engine, max(available_cores() // number, 1))
-        network, judge = LocalNetwork(), Evaluator(engine, problem, 2 * number)
+        network, evaluator = LocalNetwork(), Evaluator(engine, problem, 2 * number)
         ends = [network.join() for _ in planners]
         nodes = [
-            Node(i, task, planner, end, judge) for i, (planner, end) in enumerate(zip(planners, ends, strict=True))
+            Node(i, task, planner, end, evaluator) for i, (planner, end) in enumerate(zip(planners, ends, strict=True))
         ]
         if config.mode == "sync":
-            return SyncNodePool(nodes, ends, config.patience, judge)
+            return SyncNodePool(nodes, ends, config.timeout, evaluator)
         observer = network.join()
-        return AsyncNodePool(nodes, [*ends, observer], config.patience, judge, Inbox(judge, observer, number))
+        return AsyncNodePool(nodes, [*ends, observer], config.timeout, evaluator, Inbox(evaluator, observer, number))

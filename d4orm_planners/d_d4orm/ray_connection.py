@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
 
-PATIENCE = 10.0
+TIMEOUT = 10.0
 """Seconds to wait for the head of a cluster to answer."""
 
 LOOPBACK = ("127.0.0.1", "::1")
@@ -46,7 +46,7 @@ class RayConnection:
         try:
             if host:
                 # Ray itself tries for minutes.
-                socket.create_connection((host, port), PATIENCE).close()
+                socket.create_connection((host, port), TIMEOUT).close()
             if self._owner and address == "local":
                 self._start_here()
             elif self._owner:

@@ -45,7 +45,7 @@ class DD4ormConfig(PlannerConfig):
         k: Number of candidates that it draws from.
         mode: ``"sync"``: all nodes refine, then all exchange; the same seed gives the same plan. ``"async"``: each at
             its own pace; plans then depend on which is sooner.
-        patience: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
+        timeout: Seconds that are waited for stragglers: in asynchronous mode in every round, else beyond the time
             limit of the solve, after which a node is given up.
         transport: ``"local"``: nodes are threads of this process. ``"ray"``: their iterations run in actors of Ray.
             ``"zenoh"``: this process is one node among others on a network, each at its own pace (``mode="async"``).
@@ -61,7 +61,7 @@ class DD4ormConfig(PlannerConfig):
     selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
     k: Count = 4
     mode: Annotated[str, one_of(MODES)] = "sync"
-    patience: Seconds = 1.0
+    timeout: Seconds = 1.0
     transport: Annotated[str, one_of(TRANSPORTS)] = "local"
     node: Annotated[Whole, Field(ge=0)] | None = None
     zenoh: Annotated[ZenohSettings | None, SkipValidation] = None  # checked once it is known to be of use

@@ -67,7 +67,7 @@ class ZenohSettings:
             on loopback only.
         config_file: A zenoh configuration in JSON5, for TLS, access control and whatever else zenoh has; the settings
             above are not to be in it.
-        linger: Seconds that a node with a solution goes on telling it, until all others have one as good.
+        grace_period: Seconds that a node with a solution goes on telling it, until all others have one as good.
     """
 
     namespace: str = "d4orm"
@@ -75,7 +75,7 @@ class ZenohSettings:
     connect: tuple[str, ...] = ()
     multicast: bool = False
     config_file: str | None = None
-    linger: float = 2.0
+    grace_period: float = 2.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.namespace, str) or not _NAMESPACE.fullmatch(self.namespace):
@@ -88,7 +88,7 @@ class ZenohSettings:
             raise ValueError(f"multicast must be true or false, not {self.multicast!r}")
         if self.config_file is not None:
             object.__setattr__(self, "config_file", str(self.config_file))
-        object.__setattr__(self, "linger", duration(self.linger, "linger", zero_allowed=True))
+        object.__setattr__(self, "grace_period", duration(self.grace_period, "grace_period", zero_allowed=True))
 
     @classmethod
     def of(cls, settings: object) -> ZenohSettings:

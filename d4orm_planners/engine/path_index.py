@@ -1,8 +1,8 @@
 """Index of a team's positions at every step, compiled with numba: near robots without looking at every pair.
 
 Time is cut into blocks of a few steps, in which robots get not far. In every block the robots are chained in the
-buckets of a hash table, by the cell of a grid that the middle of each one's way through the block is in. A robot that
-comes near a way is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
+buckets of a hash table, by the cell of a grid that the middle of each one's path through the block is in. A robot that
+comes near a path is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
 """
 
 from __future__ import annotations
@@ -110,40 +110,40 @@ class PathIndex:
         return np.stack(np.divmod(met, num_robots), axis=1)
 
     def count_meetings(
-        self, robots: ArrayLike, ways: FloatArray, until: ArrayLike | None = None
+        self, robots: ArrayLike, states: FloatArray, until: ArrayLike | None = None
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Count the others that robots would meet on each of some paths, if nobody else's changed.
 
         Args:
             robots: ``(R,)``.
-            ways: ``(R, V, H+1, n)`` states, or just places.
+            states: ``(R, V, H+1, n)`` states, or just places.
             until: ``(R,)`` the last step that counts, or ``None`` for the horizon.
 
         Returns:
             ``(R, V)``, and the first step at which each meets one, ``H+1`` if it meets none.
         """
-        index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(ways, np.float32)
+        index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(states, np.float32)
         last = np.full(len(index), paths.shape[2]) if until is None else np.asarray(until, np.int64)
         met, when = np.empty((2, *paths.shape[:2]), np.int32)
         self._threads.over(len(index), lambda part: _count_meetings(self.table, index, paths, last, part, met, when))
         return met, when
 
 
-def judge_alone(arrays: ProblemArrays, robots: ArrayLike, ways: FloatArray) -> NDArray[np.int32]:
-    """Judge some robots' paths without looking at the others.
+def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) -> NDArray[np.int32]:
+    """Check some robots' paths without looking at the others.
 
     Args:
         arrays: The problem.
         robots: ``(R,)``.
-        ways: ``(R, V, H+1, n)`` states, or just places.
+        states: ``(R, V, H+1, n)`` states, or just places.
 
     Returns:
         ``(3, R, V)`` steps: the first after the start within the margin of an obstacle or the bounds; the last that
         moves the robot; and the first at which rounding decides whether it is at its goal. ``H+1`` where there is none.
     """
-    index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(ways, np.float32)
+    index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(states, np.float32)
     steps = np.empty((3, *paths.shape[:2]), np.int32)
-    Threads(available_cores()).over(len(index), lambda part: _judge_alone(arrays, index, paths, part, steps))
+    Threads(available_cores()).over(len(index), lambda part: _check_alone(arrays, index, paths, part, steps))
     return steps
 
 
@@ -269,7 +269,7 @@ def _first_near(
 def _cells_around(
     table: PathTable, middle: tuple[float, float, float], spread: float
 ) -> tuple[int, int, int, int, int, int]:
-    """Lowest and highest numbers of the cells around a way through a block, along three axes."""
+    """Lowest and highest numbers of the cells around a path through a block, along three axes."""
     x, y, z = middle
     far = _WIDER * (table.reach + spread + table.widest[0])
     flat = table.places.shape[2] == 2
@@ -339,25 +339,25 @@ def _pairs(table: PathTable, block_range: IntArray) -> IntArray:
 def _count_meetings(
     table: PathTable,
     robots: IntArray,
-    ways: FloatArray,
+    paths: FloatArray,
     until: IntArray,
     robot_range: IntArray,
     counts: Ints,
     when: Ints,
 ) -> None:
     """See :meth:`PathIndex.count_meetings`."""
-    num_ways, num_blocks = ways.shape[1], table.first.shape[0]
-    met = np.empty((num_ways, table.places.shape[1]), np.bool_)
+    num_paths, num_blocks = paths.shape[1], table.first.shape[0]
+    met = np.empty((num_paths, table.places.shape[1]), np.bool_)
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
         met[:] = False
         met[:, robot] = True
-        counts[r], when[r] = 0, ways.shape[2]
-        # Time in the outer loop: ways of one robot look into the same cells.
+        counts[r], when[r] = 0, paths.shape[2]
+        # Time in the outer loop: paths of one robot look into the same cells.
         for block in range(min(num_blocks, until[r] // BLOCK + 1)):
             first, last = steps_of(table, block)
-            for way in range(num_ways):
-                path = ways[r, way]
+            for v in range(num_paths):
+                path = paths[r, v]
                 middle, spread = _enclose(path, table.places.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
                     continue  # Nothing is other than it was in the block before.
@@ -367,23 +367,25 @@ def _count_meetings(
                         for k in range(low_k, high_k + 1):
                             other = table.first[block, _bucket(table, i, j, k)]
                             while other != _NOBODY:
-                                if not met[way, other]:
+                                if not met[v, other]:
                                     t = _first_near(table, robot, path, 0, middle, spread, block, other)
                                     if t > 0:
-                                        met[way, other] = True
-                                        counts[r, way] += 1
-                                        when[r, way] = min(when[r, way], t)
+                                        met[v, other] = True
+                                        counts[r, v] += 1
+                                        when[r, v] = min(when[r, v], t)
                                 other = table.following[block, other]
 
 
 @cached_kernel(**OPTIONS)
-def _judge_alone(arrays: ProblemArrays, robots: IntArray, ways: FloatArray, robot_range: IntArray, steps: Ints) -> None:
-    """See :func:`judge_alone`."""
-    dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), ways.shape[2]
+def _check_alone(
+    arrays: ProblemArrays, robots: IntArray, paths: FloatArray, robot_range: IntArray, steps: Ints
+) -> None:
+    """See :func:`check_alone`."""
+    dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), paths.shape[2]
     for r in range(robot_range[0], robot_range[1]):
         reach, goal = arrays.radius[robots[r]] + arrays.margin, arrays.goal[robots[r]]
-        for way in range(ways.shape[1]):
-            path, last, touching, unsure = ways[r, way], never - 1, never, never
+        for v in range(paths.shape[1]):
+            path, last, touching, unsure = paths[r, v], never - 1, never, never
             while last > 0 and _is_same_place(path, dimension, last):
                 last -= 1
             # Where it stands from then on it is no nearer to anything.
@@ -392,7 +394,7 @@ def _judge_alone(arrays: ProblemArrays, robots: IntArray, ways: FloatArray, robo
                     touching = t
                 if is_unsure(arrays, path[t], goal):
                     unsure = t
-            steps[0, r, way], steps[1, r, way], steps[2, r, way] = touching, last, unsure
+            steps[0, r, v], steps[1, r, v], steps[2, r, v] = touching, last, unsure
 
 
 @inlined

@@ -53,14 +53,14 @@ class Scratch(NamedTuple):
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
         near: ``(K, BLOCK)`` near a robot or a body at a step of the block, a bit for every sample.
-        spare: ``(2 TILE,)`` two rows to overwrite.
+        buffer: ``(2 TILE,)`` two rows to overwrite.
     """
 
     boxes: FloatArray
     num_robots: Ints
     robots: Ints
     near: NDArray[np.uint64]
-    spare: FloatArray
+    buffer: FloatArray
 
 
 class Bodies(NamedTuple):
@@ -211,7 +211,7 @@ def _mark_bodies(
                 reach = radius[k] + bodies.radius[body] + margin
                 for step in range(count):
                     rows = places[place_of(k, step, dimension) : place_of(k, step + 1, dimension)]
-                    s.near[k, step] |= near_round(reach, bodies.places[first + step, body], dimension, rows, s.spare)
+                    s.near[k, step] |= near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
 
 
 @inlined
@@ -238,15 +238,15 @@ def mark_robots(
 
 
 @inlined
-def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatArray, spare: FloatArray) -> bool:
+def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatArray, buffer: FloatArray) -> bool:
     """Check whether in this block any sample of robot ``k`` may be within the margin of an obstacle, or of ``bounds``,
-    see :func:`bound_boxes`. ``spare`` is two rows to overwrite.
+    see :func:`bound_boxes`. ``buffer`` is two rows to overwrite.
     """
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
     if arrays.grid.clearance.shape[0] > 0:
         # The boxes are wider than the places by the radius and half of the margin.
         reach, half = arrays.radius[k] + arrays.margin, WIDER * (arrays.radius[k] + _HALF * arrays.margin)
-        touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, spare)
+        touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, buffer)
     for bound in range(bounds.shape[0]):
         touch |= _meets(k, bound, dimension, boxes, limits)
     return touch

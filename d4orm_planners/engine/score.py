@@ -250,10 +250,10 @@ def _score_tile(
                 rest = num_steps - (first + count)
                 _add_standing(goals[k], inverse[k], np.float32(rest), robot)
             enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-            if near_static(arrays, k, bounds, boxes, scratch.spare):
+            if near_static(arrays, k, bounds, boxes, scratch.buffer):
                 for step in range(count):
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
-                    touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.spare)
+                    touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.buffer)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
                     subtract_where(robot, TOTAL * TILE, touch, steps * penalty)
         if scoring.collisions:

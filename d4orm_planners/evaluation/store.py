@@ -22,7 +22,7 @@ STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
 """Largest whole number in it, seeds among them."""
-PATIENCE = 60.0
+TIMEOUT = 60.0
 """Seconds to wait for another writer."""
 
 
@@ -86,7 +86,7 @@ class Trial:
         arrived: Robots that arrived.
         travel_time: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive.
         makespan: Latest arrival time [s], likewise.
-        stretch: Way travelled over the shortest free way, see :func:`d4orm_env.core.metrics.mean_stretch`; ``None`` if
+        stretch: Path travelled over the shortest path, see :func:`d4orm_env.core.metrics.mean_stretch`; ``None`` if
             nobody arrived, and in rows that older versions wrote.
         reward: Mean over steps and robots.
         mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
@@ -291,7 +291,7 @@ class TrialStore:
         if self._read_only and not os.access(self.path.parent, os.W_OK) and not (log.exists() and log.stat().st_size):
             # SQLite cannot make the files that it keeps beside the store, and no writer has left anything in them.
             name += "?mode=ro&immutable=1"
-        return sqlite3.connect(name, uri=True, timeout=PATIENCE, isolation_level=None)
+        return sqlite3.connect(name, uri=True, timeout=TIMEOUT, isolation_level=None)
 
     def _make(self, connection: sqlite3.Connection) -> None:
         """Make the table in a new file."""
@@ -335,13 +335,13 @@ def checked_trial(values: Mapping[str, Any]) -> Trial:
 
 def _use_wal(connection: sqlite3.Connection) -> None:
     """Let readers and a writer not wait for each other; the file remembers it."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while True:
         try:
             connection.execute("PRAGMA journal_mode = WAL")
             return
         except sqlite3.OperationalError as error:
-            # SQLite's own patience does not cover this statement.
+            # SQLite's own timeout does not cover this statement.
             if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
                 raise
             time.sleep(0.01)

@@ -104,7 +104,7 @@ class SuccessRate(Compared):
         travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
         travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
         travel_time_upper: Upper end.
-        stretch: Mean over the successes of the way travelled over the shortest free way; ``None`` without any.
+        stretch: Mean over the successes of the path travelled over the shortest path; ``None`` without any.
         wall_time: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors.
         decision: Median seconds of choosing the actions of one step, without what came before the first one; ``None``
             if all raised errors.

@@ -1,1 +1,1 @@
-"""The planner to recommend: path finding where it helps, D4orm where ways conflict, anytime improvement."""
+"""The planner to recommend: path finding where it helps, D4orm where paths conflict, anytime improvement."""

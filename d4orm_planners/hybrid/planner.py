@@ -131,7 +131,7 @@ class Hybrid(Planner):
     ) -> tuple[RoadmapSolution, Iteration]:
         """Replan robots on the roadmap, and by turns search among the motions.
 
-        The first finds other ways round, the second cuts corners and leaves out stops.
+        The first finds other paths round, the second cuts corners and leaves out stops.
         """
         if search.best.solved and self.improves_by_lns:
             if search.iteration % LNS_PERIOD == 1:

@@ -1,4 +1,4 @@
-"""Rerouting: robots that fail look for ways around all others in space and time, one after the other."""
+"""Rerouting: robots that fail look for paths around all others in space and time, one after the other."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.hybrid.settings import REROUTE_RULES
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
+from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
 from d4orm_planners.tracking.steering import drives, standing
 
 AWAY = np.float32(1e6)
 """Position of a robot that is in nobody's way [m]."""
 SPREAD = 20 / 3
-"""Deviation of detours' points from straight ways, beyond half of their lengths, in radii of the largest robot."""
+"""Deviation of detours' points from straight paths, beyond half of their lengths, in radii of the largest robot."""
 
 
 def reroute(team: WorkingPlan) -> None:
-    """Let the robots that fail look for other ways, some times in turn, those that meet most others first.
+    """Let the robots that fail look for other paths, some times in turn, those that meet most others first.
 
-    As prioritised planning does, but robots that have no way yet are in the way of others all the same, at a cost: one
+    As prioritised planning does, but robots that have no path yet are in the way of others all the same, at a cost: one
     that cannot get past all of them gets past most (MAPF-LNS2, Li et al., AAAI 2022).
     """
     everybody = np.arange(team.problem.num_robots)
@@ -33,9 +33,9 @@ def reroute(team: WorkingPlan) -> None:
         faults, _ = team.faults(everybody)
         failed = np.lexsort((random.random(len(everybody)), -faults))[: np.count_nonzero(faults)]
         swing = (2 * random.random() - 1) * REROUTE_RULES.swing
-        manner = MotionPrimitives(tuple(np.array(REROUTE_RULES.angles) + swing), REROUTE_RULES.paces)
+        primitives = MotionPrimitives(tuple(np.array(REROUTE_RULES.angles) + swing), REROUTE_RULES.paces)
         contact = REROUTE_RULES.contact * REROUTE_RULES.contact_growth**sweep
-        rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.apart * team.problem.team.largest_radius)
+        rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.dedup_distance * team.problem.team.largest_radius)
         for first in range(0, len(failed), REROUTE_RULES.batch):
             if team.search.should_stop():
                 return
@@ -47,20 +47,20 @@ def reroute(team: WorkingPlan) -> None:
             blocks = np.maximum((begin - 1) // BLOCK - earlier, 0)
             robots, blocks = robots[faults > 0], blocks[faults > 0]
             if len(robots):
-                ways = find_ways(team, robots, blocks, manner, rules)
-                team.take_best(robots, ways)
+                paths = find_paths(team, robots, blocks, primitives, rules)
+                team.take_best(robots, paths)
                 if team.search.should_stop():
                     return
-                lost = robots[~ways.arrived[:, 0]]
+                lost = robots[~paths.arrived[:, 0]]
                 if len(lost):
                     _try_detours(team, lost, random)
     for pair in components(team.conflicts()):
         if len(pair) == 2 and not team.search.should_stop():
-            _reroute_pair(team, np.array(pair), manner, rules)
+            _reroute_pair(team, np.array(pair), primitives, rules)
 
 
-def _reroute_pair(team: WorkingPlan, pair: IntArray, manner: MotionPrimitives, rules: BeamRules) -> None:
-    """Let two that meet only each other look for ways from the start, one after the other, if that is better.
+def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitives, rules: BeamRules) -> None:
+    """Let two that meet only each other look for paths from the start, one after the other, if that is better.
 
     Where they face each other at once, nothing that one of them does helps while the other comes on.
     """
@@ -71,21 +71,21 @@ def _reroute_pair(team: WorkingPlan, pair: IntArray, manner: MotionPrimitives, r
         # Who goes second stays where it is as long as the first may need to get away.
         beside = np.full((1, 1, problem.horizon + 1, problem.dimension), AWAY, np.float32)
         beside[:, :, : REROUTE_RULES.standing * BLOCK + 1] = problem.start[second, : problem.dimension]
-        ways = []
+        paths = []
         for robot, other in ((first, second), (second, first)):
-            company = OtherAgents(pair[None], beside, radius[[[other]]])
-            ways.append(find_ways(team, np.array([robot]), 0, manner, rules, company=company))
-            beside = np.ascontiguousarray(np.moveaxis(ways[-1].positions, 0, 2))
-        controls = np.concatenate([way.controls[:, :, 0] for way in ways], axis=1)
-        states = np.concatenate([way.states[:, :, 0] for way in ways], axis=1)
-        team.move([first, second], controls, states, [way.arrived[0, 0] for way in ways])
+            other_agents = OtherAgents(pair[None], beside, radius[[[other]]])
+            paths.append(find_paths(team, np.array([robot]), 0, primitives, rules, other_agents=other_agents))
+            beside = np.ascontiguousarray(np.moveaxis(paths[-1].positions, 0, 2))
+        controls = np.concatenate([path.controls[:, :, 0] for path in paths], axis=1)
+        states = np.concatenate([path.states[:, :, 0] for path in paths], axis=1)
+        team.move([first, second], controls, states, [path.arrived[0, 0] for path in paths])
         if team.faults(pair)[0].sum() < faults:
             return
         team.move(pair, *present)
 
 
 def _try_detours(team: WorkingPlan, robots: IntArray, random: np.random.Generator) -> None:
-    """Let robots ``(R,)`` drive by random points around their straight ways, if that is better."""
+    """Let robots ``(R,)`` drive by random points around their straight paths, if that is better."""
     part = team.problem.select(robots.tolist())
     start, goal = (places[:, None] for places in (part.start[:, : part.dimension], part.goal))
     size = (len(robots), REROUTE_RULES.detours)

@@ -1,4 +1,4 @@
-"""Settings of the hybrid planner, and the numbers of its search for ways around others."""
+"""Settings of the hybrid planner, and the numbers of its search for paths around others."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ class HybridConfig(D4ormDConfig):
 
 @dataclass(frozen=True)
 class RerouteRules:
-    """The numbers of the search for ways around others.
+    """The numbers of the search for paths around others.
 
     Attributes:
         sweeps: Number of times in turn that robots which fail look for a path in an iteration.
-        batch: Robots that look for ways at the same time, not minding each other's: so that all cores have work.
-        width: Ways that a search keeps after each block of steps.
+        batch: Robots that look for paths at the same time, not minding each other's: so that all cores have work.
+        width: Paths that a search keeps after each block of steps.
         contact: Cost of being near another robot for a block of steps in the first sweep [s]: waiting that long is
             cheaper.
         contact_growth: Times as much it costs in the next sweep: what cannot be had for little may be had for more.
-        apart: Least distance between paths that are kept, in radii of the largest robot, or else twice as much in
-            speed [1/s].
-        earlier: Blocks before a robot's first fault at which its new way begins: from one number to the other, which
+        dedup_distance: Least distance between paths that are kept, in radii of the largest robot, or else twice as much
+            in speed [1/s].
+        earlier: Blocks before a robot's first fault at which its new path begins: from one number to the other, which
             doubles with each sweep.
-        angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
+        angles: By which a robot turns off from the path to its goal [degrees]; in space up and down as well.
         swing: From one sweep to the next all of them change by up to so much either way [degrees].
         paces: Shares of its speed with which a robot heads for its goal: waiting has no direction.
         standing: Blocks for which, of two robots that meet only each other, the second is taken to stay where it starts
-            while the first looks for a way.
-        detours: Random points by which it tries to drive if it has found no way.
+            while the first looks for a path.
+        detours: Random points by which it tries to drive if it has found no path.
     """
 
     sweeps: int = 6
@@ -61,7 +61,7 @@ class RerouteRules:
     width: int = 32
     contact: float = 1.25
     contact_growth: float = 2.0
-    apart: float = 1.0
+    dedup_distance: float = 1.0
     earlier: tuple[int, int] = (2, 5)
     angles: tuple[float, ...] = (30.0, 60.0, 90.0, 135.0, 180.0)
     swing: float = 14.0

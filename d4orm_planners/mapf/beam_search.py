@@ -1,7 +1,7 @@
-"""Beam search of one robot's way among all others' known ways, in space and time, compiled with numba.
+"""Beam search of one robot's path among all others' known ways, in space and time, compiled with numba.
 
-A way is made of pieces of a block of steps each, in which the robot heads for its goal, faster or slower, stops, or
-turns off by some angle. After every block the most promising of the ways so far are kept.
+A path is made of pieces of a block of steps each, in which the robot heads for its goal, faster or slower, stops, or
+turns off by some angle. After every block the most promising of the paths so far are kept.
 """
 
 from __future__ import annotations
@@ -56,24 +56,24 @@ class BeamRules(NamedTuple):
     Attributes:
         width: Number of paths.
         contact: Cost of being near another robot in a block [s].
-        apart: Least distance between two, or else twice as much in speed [m, m/s].
+        dedup_distance: Least distance between two, or else twice as much in speed [m, m/s].
     """
 
     width: int
     contact: float
-    apart: float
+    dedup_distance: float
 
 
 class Queries(NamedTuple):
-    """Robots that look for ways.
+    """Robots that look for paths.
 
     Attributes:
         robots: ``(R,)`` their numbers in the team.
-        blocks: ``(R,)`` the block at whose beginning their new ways begin,
+        blocks: ``(R,)`` the block at whose beginning their new paths begin,
         states: ``(R, n)`` and in which state.
-        limits: ``(R,)`` what their ways must cost less than [s]: the step at which one ends, and what contacts cost.
+        limits: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost.
         without: ``(R, N)`` numbers of robots that they do not mind, their own among them.
-        beside: ``(R, M, H+1, d)`` ways that they mind as well [m],
+        beside: ``(R, M, H+1, d)`` paths that they mind as well [m],
         radius: ``(R, M)`` and the radii of the agents on them [m].
     """
 
@@ -87,14 +87,14 @@ class Queries(NamedTuple):
 
 
 class _Beam(NamedTuple):
-    """Up to ``N`` ways as far as they have come.
+    """Up to ``N`` paths as far as they have come.
 
     Attributes:
         states: ``(N, n)``.
         velocities: ``(N, d)``.
         faults: ``(N,)`` robots met, block by block.
         bounds: ``(N,)`` what they cost at least, as it seems [s].
-        before: ``(N,)`` number of the way that each goes on from: in the beam before, or ever.
+        before: ``(N,)`` number of the path that each goes on from: in the beam before, or ever.
         moves: ``(N,)`` what was done in the last block.
     """
 
@@ -162,43 +162,43 @@ _TURNED, _SLOWED = {2: _turned_2, 3: _turned_3}, {2: _slowed_2, 3: _slowed_3}
 
 
 @compiled
-def _is_like_another(ways: _Beam, way: Whole, kept: _Beam, size: int, apart2: float) -> bool:
+def _is_like_another(new: _Beam, node: Whole, kept: _Beam, size: int, dedup2: float) -> bool:
     """Check whether a path is about where one of those kept is, about as fast."""
     for other in range(size):
         gap2, change2 = 0.0, 0.0
-        for axis in range(ways.velocities.shape[1]):
-            gap = ways.states[way, axis] - kept.states[other, axis]
-            change = ways.velocities[way, axis] - kept.velocities[other, axis]
+        for axis in range(new.velocities.shape[1]):
+            gap = new.states[node, axis] - kept.states[other, axis]
+            change = new.velocities[node, axis] - kept.velocities[other, axis]
             gap2 += gap * gap
             change2 += change * change
-        if gap2 < apart2 and change2 < 4 * apart2:
+        if gap2 < dedup2 and change2 < 4 * dedup2:
             return True
     return False
 
 
 @compiled
-def _keep(ways: _Beam, way: Whole, kept: _Beam, number: Whole) -> None:
-    for i in range(ways.states.shape[1]):
-        kept.states[number, i] = ways.states[way, i]
-    for axis in range(ways.velocities.shape[1]):
-        kept.velocities[number, axis] = ways.velocities[way, axis]
-    kept.faults[number] = ways.faults[way]
-    kept.before[number], kept.moves[number] = ways.before[way], ways.moves[way]
+def _keep(new: _Beam, node: Whole, kept: _Beam, number: Whole) -> None:
+    for i in range(new.states.shape[1]):
+        kept.states[number, i] = new.states[node, i]
+    for axis in range(new.velocities.shape[1]):
+        kept.velocities[number, axis] = new.velocities[node, axis]
+    kept.faults[number] = new.faults[node]
+    kept.before[number], kept.moves[number] = new.before[node], new.moves[node]
 
 
 @compiled
 def _count_beside(
-    table: PathTable, robot: Whole, seekers: Queries, r: int, path: FloatArray, first: Whole, last: Whole
+    table: PathTable, robot: Whole, queries: Queries, r: int, path: FloatArray, first: Whole, last: Whole
 ) -> int:
     """Count the further paths that a path meets from one step to another; at its end it is at rest."""
     count, end = 0, path.shape[0] - 1
-    for other in range(seekers.beside.shape[1]):
-        reach = table.radius[robot] + seekers.radius[r, other] + table.margin
+    for other in range(queries.beside.shape[1]):
+        reach = table.radius[robot] + queries.radius[r, other] + table.margin
         for t in range(first, last):
             gap2 = 0.0
             for axis in range(path.shape[1]):
                 place = np.float64(path[min(t - first, end), axis])
-                gap = place - np.float64(seekers.beside[r, other, t, axis])
+                gap = place - np.float64(queries.beside[r, other, t, axis])
                 gap2 += gap * gap
             if gap2 <= reach * reach:
                 count += 1
@@ -216,8 +216,8 @@ Search: TypeAlias = Kernel[
 def search_kernel(name: str) -> Search:
     """The compiled search for robots of the model with this name.
 
-    For a range of the seekers it fills controls ``u`` ``(R, H, m)`` and states ``x`` ``(R, H+1, n)`` from where their
-    ways begin, and says in ``found`` ``(R,)`` whether a way arrives; if none does, the rest is left alone.
+    For a range of the queries it fills controls ``u`` ``(R, H, m)`` and states ``x`` ``(R, H+1, n)`` from where their
+    paths begin, and says in ``found`` ``(R,)`` whether a path arrives; if none does, the rest is left alone.
     """
     model = MODELS[name]
     move, dock = make_stepper(model)
@@ -244,7 +244,7 @@ def search_kernel(name: str) -> Search:
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def search(
-        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, seekers: Queries, part: IntArray,
+        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, part: IntArray,
         u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
         dt, closed = arrays.time_step, is_closed(arrays)
@@ -253,28 +253,28 @@ def search_kernel(name: str) -> Search:
         goal_radius = np.sqrt(arrays.squared_goal_radius)
         num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
         last_busy = min(num_blocks - 1, table.moving[0] + 1)
-        beam, ways = _make_beam(width, n, d), _make_beam(width * num_moves, n, d)
-        # Of all ways ever kept: what each goes on from, and by what.
+        beam, new = _make_beam(width, n, d), _make_beam(width * num_moves, n, d)
+        # Of all paths ever kept: what each goes on from, and by what.
         before, made_by = np.empty(width * num_blocks, np.int64), np.empty(width * num_blocks, np.int64)
         numbers, did = np.empty(width, np.int64), np.empty(num_blocks, np.int64)
         path = np.empty((table.block, d), np.float32)
         for r in range(part[0], part[1]):
-            robot, begin = seekers.robots[r], seekers.blocks[r]
+            robot, begin = queries.robots[r], queries.blocks[r]
             goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
             at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
             for i in range(n):
-                beam.states[0, i] = seekers.states[r, i]
+                beam.states[0, i] = queries.states[r, i]
             beam.faults[0], numbers[0], size, num_kept = 0.0, -1, 1, 0
-            best, best_number, best_move = seekers.limits[r], -1, -1
-            without = seekers.without[r]
+            best, best_number, best_move = queries.limits[r], -1, -1
+            without = queries.without[r]
             for block in range(begin, num_blocks):
                 first, last = steps_of(table, block)
                 count = 0
-                for way in range(size):
+                for node in range(size):
                     for number in range(num_moves):
-                        state, control, at_goal = to_fixed_tuple(beam.states[way], n), no_control, False
-                        aim = aim_of(beam.states[way], state, limits, goal, goal_radius, moves, number)
-                        faults, end = beam.faults[way], first
+                        state, control, at_goal = to_fixed_tuple(beam.states[node], n), no_control, False
+                        aim = aim_of(beam.states[node], state, limits, goal, goal_radius, moves, number)
+                        faults, end = beam.faults[node], first
                         for t in range(first, last):
                             if not transition.stands(at_goal, arrays.docks):
                                 control = control_of(state, aim, moves.pace[number], limits, h)
@@ -297,31 +297,31 @@ def search_kernel(name: str) -> Search:
                         if rules.contact * faults + cost >= best:
                             continue
                         faults += count_near(table, robot, without, path, first, block)
-                        faults += _count_beside(table, robot, seekers, r, path, first, last)
+                        faults += _count_beside(table, robot, queries, r, path, first, last)
                         if at_goal:
                             # It stays there: whoever comes by later counts too.
                             for axis in range(d):
                                 path[:, axis] = state[axis]
                             for later in range(block + 1, last_busy + 1):
                                 faults += count_near(table, robot, without, path, steps_of(table, later)[0], later)
-                            faults += _count_beside(table, robot, seekers, r, path, last, table.places.shape[0])
+                            faults += _count_beside(table, robot, queries, r, path, last, table.places.shape[0])
                             if rules.contact * faults + cost < best:
-                                best, best_number, best_move = rules.contact * faults + cost, numbers[way], number
+                                best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
                             continue
                         for axis in range(d):
-                            ways.velocities[count, axis] = velocity[axis]
+                            new.velocities[count, axis] = velocity[axis]
                         for i in range(n):
-                            ways.states[count, i] = state[i]
-                        ways.bounds[count] = rules.contact * faults + cost
-                        ways.faults[count], ways.before[count], ways.moves[count] = faults, numbers[way], number
+                            new.states[count, i] = state[i]
+                        new.bounds[count] = rules.contact * faults + cost
+                        new.faults[count], new.before[count], new.moves[count] = faults, numbers[node], number
                         count += 1
                 size = 0
-                for way in np.argsort(ways.bounds[:count], kind="mergesort"):
-                    if size == width or ways.bounds[way] >= best:
+                for node in np.argsort(new.bounds[:count], kind="mergesort"):
+                    if size == width or new.bounds[node] >= best:
                         break
-                    if not _is_like_another(ways, way, beam, size, rules.apart * rules.apart):
-                        _keep(ways, way, beam, size)
-                        before[num_kept], made_by[num_kept], numbers[size] = ways.before[way], ways.moves[way], num_kept
+                    if not _is_like_another(new, node, beam, size, rules.dedup_distance * rules.dedup_distance):
+                        _keep(new, node, beam, size)
+                        before[num_kept], made_by[num_kept], numbers[size] = new.before[node], new.moves[node], num_kept
                         size, num_kept = size + 1, num_kept + 1
                 if size == 0:
                     break
@@ -333,8 +333,8 @@ def search_kernel(name: str) -> Search:
             while best_number >= 0:
                 did[length], best_number, length = made_by[best_number], before[best_number], length + 1
             for i in range(n):
-                x[r, steps_of(table, begin)[0] - 1, i] = seekers.states[r, i]
-            state, at_goal = to_fixed_tuple(seekers.states[r], n), False
+                x[r, steps_of(table, begin)[0] - 1, i] = queries.states[r, i]
+            state, at_goal = to_fixed_tuple(queries.states[r], n), False
             for block in range(begin, num_blocks):
                 first, last = steps_of(table, block)
                 number = did[length - 1 - block + begin] if block - begin < length else 0

@@ -1,4 +1,4 @@
-"""Ways of some robots around all others in space and time, by beam search on all cores."""
+"""Paths of some robots around all others in space and time, by beam search on all cores."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class MotionPrimitives:
     """Moves of robots that look for a path.
 
     Attributes:
-        angles: By which a robot turns off from the way to its goal [degrees]; in space up and down as well.
+        angles: By which a robot turns off from the path to its goal [degrees]; in space up and down as well.
         paces: Shares of its speed with which it heads for its goal: waiting has no direction.
         beside: Goal radii beside its goal to which it may head too: one that docks there keeps clear of a neighbour.
         on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
@@ -61,7 +61,7 @@ class OtherAgents:
 
     Attributes:
         without: ``(R, N)`` numbers of robots that each does not mind.
-        beside: ``(R, M, H+1, d)`` ways that it minds as well [m].
+        beside: ``(R, M, H+1, d)`` paths that it minds as well [m].
         radius: ``(R, M)`` radii of the agents on them [m].
     """
 
@@ -76,51 +76,51 @@ class OtherAgents:
         return cls(robots[:, None], beside, np.zeros((len(robots), 0)))
 
 
-def find_ways(
+def find_paths(
     team: WorkingPlan,
     robots: IntArray,
     blocks: ArrayLike,
-    manner: MotionPrimitives,
+    primitives: MotionPrimitives,
     rules: BeamRules,
     limits: ArrayLike = np.inf,
-    company: OtherAgents | None = None,
+    other_agents: OtherAgents | None = None,
 ) -> Rollouts:
-    """The best ways that robots ``(R,)`` find; one that finds none does what it does, and does not arrive.
+    """The best paths that robots ``(R,)`` find; one that finds none does what it does, and does not arrive.
 
     So do those left over when the search should stop.
 
     Args:
         team: Plan of all.
         robots: Their numbers.
-        blocks: ``(R,)`` the block of steps at whose beginning their new ways begin.
-        manner: Their motion primitives.
+        blocks: ``(R,)`` the block of steps at whose beginning their new paths begin.
+        primitives: Their motion primitives.
         rules: Rules by which paths are kept.
-        limits: ``(R,)`` what a way must cost less than [s]: its time, and what it costs to meet others.
-        company: Agents that they mind, or do not mind.
+        limits: ``(R,)`` what a path must cost less than [s]: its time, and what it costs to meet others.
+        other_agents: Agents that they mind, or do not mind.
 
     Returns:
-        A single way of each.
+        A single path of each.
     """
     problem, horizon = team.problem, team.problem.horizon
     blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))
-    company = company or OtherAgents.nobody(robots, horizon, problem.dimension)
+    other_agents = other_agents or OtherAgents.nobody(robots, horizon, problem.dimension)
     u, x = (np.ascontiguousarray(rows[:, robots].swapaxes(0, 1)) for rows in (team.controls, team.states))
     arrived = np.zeros(len(robots), bool)
     for model, members in by_model(problem):
         mine = np.flatnonzero(np.isin(robots, members))
         if len(mine):
-            seekers = Queries(
-                robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], company.without[mine],
-                company.beside[mine], company.radius[mine],
+            queries = Queries(
+                robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], other_agents.without[mine],
+                other_agents.beside[mine], other_agents.radius[mine],
             )  # fmt: skip
-            moves = manner.moves(problem.dimension, has_heading=model.heading_index is not None)
-            u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, seekers, u[mine], x[mine])
+            moves = primitives.moves(problem.dimension, has_heading=model.heading_index is not None)
+            u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, queries, u[mine], x[mine])
     u, x = (rows.swapaxes(0, 1)[:, :, None] for rows in (u, x))
     return Rollouts(u, x, arrived[:, None], problem.dimension)
 
 
 def _search(
-    team: WorkingPlan, model: Model, moves: Moves, rules: BeamRules, seekers: Queries, u: FloatArray, x: FloatArray
+    team: WorkingPlan, model: Model, moves: Moves, rules: BeamRules, queries: Queries, u: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and arrivals, of robots of one model that did as given."""
     found, search = np.zeros(len(u), bool), search_kernel(model.name)
@@ -130,17 +130,17 @@ def _search(
         for first in range(part[0], part[1]):
             if team.search.should_stop():
                 break
-            search(arrays, table, moves, rules, seekers, np.array((first, first + 1)), u, x, found)
+            search(arrays, table, moves, rules, queries, np.array((first, first + 1)), u, x, found)
 
     Threads(available_cores()).over(len(u), look)
     return u, x, found
 
 
 def prepare_beams(team: WorkingPlan) -> None:
-    """Compile what the search of this team's ways needs, if it is not yet."""
+    """Compile what the search of this team's paths needs, if it is not yet."""
     firsts: dict[str, int] = {model.name: robots[0] for model, robots in by_model(team.problem)}
     if not all(search_kernel(name).signatures for name in firsts):
         robots: Sequence[int] = list(firsts.values())
         team.faults(robots)
-        find_ways(team, np.array(robots), 0, MotionPrimitives((90.0,), (1.0,)), BeamRules(2, 1.0, 1.0))
+        find_paths(team, np.array(robots), 0, MotionPrimitives((90.0,), (1.0,)), BeamRules(2, 1.0, 1.0))
         team.index.move(robots, team.positions[:, robots])

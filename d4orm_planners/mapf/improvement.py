@@ -21,7 +21,7 @@ FIRST_ROBOT_STEPS = 2**19
 
 
 def improve_by_lns(search: SolveRun) -> Iteration:
-    """The best plan so far, or a roundabout if that is better, whose robots have looked for faster ways."""
+    """The best plan so far, or a roundabout if that is better, whose robots have looked for faster paths."""
     # Here, because importing numba takes long.
     from d4orm_planners.mapf.beams import prepare_beams
     from d4orm_planners.mapf.lns import improve_paths
@@ -46,7 +46,7 @@ def _better_roundabout(search: SolveRun) -> Trajectory | None:
 
 
 def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
-    """Take what faster ways there are at once for a team in which none fails, in so many rounds."""
+    """Take what faster paths there are at once for a team in which none fails, in so many rounds."""
     from d4orm_planners.mapf.lns import improve_paths
 
     rounds = min(rounds, FIRST_ROBOT_STEPS // (team.problem.num_robots * team.problem.horizon))

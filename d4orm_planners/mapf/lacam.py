@@ -75,7 +75,7 @@ class TeamMoves:
 
 
 class TeamOnRoadmap:
-    """The robots' ways to their goals around those that have docked."""
+    """The robots' paths to their goals around those that have docked."""
 
     def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
         self.roadmap, num_robots, num_nodes = roadmap, problem.num_robots, len(roadmap.nodes)
@@ -126,7 +126,7 @@ class TeamOnRoadmap:
         return docked
 
     def fill(self, robot: int, mask: BoolArray, holds: bool = False) -> None:
-        """A robot's ways anew: to its goal, or while it holds for others to where it started, out of their way."""
+        """A robot's paths anew: to its goal, or while it holds for others to where it started, out of their path."""
         end = self.roadmap.starts[robot] if holds else self.roadmap.goals[robot]
         fill_costs(self.roadmap, self.bodies, self.docked_at(mask), robot, end, self.bodies.costs[robot])
         self.masks[robot], self.holds[robot] = mask, holds
@@ -135,7 +135,7 @@ class TeamOnRoadmap:
         """``(K,)`` robots at their goals."""
         return positions == self.roadmap.goals
 
-    def find_ways(self, positions: IntArray) -> bool:
+    def find_paths(self, positions: IntArray) -> bool:
         """Bring all paths up to date; whether each robot has one, around those that have docked."""
         mask = self.arrived(positions) if self.bodies.docks else self.nobody
         docked = self.docked_at(mask)
@@ -160,7 +160,7 @@ class TeamOnRoadmap:
         """
         bodies, constraint = self.bodies, here.next_constraint(self.roadmap)
         forced = np.array(constraint.robots, np.int64), np.array(constraint.places, np.int64)
-        self.find_ways(here.positions)
+        self.find_paths(here.positions)
         scratch.may_dock[:] = ~self.holds
         while True:
             positions = here.positions.copy()
@@ -168,11 +168,11 @@ class TeamOnRoadmap:
             came = self.arrived(positions) & ~self.arrived(here.positions)
             if count < 0:
                 return None
-            if not bodies.docks or not came.any() or self.find_ways(positions):
+            if not bodies.docks or not came.any() or self.find_paths(positions):
                 break
-            # Who would close somebody's only way must wait until that one has passed.
+            # Who would close somebody's only path must wait until that one has passed.
             scratch.may_dock[came] = False
-            self.find_ways(here.positions)
+            self.find_paths(here.positions)
         key = positions.tobytes()
         if key not in known:
             waiting = np.where(self.arrived(positions), here.priorities % 1, here.priorities + 1)

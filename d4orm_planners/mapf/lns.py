@@ -1,4 +1,4 @@
-"""Large-neighbourhood search: a few robots at a time find faster ways around all others, under their own dynamics.
+"""Large-neighbourhood search: a few robots at a time find faster paths around all others, under their own dynamics.
 
 After MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021); what is worse is accepted as in
 simulated annealing.
@@ -16,7 +16,7 @@ from d4orm_env.core.portable import log
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
+from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
 from d4orm_planners.tracking.steering import straight_drives
 
 
@@ -25,7 +25,7 @@ class NeighbourhoodRules:
     """The numbers of the search.
 
     Attributes:
-        groups: Groups of robots that look for ways at the same time, not minding each other: so that all cores have
+        groups: Groups of robots that look for paths at the same time, not minding each other: so that all cores have
             work. What one finds is taken over only if it fits what those before it have found.
         size: Robots in a group, at most.
         give: Delay that a robot of a group may accept for the sake of those after it [s].
@@ -36,8 +36,8 @@ class NeighbourhoodRules:
         angles: By which robots turn off [degrees], all times the same number, ...
         scales: ... which is between these and drawn for every round.
         paces: Shares of their speed with which they head for their goals.
-        width: Ways that a search keeps after each block of steps.
-        apart: Least distance between paths that are kept, in the same radii, or else twice as much in speed [1/s].
+        width: Paths that a search keeps after each block of steps.
+        dedup_distance: Least distance between kept paths, in the same radii, or else twice as much in speed [1/s].
         contact: Cost of meeting another robot [s]: too much.
     """
 
@@ -51,7 +51,7 @@ class NeighbourhoodRules:
     scales: tuple[float, float] = (0.4, 1.6)
     paces: tuple[float, ...] = (1.0, 0.7, 0.35, 0.0)
     width: int = 32
-    apart: float = 2 / 3
+    dedup_distance: float = 2 / 3
     contact: float = 1e6
 
 
@@ -59,7 +59,7 @@ RULES = NeighbourhoodRules()
 
 
 def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float = RULES.temperature) -> FloatArray:
-    """Let groups of robots look for faster ways, so many rounds, as long as there is time.
+    """Let groups of robots look for faster paths, so many rounds, as long as there is time.
 
     What counts is the sum of all arrival times and of all distances left over time, each as a share of the robot's
     first: the first is what travel takes, the second what the reward is made of.
@@ -85,7 +85,7 @@ def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float 
 
 
 class _Neighbourhoods:
-    """Groups of robots that look for faster ways."""
+    """Groups of robots that look for faster paths."""
 
     def __init__(self, team: WorkingPlan, random: np.random.Generator) -> None:
         self.team, self.problem, self.random = team, team.problem, random
@@ -116,7 +116,7 @@ class _Neighbourhoods:
         slack = -temperature * log(1 - self.random.random(len(groups)))
         blocks = self.random.integers(0, 2, len(groups)) * self.arrival[groups[:, 0]] / self.problem.dt // BLOCK
         blocks = (blocks * self.random.random(len(groups))).astype(np.int64)
-        manner = MotionPrimitives(tuple(np.array(RULES.angles) * self.random.uniform(*RULES.scales)), RULES.paces)
+        primitives = MotionPrimitives(tuple(np.array(RULES.angles) * self.random.uniform(*RULES.scales)), RULES.paces)
         found = np.ones(len(groups), bool)
         controls = np.zeros((self.problem.horizon, *groups.shape, self.problem.control_size), np.float32)
         states = np.zeros((self.problem.horizon + 1, *groups.shape, self.problem.state_size), np.float32)
@@ -130,16 +130,16 @@ class _Neighbourhoods:
             if left.shape[1]:
                 limits = np.minimum(limits, self.arrival[robots] + RULES.give)
             before = groups[found, :member]
-            company = OtherAgents(
+            other_agents = OtherAgents(
                 groups[found],
                 np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
                 np.asarray(self.problem.team.radius, np.float64)[before],
             )
-            rules = BeamRules(RULES.width, RULES.contact, RULES.apart * self.problem.team.largest_radius)
-            ways = find_ways(self.team, robots, blocks[found], manner, rules, limits, company)
-            controls[:, found, member], states[:, found, member] = ways.controls[:, :, 0], ways.states[:, :, 0]
-            budget[found] -= self.costs(robots, ways.positions[:, :, 0])[0]
-            found[found] = ways.arrived[:, 0]
+            rules = BeamRules(RULES.width, RULES.contact, RULES.dedup_distance * self.problem.team.largest_radius)
+            paths = find_paths(self.team, robots, blocks[found], primitives, rules, limits, other_agents)
+            controls[:, found, member], states[:, found, member] = paths.controls[:, :, 0], paths.states[:, :, 0]
+            budget[found] -= self.costs(robots, paths.positions[:, :, 0])[0]
+            found[found] = paths.arrived[:, 0]
         for number in np.flatnonzero(found):
             self.take_over(groups[number], controls[:, number], states[:, number], slack[number])
 

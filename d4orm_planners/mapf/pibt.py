@@ -41,7 +41,7 @@ class Footprints(NamedTuple):
         docks: Whether a robot that has arrived stays there for good.
         starts: ``(K,)`` int64 nodes.
         goals: ``(K,)`` int64 nodes.
-        costs: ``(K, N)`` float32 length of the way from every node to each robot's goal [m].
+        costs: ``(K, N)`` float32 length of the path from every node to each robot's goal [m].
     """
 
     radius: Floats
@@ -133,7 +133,7 @@ def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: W
 
 @cached_kernel(variant="costs", **OPTIONS)
 def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
-    """Length of a robot's shortest way from every node to one; ``costs`` ``(N,)`` is output."""
+    """Length of a robot's shortest path from every node to one; ``costs`` ``(N,)`` is output."""
     costs[:] = np.inf
     heap = [(0.0, np.int64(end))]
     costs[end] = 0.0
@@ -211,7 +211,7 @@ def _rank_options(
 
 
 @compiled
-def _in_the_way(
+def _blocking_robot(
     roadmap: Roadmap, bodies: Footprints, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: int
 ) -> Whole:
     """The first robot that has to yield before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
@@ -287,7 +287,7 @@ def _move(
                 continue
             scratch.edges[depth] = e
         e = scratch.edges[depth]
-        blocker = _in_the_way(roadmap, bodies, scratch, positions, k, e, depth)
+        blocker = _blocking_robot(roadmap, bodies, scratch, positions, k, e, depth)
         if blocker == -2:
             scratch.edges[depth] = NOTHING
         elif blocker >= 0:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
 """Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
 TURNS = 30
-"""Ways that are planned per robot before path finding for all at once is tried."""
+"""Paths that are planned per robot before path finding for all at once is tried."""
 MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
 DETOUR_RATIO = 1.25
@@ -64,11 +64,11 @@ class RoadmapSolution:
 
 @dataclass(frozen=True)
 class NoPaths:
-    """The state of the search when no ways were found.
+    """The state of the search when no paths were found.
 
     Attributes:
         why: For the record of the iterations.
-        unreachable: Robots that have no way to their goals, if that is why.
+        unreachable: Robots that have no path to their goals, if that is why.
     """
 
     why: str
@@ -100,7 +100,7 @@ class MAPF(Planner):
     def iterate(
         self, search: SolveRun, state: RoadmapSolution | NoPaths | None
     ) -> tuple[RoadmapSolution | NoPaths, Iteration]:
-        """See :meth:`Planner.iterate`: first ways for the whole team, then better ones for some robots at a time."""
+        """See :meth:`Planner.iterate`: first paths for the whole team, then better ones for some robots at a time."""
         if isinstance(state, RoadmapSolution):
             state = improve_roadmap_solution(search, state, self.config.neighbours, self.config.replannings)
         elif state is None:
@@ -137,14 +137,14 @@ def improve_roadmap_solution(
 
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
-    """Ways for the whole team, or as many robots as possible; why there are none if nothing is found in time."""
+    """Paths for the whole team, or as many robots as possible; why there are none if nothing is found in time."""
     from d4orm_planners.mapf.lacam import find_moves
     from d4orm_planners.mapf.roadmap import lay_roadmap
     from d4orm_planners.mapf.roadmap_team import Replanning, drive_moves
 
     problem, best = search.problem, None
     if problem.num_robots * problem.horizon > MAX_ROBOT_STEPS:
-        return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for ways")
+        return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for paths")
     with search.watch.paused():
         compile_path_finding(problem)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
@@ -167,7 +167,7 @@ def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
             best = RoadmapSolution(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
-    return best[0] if best else NoPaths("no ways found on the roadmaps in time")
+    return best[0] if best else NoPaths("no paths found on the roadmaps in time")
 
 
 def compile_roadmap(problem: Problem) -> None:
@@ -189,8 +189,8 @@ def needs_detour(problem: Problem) -> bool:
 
     roadmap = lay_roadmap(problem)
     straight = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
-    ways = TeamOnRoadmap(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts]
-    return bool((ways > DETOUR_RATIO * straight + problem.goal_radius).any())
+    paths = TeamOnRoadmap(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts]
+    return bool((paths > DETOUR_RATIO * straight + problem.goal_radius).any())
 
 
 def compile_path_finding(problem: Problem) -> None:
@@ -211,7 +211,7 @@ def compile_path_finding(problem: Problem) -> None:
 
 
 def _small_problem(problem: Problem, robot: int) -> Problem:
-    """A short way of one robot, in a world with an obstacle if the problem's has any: quickly planned, in any world."""
+    """A short path of one robot, in a world with an obstacle if the problem's has any: quickly planned anywhere."""
     alone, d = problem.select([robot]), problem.dimension
     far = min(8 * (float(alone.team.radius[0]) + alone.margin), LARGEST / 2)
     start, aside = alone.start.copy(), np.eye(d)[1] * far

@@ -29,7 +29,7 @@ ARC_POINTS, ARC_CHECKS, ARC_SLACK = 9, 17, 1 / 15
 """Points along an arc, those that are looked at for walls, and how far from those they keep beyond the margin."""
 TINY = float(np.finfo(np.float64).tiny)
 STRAIGHT, TURNING_BACK = 1e-4, 0.31
-"""Sine and cosine of half the angle by which ways turn at corners: less is no corner, and cannot be rounded."""
+"""Sine and cosine of half the angle by which paths turn at corners: less is no corner, and cannot be rounded."""
 WAIT_SLACK = 0.6
 """Distance beyond radii and margin that robots under way keep."""
 SHARPEST = 2 / 3
@@ -65,20 +65,20 @@ def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
     arcs = np.append(0.0, np.cumsum(_lengths(np.diff(points, axis=0))))
     arcs -= np.repeat(arcs[first[:-1]], np.diff(first))
     radius = np.asarray(problem.team.radius, np.float64)
-    apart = problem.margin + WAIT_SLACK * problem.team.largest_radius
-    cells = sort_into_cells(points, 2 * float(radius.max()) + apart)
-    return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, apart))
+    separation = problem.margin + WAIT_SLACK * problem.team.largest_radius
+    cells = sort_into_cells(points, 2 * float(radius.max()) + separation)
+    return Routes(points, times, bends, first, arcs, *_find_waits(cells, first, times, radius, separation))
 
 
 class RouteBends(NamedTuple):
-    """Corners of ways, without the angles themselves, whose functions differ from one processor to the next.
+    """Corners of paths, without the angles themselves, whose functions differ from one processor to the next.
 
     Attributes:
         corners: ``(C, 3)`` where they are [m].
         before: ``(C, 3)`` unit vectors that lead to each.
         after: ``(C, 3)`` unit vectors that lead on from each.
-        straight: ``(C,)`` half of the shorter of the ways to the corners next to each [m].
-        cosine: ``(C,)`` of half the angle by which the way turns.
+        straight: ``(C,)`` half of the shorter of the paths to the corners next to each [m].
+        cosine: ``(C,)`` of half the angle by which the path turns.
         sine: ``(C,)``.
     """
 
@@ -144,7 +144,7 @@ def _lengths(steps: Floats) -> Floats:
 
 
 def _rounded(stops: Corners, radii: Floats, spacing: float) -> tuple[Floats, IntArray, Floats, Floats]:
-    """``(points, first, times, bends)``, so far apart at most, along ways with corners rounded by these radii."""
+    """``(points, first, times, bends)``, so far apart at most, along paths with corners rounded by these radii."""
     corners, rounded = stops.places, np.flatnonzero((radii > 0) & np.isfinite(radii))
     arcs = _arcs(_bends_at(corners, rounded), radii[rounded], ARC_POINTS)
     # Corners that are rounded become as many points, others stay one.
@@ -176,13 +176,13 @@ def _rounded(stops: Corners, radii: Floats, spacing: float) -> tuple[Floats, Int
     return points, first, times, inside
 
 
-def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, apart: float) -> tuple[IntArray, ...]:
+def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, least: float) -> tuple[IntArray, ...]:
     room, num_robots = 8 * len(times), len(first) - 1
     owner = np.repeat(np.arange(num_robots), np.diff(first))
     wait_first = np.empty(num_robots + 1, np.int64)
     while True:
         waits = np.empty((room, 3), np.int64)
-        count = find_waits(cells, first, owner, times, radius, apart, wait_first, waits)
+        count = find_waits(cells, first, owner, times, radius, least, wait_first, waits)
         if count <= room:
             return wait_first, *np.ascontiguousarray(waits[:count].T)
         room = count

@@ -1,4 +1,4 @@
-"""New ways for some robots of a team that never rests, among all others on the ways that they have."""
+"""New paths for some robots of a team that never rests, among all others on the ways that they have."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout
 
 FINENESS = 1.6
 """Fineness of the roadmap."""
-LINGER = 1.0
+DWELL = 1.0
 """Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
 TURNS = 3
-"""Ways that are planned per robot before it gives up."""
+"""Paths that are planned per robot before it gives up."""
 
 
-def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
-    """Plan the ways of some robots around all others, which yield only where there is no other one.
+def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
+    """Plan the paths of some robots around all others, which yield only where there is no other one.
 
     Args:
         problem: The team where it is now, and its goals.
-        ways: ``(T + 1, K, d)`` where the robots are going to be, from now on [m]; those of ``changed`` are not looked
+        paths: ``(T + 1, K, d)`` where the robots are going to be, from now on [m]; those of ``changed`` are not looked
             at.
-        changed: ``(K,)`` whose way is planned.
+        changed: ``(K,)`` whose path is planned.
         seed: Of the robots that may have to yield, and of how leisurely they drive.
 
     Returns:
@@ -34,12 +34,12 @@ def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int
 
     compile_path_finding(problem)
     num_robots, d = problem.num_robots, problem.dimension
-    linger = int(np.ceil(LINGER / problem.dt))
-    replanning = Replanning(problem, lay_roadmap(problem, FINENESS), linger)
+    dwell = int(np.ceil(DWELL / problem.dt))
+    replanning = Replanning(problem, lay_roadmap(problem, FINENESS), dwell)
     if not np.isfinite(replanning.alone).all():
         return None
-    result = ways[np.minimum(np.arange(problem.horizon + 1), len(ways) - 1)]
-    present = _driven(problem, result, linger)
+    result = paths[np.minimum(np.arange(problem.horizon + 1), len(paths) - 1)]
+    present = _driven(problem, result, dwell)
     present.places[:, changed] = FAR
     before, random, robots = present.places.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
     order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
@@ -52,12 +52,12 @@ def relay_ways(problem: Problem, ways: FloatArray, changed: BoolArray, seed: int
     return result
 
 
-def _driven(problem: Problem, ways: FloatArray, linger: int) -> TeamRollout:
-    """A team on its ways ``(H + 1, K, d)``, which leaves its goals again; nothing is known of its controls."""
+def _driven(problem: Problem, paths: FloatArray, dwell: int) -> TeamRollout:
+    """A team on its paths ``(H + 1, K, d)``, which leaves its goals again; nothing is known of its controls."""
     steps, num_robots, d = problem.horizon, problem.num_robots, problem.dimension
-    there = np.linalg.norm(ways - problem.goal, axis=2) <= problem.goal_radius
+    there = np.linalg.norm(paths - problem.goal, axis=2) <= problem.goal_radius
     arrivals = np.where(there.any(axis=0), there.argmax(axis=0), steps)
     places = np.zeros((steps + 1, num_robots, 3))
-    places[:, :, :d] = ways
-    places[np.arange(steps + 1)[:, None] > arrivals + linger] = FAR
+    places[:, :, :d] = paths
+    places[np.arange(steps + 1)[:, None] > arrivals + dwell] = FAR
     return TeamRollout(np.zeros((steps, num_robots, problem.control_size), np.float32), places, arrivals)

@@ -1,4 +1,4 @@
-"""A way for one robot among all others as they drive, compiled with numba: in space and time, on the roadmap."""
+"""A path for one robot among all others as they drive, compiled with numba: in space and time, on the roadmap."""
 
 from __future__ import annotations
 
@@ -90,9 +90,9 @@ def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart:
 
 @cached_kernel(variant="straighten", **OPTIONS)
 def straighten(
-    roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, way: IntArray
+    roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, path: IntArray
 ) -> int:
-    """Leave out nodes of a way where the straight line is free of obstacles and of others.
+    """Leave out nodes of a path where the straight line is free of obstacles and of others.
 
     Args:
         roadmap: The roadmap.
@@ -101,28 +101,28 @@ def straighten(
         others: Their positions.
         k: The robot.
         reach: Distance that it keeps from obstacles [m].
-        way: ``(n, 3)`` of :func:`find_way`, changed in place.
+        path: ``(n, 3)`` of :func:`find_way`, changed in place.
 
     Returns:
         How many are left.
     """
     nodes, goal, docked, count, i = roadmap.nodes, bodies.goals[k], bodies.docked + bodies.slack, 1, 0
-    while i + 1 < way.shape[0]:
+    while i + 1 < path.shape[0]:
         j = i + 1
-        depart, tail = way[j, 1], nodes[way[i, 0]]
-        while j + 1 < way.shape[0]:
-            head = nodes[way[j + 1, 0]]
-            near = near_neighbours.squared_gap(nodes, goal, nodes, way[i, 0], nodes, way[j + 1, 0])
-            if bodies.docks and way[j + 1, 0] != goal and near < docked * docked:
+        depart, tail = path[j, 1], nodes[path[i, 0]]
+        while j + 1 < path.shape[0]:
+            head = nodes[path[j + 1, 0]]
+            near = near_neighbours.squared_gap(nodes, goal, nodes, path[i, 0], nodes, path[j + 1, 0])
+            if bodies.docks and path[j + 1, 0] != goal and near < docked * docked:
                 break
             # Nested, because the compiler leaves out what is never reached.
             if space is not None:  # noqa: SIM102
                 if not is_free_line(space, reach, tail, head):
                     break
-            if not _is_line_clear(others, k, tail, head, depart, way[j + 1, 2]):
+            if not _is_line_clear(others, k, tail, head, depart, path[j + 1, 2]):
                 break
             j += 1
-        way[count, 0], way[count, 1], way[count, 2] = way[j, 0], depart, way[j, 2]
+        path[count, 0], path[count, 1], path[count, 2] = path[j, 0], depart, path[j, 2]
         count, i = count + 1, j
     return count
 
@@ -143,32 +143,32 @@ class Trip(NamedTuple):
         stride: Distance that it drives in a step [m].
         launch: Steps that it loses whenever it sets out.
         latest: Step by which it must have arrived.
-        linger: Steps for which it stays at its goal; negative for ever.
+        dwell: Steps for which it stays at its goal; negative for ever.
     """
 
     stride: float
     launch: float
     latest: int
-    linger: int
+    dwell: int
 
 
 @register_jitable(nogil=True, **OPTIONS)
-def _followed_back(path: IntArray, entry: Whole) -> IntArray:
-    """``(n, 3)`` the way that ends with an entry."""
+def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
+    """``(n, 3)`` the path that ends with an entry."""
     count, walk = 0, entry
     while walk >= 0:
-        count, walk = count + 1, path[walk, 3]
+        count, walk = count + 1, tree[walk, 3]
     found, walk = np.empty((count, 3), np.int64), entry
     while walk >= 0:
         count -= 1
-        found[count, 0], found[count, 1], found[count, 2] = path[walk, 0], path[walk, 1], path[walk, 2]
-        walk = path[walk, 3]
+        found[count, 0], found[count, 1], found[count, 2] = tree[walk, 0], tree[walk, 1], tree[walk, 2]
+        walk = tree[walk, 3]
     return found
 
 
-@cached_kernel(variant="way", **OPTIONS)
-def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> IntArray:
-    """The soonest way of a robot to its goal among all others: safe interval path planning.
+@cached_kernel(variant="path", **OPTIONS)
+def find_path(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> IntArray:
+    """The soonest path of a robot to its goal among all others: safe interval path planning.
 
     After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).
 
@@ -181,33 +181,33 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
         trip: Its motion.
 
     Returns:
-        ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no way.
+        ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no path.
     """
     goal, start, nodes, costs = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes, bodies.costs[k]
     stride, latest = trip.stride, trip.latest
     # Nobody may come near its goal once it stands there for good.
-    dock = others.positions.shape[0] - 1 if trip.linger < 0 else -1
+    dock = others.positions.shape[0] - 1 if trip.dwell < 0 else -1
     while dock >= 0 and _is_clear(others, k, dock, nodes[goal, 0], nodes[goal, 1], nodes[goal, 2]):
         dock -= 1
     boxes = np.empty((latest // BLOCK + 2, others.positions.shape[1], 6))
     _fill_boxes(others, boxes)
     visits, last = find_visits(cells, others, k, latest + 1)
     safe = free_intervals(visits, last, start, latest + 1)
-    # The entry of ``path`` that comes first to each interval.
+    # The entry of ``tree`` that comes first to each interval.
     came = np.full(safe.begins.shape[0], -1, np.int32)
     aside = (bodies.docked + bodies.slack / 2) ** 2
-    path = np.empty((1024, 5), np.int64)
-    path[0, 0], path[0, 1], path[0, 2], path[0, 3], path[0, 4] = start, 0, 0, -1, safe.first[start]
+    tree = np.empty((1024, 5), np.int64)
+    tree[0, 0], tree[0, 1], tree[0, 2], tree[0, 3], tree[0, 4] = start, 0, 0, -1, safe.first[start]
     used = 1
     came[safe.first[start]] = 0
     heap = [(np.float64(costs[start]) / stride, np.int64(0))]
     while len(heap) > 0:
         _, entry = heapq.heappop(heap)
-        node, arrived, interval = path[entry, 0], path[entry, 2], path[entry, 4]
+        node, arrived, interval = tree[entry, 0], tree[entry, 2], tree[entry, 4]
         if came[interval] != entry:
             continue
         if node == goal and arrived > dock:
-            return _followed_back(path, entry)
+            return _followed_back(tree, entry)
         if node == goal and bodies.docks:
             continue
         tail = nodes[node]
@@ -224,7 +224,7 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
                 continue
             steps, depart, failures = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived, 0
             while depart < safe.ends[interval]:
-                lost = trip.launch if depart > arrived or path[entry, 3] < 0 else 0
+                lost = trip.launch if depart > arrived or tree[entry, 3] < 0 else 0
                 until = depart + steps + lost
                 if until + left > latest:
                     break
@@ -235,13 +235,13 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
                     depart += safe.begins[there] - until
                     continue
                 before = came[there]
-                if before >= 0 and path[before, 2] <= until:
+                if before >= 0 and tree[before, 2] <= until:
                     depart += safe.ends[there] - until
                     continue
                 depart += 1
                 if head == goal and bodies.docks and until <= dock:
                     continue
-                if head == goal and safe.ends[there] < min(until + trip.linger, latest):
+                if head == goal and safe.ends[there] < min(until + trip.dwell, latest):
                     depart += safe.ends[there] - until
                     continue
                 if not _is_line_free(others, boxes, k, tail, nodes[head], depart - 1, until):
@@ -249,10 +249,10 @@ def find_way(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others,
                     failures += 1
                     depart += failures // 4
                     continue
-                if used == path.shape[0]:
-                    path = np.concatenate((path, np.empty((used, 5), np.int64)))
-                path[used, 0], path[used, 1], path[used, 2] = head, until - steps - lost, until
-                path[used, 3], path[used, 4], came[there] = entry, there, used
+                if used == tree.shape[0]:
+                    tree = np.concatenate((tree, np.empty((used, 5), np.int64)))
+                tree[used, 0], tree[used, 1], tree[used, 2] = head, until - steps - lost, until
+                tree[used, 3], tree[used, 4], came[there] = entry, there, used
                 heapq.heappush(heap, (until + left, np.int64(used)))
                 used += 1
     return np.empty((0, 3), np.int64)

@@ -1,4 +1,4 @@
-"""A graph in the free space for a team to find its ways on: a lattice fitted to the walls, and all starts and goals."""
+"""Roadmap of the free space: a lattice fitted to the walls, and all starts and goals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells
 
 PAIR_SLACK = 0.4
-"""Distance that robots keep from each other beyond radii and margin, in radii: what they stray from their ways."""
+"""Distance that robots keep from each other beyond radii and margin, in radii: what they stray from their paths."""
 WALL_SLACK = 0.15
 """The same for obstacles, as a share of radius and margin."""
 REPLACED = 0.35

@@ -1,4 +1,4 @@
-"""A team that drives on a roadmap: on ways planned one after another, and on better ones for some robots at a time."""
+"""A team that drives on a roadmap: on paths planned one after another, and on better ones for some robots at a time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from d4orm_env.paths.wavefront import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
-from d4orm_planners.mapf.replanning import Trip, find_way, straighten, touches
+from d4orm_planners.mapf.replanning import Trip, find_path, straighten, touches
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.mapf.safe_intervals import Others
 from d4orm_planners.tracking.path_drives import drive_along
@@ -26,24 +26,24 @@ from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
 FIRST_CUT = 0.2
 """Most by which corners are cut on first routes, in radii of the largest robot, as all lengths below."""
-MANNERS = ((1.0, 5 / 3), (0.9, 2 / 3), (0.75, 0.2), (0.6, 1 / 15))
-"""Shares of its speed that a robot is taken to drive at when its way is planned, and by how much it cuts corners; the
+SPEED_PROFILES = ((1.0, 5 / 3), (0.9, 2 / 3), (0.75, 0.2), (0.6, 1 / 15))
+"""Shares of its speed that a robot is taken to drive at when its path is planned, and by how much it cuts corners; the
 next where it is late so, or comes too near to something."""
 LEISURE = 0.1
-"""Share of that by which it is slower, at most: drawn for every way, so that no two searches are the same."""
+"""Share of that by which it is slower, at most: drawn for every path, so that no two searches are the same."""
 LAUNCH = 0.4
 """Share of the time to full speed that setting out costs."""
 OVERTIME = 3
 """Horizons within which first routes must be driven; they become shorter afterwards."""
-SOON, PATIENCE = 1.5, 60
+BOUND_FACTOR, BOUND_EXTRA = 1.5, 60
 """Bounds of the first search for a path: so many times as long as alone, and so many steps more."""
 FAR = 1e9
 """Position of robots that are not there yet [m]."""
 LATER = 30
 """Steps by which a robot may come later for the sake of others."""
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
-"""Distances beyond radii and margin that a way is planned to keep, where starts and goals allow it, and keeps; and what
-starts and goals themselves must be apart less, for rounding."""
+"""Distances beyond radii and margin that a path is planned to keep, where starts and goals allow it, and keeps; and
+what starts and goals themselves must be apart less, for rounding."""
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another."""
 
@@ -90,22 +90,22 @@ def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> TeamRoll
 
 
 class Replanning:
-    """Better ways for some robots of a team at a time, planned one after another around all others as they drive.
+    """Better paths for some robots of a team at a time, planned one after another around all others as they drive.
 
     As in MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021).
 
     Args:
         problem: The team.
         roadmap: The roadmap of its world.
-        linger: Steps after which a robot that has arrived is no obstacle any more, for it goes on to another
+        dwell: Steps after which a robot that has arrived is no obstacle any more, for it goes on to another
             goal; ``None`` if it stays.
 
     Attributes:
         alone: ``(K,)`` about how many steps each robot takes by itself.
     """
 
-    def __init__(self, problem: Problem, roadmap: Roadmap, linger: int | None = None) -> None:
-        self.problem, self.roadmap, self.linger = problem, roadmap, linger
+    def __init__(self, problem: Problem, roadmap: Roadmap, dwell: int | None = None) -> None:
+        self.problem, self.roadmap, self.dwell = problem, roadmap, dwell
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
         self.bodies, self.size = TeamOnRoadmap(problem, roadmap).bodies, problem.team.largest_radius
@@ -138,7 +138,7 @@ class Replanning:
     def better(
         self, driven: TeamRollout, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]
     ) -> TeamRollout | None:
-        """The team with new ways for some robots, in their order, if that is better for all together, and in time."""
+        """The team with new paths for some robots, in their order, if that is better for all together, and in time."""
         last = int(driven.arrivals.max())
         changed = TeamRollout(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
         changed.places[:, robots] = FAR
@@ -153,8 +153,8 @@ class Replanning:
 
         Args:
             random: Of the order, and of the robots that may be displaced.
-            should_stop: Asked before every way.
-            most: Ways planned after which it gives up.
+            should_stop: Asked before every path.
+            most: Paths planned after which it gives up.
 
         Returns:
             All robots' paths within the horizon; ``None`` if they were not found.
@@ -192,10 +192,10 @@ class Replanning:
             else:
                 return None
             driven.places[:, robot] = around[:, robot]
-            apart = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + TOUCH * self.size
+            separation = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + TOUCH * self.size
             there = driven.places[1 : self.leaves(int(driven.arrivals[robot]))]
             gaps = np.sqrt(((there - there[:, robot, None]) ** 2).sum(axis=2))
-            displaced = settled & (gaps < np.minimum(apart, self.ends_apart[robot])).any(axis=0)
+            displaced = settled & (gaps < np.minimum(separation, self.ends_apart[robot])).any(axis=0)
             displaced[robot] = False
             driven.places[:, displaced] = FAR
             settled &= ~displaced
@@ -205,40 +205,40 @@ class Replanning:
 
     def leaves(self, arrival: int) -> int | None:
         """The step from which on a robot that arrives at a step is no obstacle any more, if any."""
-        return None if self.linger is None else arrival + self.linger + 1
+        return None if self.dwell is None else arrival + self.dwell + 1
 
     def replan_one(self, driven: TeamRollout, robot: int, latest: int, random: np.random.Generator) -> bool:
-        """Plan a robot's way around all others in ``driven``, which is changed; whether that succeeds."""
+        """Plan a robot's path around all others in ``driven``, which is changed; whether that succeeds."""
         haste = 1 - random.random() * LEISURE
-        return any(self.find_and_drive(driven, robot, latest, cruise * haste, cut) for cruise, cut in MANNERS)
+        return any(self.find_and_drive(driven, robot, latest, cruise * haste, cut) for cruise, cut in SPEED_PROFILES)
 
     def find_and_drive(self, driven: TeamRollout, robot: int, latest: int, cruise: float, cut: float) -> bool:
-        """The same in one of the :data:`MANNERS`."""
+        """The same in one of the :data:`SPEED_PROFILES`."""
         roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
-        apart = bodies.radius[robot] + bodies.radius + bodies.margin
-        others = Others(driven.places, np.minimum(apart + KEEP * self.size, self.ends_apart[robot]))
-        linger = -1 if self.linger is None else self.linger
+        separation = bodies.radius[robot] + bodies.radius + bodies.margin
+        others = Others(driven.places, np.minimum(separation + KEEP * self.size, self.ends_apart[robot]))
+        dwell = -1 if self.dwell is None else self.dwell
         # Looked for among the sooner ones at first, because that is where it mostly is.
-        for bound in sorted({min(int(SOON * self.alone[robot]) + PATIENCE, latest), latest}):
-            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, linger)
-            way = find_way(roadmap, self.cells, bodies, others, robot, trip)
-            if len(way):
+        for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
+            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell)
+            path = find_path(roadmap, self.cells, bodies, others, robot, trip)
+            if len(path):
                 break
         else:
             return False
         reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
-        left = straighten(roadmap, bodies, self.space, others, robot, reach, way)
-        nodes, departs, arrives = way[:left].T
+        left = straighten(roadmap, bodies, self.space, others, robot, reach, path)
+        nodes, departs, arrives = path[:left].T
         stops = Corners(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
-        # As soon as it can, or else by the clock of its way.
+        # As soon as it can, or else by the clock of its path.
         for backs_up, hurrying in product(self.turns[robot], (True, False)):
             drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
             if self.fits(
-                Others(driven.places, np.minimum(apart + TOUCH * self.size, others.need)), robot, drive, latest
+                Others(driven.places, np.minimum(separation + TOUCH * self.size, others.need)), robot, drive, latest
             ):
                 driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = drive
-                if self.linger is not None:
+                if self.dwell is not None:
                     driven.places[self.leaves(drive[2]) :, robot] = FAR
                 return True
         return False

@@ -23,13 +23,13 @@ from d4orm_planners.tracking.steering import track_velocities
 SLACK = 1 / 75
 """Added to the distance that robots keep from each other in it, in radii of the largest robot."""
 PARALLEL = 1e-6
-"""Ways are parallel whose directions differ by less, squared [rad^2]."""
+"""Paths are parallel whose directions differ by less, squared [rad^2]."""
 CORRECTION = 1.0
 """Share of its distance from where it should be that a robot makes good in a second [1/s]."""
 
 
 class Bends(NamedTuple):
-    """Ways of a line, an arc and a line.
+    """Paths of a line, an arc and a line.
 
     Attributes:
         begin: ``(K, 2)`` where they begin [m].
@@ -46,7 +46,7 @@ class Bends(NamedTuple):
     angles: Floats
 
     def at(self, lengths: Floats) -> tuple[Floats, Floats]:
-        """``(K, 2)`` places and unit directions so far along the ways ``(K,)``."""
+        """``(K, 2)`` places and unit directions so far along the paths ``(K,)``."""
         round_ = np.clip((lengths - self.first) / self.radius, 0, np.abs(self.angles[:, 1]))
         side = np.sign(self.angles[:, 1])
         angle = self.angles[:, 0] + side * round_
@@ -65,7 +65,7 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
         side: 1 to pass the middle to the left of it, -1 to the right.
 
     Returns:
-        ``None`` in space, where ways do not cross, where a robot begins or ends within the roundabout, or comes within
+        ``None`` in space, where paths do not cross, where a robot begins or ends within the roundabout, or comes within
         the margin of anything.
     """
     if problem.dimension != 2 or problem.num_robots < 2:
@@ -107,8 +107,8 @@ def _bends(problem: Problem, side: int) -> Bends | None:
     if middle is None:
         return None
     limits, radius = problem.team.limits.astype(np.float64), np.asarray(problem.team.radius, np.float64)
-    apart = 2 * radius.max() + problem.margin + SLACK * problem.team.largest_radius
-    least = apart / (2 * float(sin(np.pi / problem.num_robots)))
+    separation = 2 * radius.max() + problem.margin + SLACK * problem.team.largest_radius
+    least = separation / (2 * float(sin(np.pi / problem.num_robots)))
     bend = np.maximum(limits[:, SPEED] ** 2 / limits[:, ACCELERATION], least)
     # Where robots cannot turn that sharply the arc reaches round the middle on the far side too.
     centre = middle - (bend - least)[:, None] * across
@@ -126,7 +126,7 @@ def _bends(problem: Problem, side: int) -> Bends | None:
 
 
 def _nearest_to_all(places: Floats, normals: Floats) -> Floats | None:
-    """``(2,)`` the place nearest to straight ways through ``places`` ``(K, 2)``; ``None`` if they are parallel.
+    """``(2,)`` the place nearest to straight paths through ``places`` ``(K, 2)``; ``None`` if they are parallel.
 
     By normal equations whose sums are exact, so that it is the same on every processor.
     """

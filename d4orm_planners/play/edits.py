@@ -30,7 +30,7 @@ def move_goal(problem: Problem, robot: int, place: ArrayLike) -> Problem:
     goal = np.array(problem.goal)
     goal[robot] = place
     _check_place(problem, "the goal", robot, goal)
-    return problem.resumed_at(problem.start, goal)
+    return problem.with_state(problem.start, goal)
 
 
 def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
@@ -40,7 +40,7 @@ def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
     start[robot, : problem.dimension] = place
     _stop(problem, start, robot)
     _check_place(problem, "the robot", robot, start[:, : problem.dimension])
-    return problem.resumed_at(start, problem.goal)
+    return problem.with_state(start, problem.goal)
 
 
 def check_robot(problem: Problem, robot: int) -> None:
@@ -54,7 +54,7 @@ def at_rest(problem: Problem) -> Problem:
     start = np.array(problem.start)
     for robot in range(problem.num_robots):
         _stop(problem, start, robot)
-    return problem.resumed_at(start, problem.goal)
+    return problem.with_state(start, problem.goal)
 
 
 def _stop(problem: Problem, states: FloatArray, robot: int) -> None:
@@ -75,7 +75,7 @@ def add_robot(problem: Problem, random: np.random.Generator) -> Problem:
     start[:count] = problem.start
     start[count, : problem.dimension] = positions[count]
     changed = problem.select([*range(count), 0])
-    return changed.resumed_at(start, goals)
+    return changed.with_state(start, goals)
 
 
 def remove_robot(problem: Problem) -> Problem:
@@ -146,7 +146,7 @@ def followed(before: Problem, after: Problem, other: Problem, who: str) -> Probl
         there[:kept][same] = elsewhere[:kept][same]
         places.append(there)
         moved.append([*np.flatnonzero(~same), *range(kept, len(there))])
-    changed = after.resumed_at(*places)
+    changed = after.with_state(*places)
     try:
         for what, rows, robots in zip(("the robot", "the goal"), places, moved):
             for robot in robots:
@@ -164,7 +164,7 @@ def _places(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def _with_world(problem: Problem, **changes: object) -> Problem:
-    changed = problem.resumed_at(problem.start, problem.goal, world=problem.world.replace(**changes))
+    changed = problem.with_state(problem.start, problem.goal, world=problem.world.replace(**changes))
     _check_world(changed)
     return changed
 

@@ -88,7 +88,7 @@ def edges(bounds: Points) -> Points:
 def polylines(
     path: Numbers, colors: Numbers, paper: int, shares: tuple[float, float], knots: Sequence[NDArray[np.intp]]
 ) -> tuple[Points, Colors]:
-    """Segments along the ways of a team.
+    """Segments along the paths of a team.
 
     Args:
         path: ``(T, K, d)`` positions.
@@ -103,20 +103,20 @@ def polylines(
     places, share = in_space(path), np.linspace(shares[0], shares[1], len(path))[:, None]
     points, tones = [NO_LINES[0]], [NO_LINES[1].astype(np.float64)]
     for robot, taken in enumerate(knots):
-        way, tone = places[taken, robot], paper + share[taken] * (colors[robot] - paper)
-        points.append(np.stack([way[:-1], way[1:]], axis=1))
+        path, tone = places[taken, robot], paper + share[taken] * (colors[robot] - paper)
+        points.append(np.stack([path[:-1], path[1:]], axis=1))
         tones.append(np.stack([tone[:-1], tone[1:]], axis=1))
     return np.concatenate(points), linear(np.concatenate(tones))
 
 
-def bends(way: Numbers, tolerance: float) -> NDArray[np.intp]:
-    """Indices of a few points that tell a way ``(T, d)`` to within a tolerance [m] (Ramer, Douglas and Peucker)."""
-    kept, open_parts = {0, len(way) - 1}, [(0, len(way) - 1)]
+def bends(path: Numbers, tolerance: float) -> NDArray[np.intp]:
+    """Indices of a few points that tell a path ``(T, d)`` to within a tolerance [m] (Ramer, Douglas and Peucker)."""
+    kept, open_parts = {0, len(path) - 1}, [(0, len(path) - 1)]
     while open_parts:
         first, last = open_parts.pop()
         if last - first < 2:
             continue
-        along, off = way[last] - way[first], way[first + 1 : last] - way[first]
+        along, off = path[last] - path[first], path[first + 1 : last] - path[first]
         share = np.clip(off @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
         distance = np.linalg.norm(off - share[:, None] * along, axis=1)
         farthest = int(distance.argmax())

@@ -144,8 +144,8 @@ class Panel:
 
     def _push_somebody(self) -> None:
         """Push the robot that is farthest from its goal, any way."""
-        way = self._random.normal(size=self._session.frame.problem.dimension)
-        self._session.push(None, PUSH * way / np.linalg.norm(way))
+        direction = self._random.normal(size=self._session.frame.problem.dimension)
+        self._session.push(None, PUSH * direction / np.linalg.norm(direction))
 
     def _drawn(self, change: Callable[[Problem, np.random.Generator], Problem]) -> edits.Edit:
         """A change that draws at random, with other numbers each time."""

@@ -17,7 +17,7 @@ GATE_HEADER = "X-D4orm-Gate"
 logger = logging.getLogger(__name__)
 
 _HEAD = 16_384
-_PATIENCE = 10.0
+_TIMEOUT = 10.0
 _MOST_WAITING = 100
 """Connections that have not shown the token yet; further ones are closed."""
 
@@ -102,7 +102,7 @@ class AuthenticatingProxy:
             raise ConnectionRefusedError
         self._waiting += 1
         try:
-            return await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _PATIENCE)
+            return await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _TIMEOUT)
         except asyncio.LimitOverrunError:
             return b""
         finally:

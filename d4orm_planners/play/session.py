@@ -91,7 +91,7 @@ class Session:
     def scene(self) -> Problem:
         """The scene as the first that drives has it now, for a file: where the robots are is where they start."""
         frame = self.frame
-        return frame.problem.resumed_at(frame.states, frame.goals)
+        return frame.problem.with_state(frame.states, frame.goals)
 
     @property
     def recorded_steps(self) -> int:

@@ -94,7 +94,7 @@ class Viewport:
     def scene(self) -> Problem:
         """The scene as it is now: where the robots are is where they start, at rest or under way."""
         joint = self._joint
-        return self._scene.resumed_at(joint.states, joint.goals)
+        return self._scene.with_state(joint.states, joint.goals)
 
     def advance(self) -> None:
         """One step of the policy and of the world."""

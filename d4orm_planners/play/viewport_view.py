@@ -275,14 +275,14 @@ class LaneView:
             lines["trails"] = polylines(trail, self._colors, self._paper, (0.2, 1.0), knots)
         for name, path, shades in (("plans", frame.plan, (1.0, 0.4)), ("guidance", frame.guidance, (0.8, 0.25))):
             if path is not None and len(path) > 1 and self._shown[name]:
-                lines[name] = self._way_lines(name, path, shades, frame.problem)
+                lines[name] = self._path_lines(name, path, shades, frame.problem)
         for name, (points, colors) in lines.items():
             self._nodes[name].points, self._nodes[name].colors = points, colors
 
-    def _way_lines(
+    def _path_lines(
         self, name: str, path: FloatArray, shades: tuple[float, float], problem: Problem
     ) -> tuple[Points, Colors]:
-        """Lines of the ways ahead, looked for only when these are others."""
+        """Lines of the paths ahead, looked for only when these are others."""
         if name not in self._knots or not np.array_equal(self._knots[name][0], path):
             tolerance = PLAN_TOLERANCE * np.asarray(problem.team.radius)
             knots = [bends(path[:, robot], float(tolerance[robot])) for robot in range(path.shape[1])]

@@ -79,7 +79,7 @@ class Checkpoints:
     def save(
         self, index: int, model: BaseAlgorithm, env: VecNormalize, evaluations: Sequence[Evaluation]
     ) -> Checkpoint:
-        """Write the checkpoint of lesson ``index``, and remove the oldest."""
+        """Write the checkpoint of stage ``index``, and remove the oldest."""
         final = self._folder / f"{index + 1:06d}"
         temporary = final.with_suffix(".partial")
         shutil.rmtree(temporary, ignore_errors=True)
@@ -100,11 +100,11 @@ class Checkpoints:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A training after some lessons.
+    """A training after some stages.
 
     Attributes:
         folder: Its folder.
-        evaluations: One per lesson so far.
+        evaluations: One per stage so far.
     """
 
     folder: Path

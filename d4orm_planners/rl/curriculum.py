@@ -34,28 +34,28 @@ def common_batch(sizes: tuple[int, ...], wanted: int) -> int:
     return max(wanted // unit, 1) * unit
 
 
-def make_lessons(num_robots: int, scenario: str, steps: int, unit: int, count: int, gradual: bool) -> tuple[Stage, ...]:
-    """The lessons of a training.
+def make_stages(num_robots: int, scenario: str, steps: int, unit: int, count: int, gradual: bool) -> tuple[Stage, ...]:
+    """The stages of a training.
 
     Teams grow, and every size gets as many steps of whole worlds as any other. Instances are random ones; where another
-    scenario is asked for, every other lesson of the full team is about that.
+    scenario is asked for, every other stage of the full team is about that.
 
     Args:
         num_robots: Size of the full team.
         scenario: Scenario to learn.
         steps: Robot-steps in all, rounded up to whole units.
         unit: Robot-steps that are taken between two updates.
-        count: Lessons at most.
+        count: Stages at most.
         gradual: Whether there are smaller teams first.
     """
     units = math.ceil(steps / unit)
     count = min(count, units)
     sizes = team_sizes(num_robots) if gradual else (num_robots,)
     turns = np.cumsum(sizes) / sum(sizes)
-    lessons = []
+    stages = []
     for index in range(count):
         size = sizes[int(np.searchsorted(turns, (index + 0.5) / count))]
         name = scenario if size == num_robots and index % 2 == 0 else "random"
         length = units * (index + 1) // count - units * index // count
-        lessons.append(Stage(size, name, length * unit))
-    return tuple(lessons)
+        stages.append(Stage(size, name, length * unit))
+    return tuple(stages)

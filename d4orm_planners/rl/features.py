@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.dynamics.models import get_model
-from d4orm_planners.tracking.steering import along_ways
+from d4orm_planners.tracking.steering import along_paths
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
@@ -105,17 +105,17 @@ class Features:
         return None if rest or number < 0 else replace(self, slices=replace(self.slices, num_neighbors=number))
 
     def along(self, observations: FloatArray, direction: NDArray[np.floating], length: NDArray[np.floating]) -> None:
-        """Put the goals where the shortest free ways seem to lead, as far off as the ways are long.
+        """Put the goals where the shortest paths seem to lead, as far off as these are long.
 
         Among walls the goal itself says little of where to go; without obstacles nothing changes. Robots at their goals
-        and those without a way see their goals.
+        and those without a path see their goals.
 
         Args:
             observations: ``(N, D)``, whose goals are changed.
-            direction: ``(N, d)`` along the ways.
-            length: ``(N,)`` of the ways [m].
+            direction: ``(N, d)`` along the paths.
+            length: ``(N,)`` of the paths [m].
         """
-        ahead, known = along_ways(direction, length)
+        ahead, known = along_paths(direction, length)
         observations[known, self.slices.own.goal] = ahead[known]
 
     def encode(self, observations: FloatArray) -> tuple[FloatArray, FloatArray]:

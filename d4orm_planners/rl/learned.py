@@ -14,7 +14,7 @@ from d4orm_env.envs.joint_state import split_state
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
-from d4orm_planners.tracking.steering import goals_along_ways
+from d4orm_planners.tracking.steering import goals_along_paths
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -115,12 +115,12 @@ class LearnedPolicy(Policy):
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
         robots = robot_indices(observations)
         among_obstacles = self.problem.world.num_obstacles > 0
-        if among_obstacles and isinstance(self._actor, _NetworkActor) and self._actor.network.header.ways:
-            self._look_along_ways(self._actor.network, robots, seen, state)
+        if among_obstacles and isinstance(self._actor, _NetworkActor) and self._actor.network.header.shortest_paths:
+            self._look_along_paths(self._actor.network, robots, seen, state)
         controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
         return within_limits(self.problem, dict(zip(observations, controls)))
 
-    def _look_along_ways(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
+    def _look_along_paths(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
         """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that all have.
 
         Where a robot is follows from its goal and where it sees that.
@@ -129,7 +129,7 @@ class LearnedPolicy(Policy):
         assert features is not None, "reset has checked the observations"
         places, own = goals.copy(), features.slices.own.goal
         places[robots] -= seen[:, own]
-        seen[:, own] = (goals_along_ways(self.problem, places, goals) - places)[robots]
+        seen[:, own] = (goals_along_paths(self.problem, places, goals) - places)[robots]
 
 
 class PPO(LearnedPolicy):

@@ -47,7 +47,7 @@ class Header(BaseModel):
         encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.set_network`. Such
             a policy acts for any number of observed robots.
         frame: Direction of the first axis of a robot's frame; ``None`` is to the goal.
-        ways: Whether it heads along the shortest free ways, see :meth:`Features.along`; ``None`` is straight.
+        shortest_paths: Whether it heads along the shortest paths, see :meth:`Features.along`; ``None`` is straight.
         training: The command and its settings, for people, and the ``training_time`` [s].
     """
 
@@ -64,12 +64,12 @@ class Header(BaseModel):
     layers: int = Field(ge=1, le=16)
     encoder: Literal["sets"] | None = None
     frame: Literal["heading"] | None = None
-    ways: Literal[True] | None = None
+    shortest_paths: Literal[True] | None = None
     training: dict[str, object]
 
     def text(self) -> str:
         """Return it as JSON, which earlier versions read where it says nothing that they do not know."""
-        unsaid = {name for name in ("encoder", "frame", "ways") if getattr(self, name) is None}
+        unsaid = {name for name in ("encoder", "frame", "shortest_paths") if getattr(self, name) is None}
         return self.model_dump_json(exclude=unsaid)
 
 

@@ -16,7 +16,7 @@ _ROOM = 1.1
 """Over the least distance between the centres of two robots that keeps the margin."""
 
 
-def loosened(
+def perturbed(
     seed: int, num_robots: int, *, base: str = "circle", shift: float = 0.3, shrink: float = 0.2, **settings: Any
 ) -> Problem:
     """Another scenario in the plane, turned and shrunk at random, every start and goal moved a little.
@@ -42,7 +42,7 @@ def loosened(
     return problem.replace(start=start, goal=goal)
 
 
-def clearing(
+def clutter(
     seed: int, num_robots: int, *, places: int = 0, obstacles: int = 6, size: float = 5.0, **settings: Any
 ) -> Problem:
     """Random starts and goals in a square with round obstacles, which are the same for every seed.

@@ -38,14 +38,14 @@ class RobotVecEnv(VecEnv):
         scenario: As for :class:`d4orm_env.navigation_v0.parallel_env`, like ``**kwargs``. One model for all robots.
         seed: Of the first world.
         reward: The reward to learn from, as in :class:`~d4orm_env.envs.options.EnvOptions`.
-        sight: Number of observed robots shown at most, the others being marked absent; ``None`` is all. Or
+        max_observed: Number of observed robots shown at most, the others being marked absent; ``None`` is all. Or
             that of each world.
-        ways: Whether robots see their goals along their shortest free ways, see :meth:`Features.along`, and are paid
-            for the way made along those.
+        shortest_paths: Whether robots see their goals along their shortest paths, see :meth:`Features.along`, and
+            are paid for progress along these.
         **kwargs: Further arguments of :class:`d4orm_env.envs.vector_env.NavigationVectorEnv`.
 
     Attributes:
-        ways: As above.
+        shortest_paths: As above.
         acted: ``(B * K,)`` bool: which robots acted in the last step.
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
         limits: ``(B * K, m)`` largest controls.
@@ -66,12 +66,12 @@ class RobotVecEnv(VecEnv):
         *,
         seed: int = 0,
         reward: str | RewardFunction = "training",
-        sight: int | Sequence[int | None] | None = None,
-        ways: bool = False,
+        max_observed: int | Sequence[int | None] | None = None,
+        shortest_paths: bool = False,
         **kwargs: Any,
     ) -> None:
-        kwargs |= {"reward": reward, "observed_path": ways, "autoreset_mode": "SameStep"}
-        if ways:
+        kwargs |= {"reward": reward, "observed_path": shortest_paths, "autoreset_mode": "SameStep"}
+        if shortest_paths:
             kwargs["progress"] = "path"
         self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, **kwargs)
         problem = self.problem = self._env.problem
@@ -87,10 +87,12 @@ class RobotVecEnv(VecEnv):
         layout = self._env.layout
         slices = ObservationSlices(layout.dimension, layout.num_neighbors, layout.num_obstacles)
         self.features = Features.of(slices, problem.team.models[0])
-        self.ways = ways
+        self.shortest_paths = shortest_paths
         self.num_worlds = num_worlds
         self._shape = (num_worlds, problem.num_robots)
-        self._hidden = self._out_of_sight([sight] * num_worlds if sight is None or isinstance(sight, int) else sight)
+        self._hidden = self._unobserved(
+            [max_observed] * num_worlds if max_observed is None or isinstance(max_observed, int) else max_observed
+        )
         count = num_worlds * problem.num_robots
         self.limits = np.tile(problem.team.control_limits, (num_worlds, 1))
         self._seed: int | None = seed
@@ -127,7 +129,7 @@ class RobotVecEnv(VecEnv):
         self._return = np.zeros(self._shape)
         self._length = np.zeros(self._shape, np.int64)
         self._finishing = np.empty((0, 2), np.int64)
-        return self._in_sight(observations, [])
+        return self._masked(observations, [])
 
     def drive(self, controls: FloatArray) -> FloatArray:
         """Step the worlds with controls ``(B * K, m)`` in physical units.
@@ -157,14 +159,14 @@ class RobotVecEnv(VecEnv):
             (infos["final_obs"][b] if ended[b] else observations[b]).reshape(self._shape[1], -1)[k]
             for b, k in self._finishing
         ]
-        return self._in_sight(observations, last)
+        return self._masked(observations, last)
 
     def encoded(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Features ``(N, F)`` and frames ``(N, 2)`` of what robots of any such worlds see ``(N, .)``."""
-        if self.ways:
-            seen, way = seen[:, : self.features.slices.size].copy(), self._env.layout.paths(seen)
+        if self.shortest_paths:
+            seen, path = seen[:, : self.features.slices.size].copy(), self._env.layout.paths(seen)
             parts = self._env.layout.path
-            self.features.along(seen, way[:, parts.direction], way[:, parts.length][:, 0])
+            self.features.along(seen, path[:, parts.direction], path[:, parts.length][:, 0])
         return self.features.encode(seen)
 
     def show(self, features: FloatArray, frames: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -184,7 +186,7 @@ class RobotVecEnv(VecEnv):
             values[dones] = 0
         return shown, self._rewards.ravel().astype(np.float32), dones.ravel(), robot_infos
 
-    def _in_sight(self, observations: FloatArray, last: list[FloatArray]) -> FloatArray:
+    def _masked(self, observations: FloatArray, last: list[FloatArray]) -> FloatArray:
         """Return what the robots are to see now, and what those whose episodes have ended saw last."""
         seen = observations.reshape(self.num_envs, -1)
         seen = np.concatenate([seen, last]) if last else seen
@@ -193,10 +195,10 @@ class RobotVecEnv(VecEnv):
             self.features.slices.neighbors(seen)[np.concatenate([self._hidden, self._hidden[ended]])] = 0
         return seen
 
-    def _out_of_sight(self, sights: Sequence[int | None]) -> BoolArray:
+    def _unobserved(self, max_observed: Sequence[int | None]) -> BoolArray:
         """``(B * K, N)`` which of the observed robots each robot is not shown, by what those of each world are."""
         observed = self.features.slices.num_neighbors
-        shown = np.repeat([observed if sight is None else sight for sight in sights], self._shape[1])
+        shown = np.repeat([observed if most is None else most for most in max_observed], self._shape[1])
         hidden: BoolArray = np.arange(observed) >= shown[:, None]
         return hidden
 

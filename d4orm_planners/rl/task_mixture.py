@@ -1,4 +1,4 @@
-"""Several scenarios and team sizes practised at once, so that none is forgotten over another."""
+"""Several scenarios and team sizes trained on at once, so that none is forgotten over another."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import find_scenario, unknown_argument
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 
-_LOOSENED = "d4orm_planners.rl.perturbed_scenarios:loosened"
-_CLEARING = "d4orm_planners.rl.perturbed_scenarios:clearing"
+_PERTURBED = "d4orm_planners.rl.perturbed_scenarios:perturbed"
+_CLUTTER = "d4orm_planners.rl.perturbed_scenarios:clutter"
 _DISTURB = "disturb."
 MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -31,71 +31,71 @@ MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
             "random 2",
             "random 4",
             "random 8",
-            "random 8 sight=4",
+            "random 8 max_observed=4",
             "random 16 size=7.07",
-            "random 16 size=7.07 sight=4",
+            "random 16 size=7.07 max_observed=4",
             "random 16",
             "random 32 size=9",
-            f"{_LOOSENED} 4",
-            f"{_LOOSENED} 8",
-            f"{_LOOSENED} 8 shift=0.05",
-            f"{_LOOSENED} 12",
-            f"{_LOOSENED} 16 shrink=0.05 sight=4",
-            f"{_LOOSENED} 16 shrink=0",
+            f"{_PERTURBED} 4",
+            f"{_PERTURBED} 8",
+            f"{_PERTURBED} 8 shift=0.05",
+            f"{_PERTURBED} 12",
+            f"{_PERTURBED} 16 shrink=0.05 max_observed=4",
+            f"{_PERTURBED} 16 shrink=0",
             "circle 8",
             "circle 16",
-            f"{_LOOSENED} 8 base=four_obstacles",
-            f"{_LOOSENED} 8 base=four_obstacles shift=0.1 sight=4",
+            f"{_PERTURBED} 8 base=four_obstacles",
+            f"{_PERTURBED} 8 base=four_obstacles shift=0.1 max_observed=4",
             "four_obstacles 8",
-            f"{_LOOSENED} 12 base=swap",
-            f"{_CLEARING} 8",
-            f"{_CLEARING} 8 places=1 obstacles=10",
+            f"{_PERTURBED} 12 base=swap",
+            f"{_CLUTTER} 8",
+            f"{_CLUTTER} 8 places=1 obstacles=10",
         ),
         "dense_crowds": (
-            "random 4 sight=4",
+            "random 4 max_observed=4",
             "random 8",
-            "random 8 sight=4",
-            "random 8 sight=4",
+            "random 8 max_observed=4",
+            "random 8 max_observed=4",
             "random 16 size=7.07",
-            "random 16 size=7.07 sight=4",
-            "random 16 size=7.07 sight=4",
+            "random 16 size=7.07 max_observed=4",
+            "random 16 size=7.07 max_observed=4",
             "random 16",
-            "random 32 size=9 sight=4",
-            f"{_LOOSENED} 8 sight=4",
-            f"{_LOOSENED} 16 shrink=0.05 sight=4",
-            "circle 8 sight=4",
+            "random 32 size=9 max_observed=4",
+            f"{_PERTURBED} 8 max_observed=4",
+            f"{_PERTURBED} 16 shrink=0.05 max_observed=4",
+            "circle 8 max_observed=4",
             "circle 16",
-            f"{_LOOSENED} 8 base=four_obstacles sight=4",
-            f"{_LOOSENED} 12 base=swap",
-            f"{_CLEARING} 8",
-            f"{_CLEARING} 8 places=1 obstacles=10",
+            f"{_PERTURBED} 8 base=four_obstacles max_observed=4",
+            f"{_PERTURBED} 12 base=swap",
+            f"{_CLUTTER} 8",
+            f"{_CLUTTER} 8 places=1 obstacles=10",
         ),
         "walls": (
             "rooms 4",
             "rooms 8",
             "rooms 8",
             "rooms 8 disturb.control_noise=0.2",
-            "rooms 8 sight=4",
-            "rooms 8 sight=4",
+            "rooms 8 max_observed=4",
+            "rooms 8 max_observed=4",
             "rooms 16",
             "forest 8",
-            "warehouse 8 sight=4",
+            "warehouse 8 max_observed=4",
             "maze 4",
             "random 8",
-            "random 8 sight=4",
-            "random 8 sight=4 disturb.delay=2",
+            "random 8 max_observed=4",
+            "random 8 max_observed=4 disturb.delay=2",
             "random 16 size=7.07",
-            "random 16 size=7.07 sight=4",
+            "random 16 size=7.07 max_observed=4",
             "random 16",
-            "random 16 sight=4",
+            "random 16 max_observed=4",
             "random 32 size=10",
             "circle 16 disturb.control_noise=0.2",
-            f"{_LOOSENED} 8 base=four_obstacles sight=4",
-            f"{_LOOSENED} 16 shrink=0.05 sight=4",
+            f"{_PERTURBED} 8 base=four_obstacles max_observed=4",
+            f"{_PERTURBED} 16 shrink=0.05 max_observed=4",
         ),
     }
 )
-"""Mixtures by name; ``walls`` is for robots that look along their ways."""
+"""Mixtures by name; ``walls`` is for robots that look along their paths."""
 
 
 @dataclass(frozen=True)
@@ -106,21 +106,21 @@ class TrainTask:
         scenario: Name, file or import path.
         num_robots: Size of its teams.
         settings: Arguments of the scenario.
-        sight: Number of observed robots shown at most; ``None`` is all.
+        max_observed: Number of observed robots shown at most; ``None`` is all.
         disturbances: Levels by name, see :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`.
     """
 
     scenario: str
     num_robots: int
     settings: Mapping[str, object]
-    sight: int | None = None
+    max_observed: int | None = None
     disturbances: Mapping[str, object] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, text: str) -> TrainTask:
         """Parse a scenario, a team size, and settings ``name=value``, separated by blanks.
 
-        ``sight=4`` and ``disturb.delay=2``, with any disturbance's name and level, are among the settings.
+        ``max_observed=4`` and ``disturb.delay=2``, with any disturbance's name and level, are among the settings.
 
         Raises:
             ValueError: If it is something else.
@@ -134,9 +134,9 @@ class TrainTask:
             if not separator or not name or not value or name in settings:
                 raise ValueError(f"mixture has {text!r}, in which {word!r} is no new setting of the form name=value")
             settings[name] = parse_yaml(value)
-        sight = settings.pop("sight", None)
-        if sight is not None and (not isinstance(sight, int) or sight < 0):
-            raise ValueError(f"mixture has {text!r}, in which sight must be a whole number of zero or more")
+        max_observed = settings.pop("max_observed", None)
+        if max_observed is not None and (not isinstance(max_observed, int) or max_observed < 0):
+            raise ValueError(f"mixture has {text!r}, in which max_observed must be a whole number of zero or more")
         for name in ("num_robots", "seed", "model"):
             if name in settings:
                 raise ValueError(f"mixture has {text!r}, in which {name!r} has no place")
@@ -150,7 +150,7 @@ class TrainTask:
         complaint = unknown_argument(scenario, settings)
         if complaint:
             raise ValueError(f"mixture has {text!r}: {complaint}")
-        return cls(scenario, int(rest[0]), settings, sight, disturbances)
+        return cls(scenario, int(rest[0]), settings, max_observed, disturbances)
 
     def problem(self, seed: int, model: str | None = None) -> Problem:
         """An instance with robots of that model; ``None`` is the scenario's own."""
@@ -161,12 +161,17 @@ class TrainTask:
         return find_scenario(self.scenario).draws or self.problem(0, model) != self.problem(1, model)
 
     def worlds(
-        self, sights: Sequence[int | None], seed: int, instances: Instances, model: str | None = None, **options: Any
+        self,
+        max_observed: Sequence[int | None],
+        seed: int,
+        instances: Instances,
+        model: str | None = None,
+        **options: Any,
     ) -> RobotVecEnv:
-        """Worlds to practise in.
+        """Worlds to train in.
 
         Args:
-            sights: Of each, in place of :attr:`sight`.
+            max_observed: Of each, in place of :attr:`max_observed`.
             seed: Of the first.
             instances: To choose among at every reset.
             model: Robot model; ``None`` is the scenario's own.
@@ -177,14 +182,16 @@ class TrainTask:
             arguments = {"scenario": instances, "randomize_instance": True}
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
-        return RobotVecEnv(len(sights), self.num_robots, seed=seed, sight=sights, **arguments, **options)
+        return RobotVecEnv(
+            len(max_observed), self.num_robots, seed=seed, max_observed=max_observed, **arguments, **options
+        )
 
     def validation(self, count: int, seed: int, model: str | None = None, **options: Any) -> RobotVecEnv:
         """Worlds to judge by, a new instance for each; one is enough where nothing differs. Arguments as above."""
         # Every validation asks for the same again.
         instances = Instances(partial(self.problem, model=model), None, {})
         count = count if self.disturbances or self.draws(model) else 1
-        return self.worlds([self.sight] * count, seed, instances, model, **options)
+        return self.worlds([self.max_observed] * count, seed, instances, model, **options)
 
 
 class Instances:
@@ -217,20 +224,20 @@ def parse_mixture(texts: Sequence[str]) -> tuple[TrainTask, ...]:
     return tuple(TrainTask.parse(text) for text in named)
 
 
-def gather_parts(exercises: Sequence[TrainTask], counts: Sequence[int]) -> list[tuple[TrainTask, list[int | None]]]:
-    """Parts that differ in nothing but sight as one, since each takes its time to step, and the sight of its worlds.
+def gather_parts(tasks: Sequence[TrainTask], counts: Sequence[int]) -> list[tuple[TrainTask, list[int | None]]]:
+    """Parts that differ in ``max_observed`` only as one, since each takes its time to step, with that of its worlds.
 
     Args:
-        exercises: Parts of a mixture.
+        tasks: Parts of a mixture.
         counts: Number of worlds of each.
     """
     gathered: list[tuple[TrainTask, list[int | None]]] = []
-    for exercise, count in zip(exercises, counts, strict=True):
-        own = replace(exercise, sight=None)
+    for task, count in zip(tasks, counts, strict=True):
+        own = replace(task, max_observed=None)
         if own not in [other for other, _ in gathered]:
             gathered.append((own, []))
-        sights = next(sights for other, sights in gathered if other == own)
-        sights.extend([exercise.sight] * count)
+        max_observed = next(max_observed for other, max_observed in gathered if other == own)
+        max_observed.extend([task.max_observed] * count)
     return gathered
 
 
@@ -257,7 +264,7 @@ class MixedVecEnv(VecEnv):
         models = sorted({part.problem.team.models[0] for part in parts})
         if len(models) > 1 or any(part.features != first.features for part in parts):
             raise ValueError(f"the mixture has robots of {', '.join(models)}; one policy is learned for one model")
-        self.features, self.problem, self.ways = first.features, first.problem, first.ways
+        self.features, self.problem, self.shortest_paths = first.features, first.problem, first.shortest_paths
         self.num_worlds = sum(part.num_worlds for part in parts)
         self._splits = np.cumsum([part.num_envs for part in parts])[:-1]
         self._limits = np.concatenate([part.limits for part in parts])

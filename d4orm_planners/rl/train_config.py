@@ -27,7 +27,7 @@ class TrainConfig(CheckedSettings):
     """Common settings of all trainings.
 
     Attributes:
-        scenario: Scenario to learn. Instances of ``random`` are practised along with any other scenario.
+        scenario: Scenario to learn. Instances of ``random`` are trained on along with any other scenario.
         num_robots: Size of the full team.
         seed: Of everything that is drawn.
         model: Robot model; ``None`` is the scenario's own.
@@ -57,16 +57,16 @@ class TrainConfig(CheckedSettings):
 
     def _example(self) -> Problem:
         """An instance of the scenario."""
-        return self.exercise(self.scenario, self.num_robots).problem(0, self.model)
+        return self.task(self.scenario, self.num_robots).problem(0, self.model)
 
     def arguments(self, scenario: str) -> dict[str, Any]:
         """Arguments of environments of the scenario to be learned, or of ``random`` with robots like its own, but for
         their number.
         """
-        settings = self.exercise(scenario, self.num_robots).settings
+        settings = self.task(scenario, self.num_robots).settings
         return {"scenario": scenario, "model": self.model_in(scenario), **settings}
 
-    def exercise(self, scenario: str, num_robots: int) -> TrainTask:
+    def task(self, scenario: str, num_robots: int) -> TrainTask:
         """The same scenario with a team of that size."""
         return TrainTask(scenario, num_robots, self.scenario_settings if scenario == self.scenario else {})
 
@@ -83,8 +83,8 @@ class TrainConfig(CheckedSettings):
         Raises:
             ValueError: If one policy cannot be learned for the team.
         """
-        exercise = self.exercise(self.scenario, self.num_robots)
-        return exercise.validation(self.validation_worlds, VALIDATION_SEED, self.model, **options)
+        task = self.task(self.scenario, self.num_robots)
+        return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **options)
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Return the header of a policy file: what a model does not tell."""
@@ -96,6 +96,6 @@ class TrainConfig(CheckedSettings):
             "num_neighbors": slices.num_neighbors,
             "num_obstacles": slices.num_obstacles,
             "frame": None if frame == "goal" else frame,
-            "ways": worlds.ways or None,
+            "shortest_paths": worlds.shortest_paths or None,
             "training": {**training, **asdict(self)},
         }

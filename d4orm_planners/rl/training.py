@@ -1,6 +1,6 @@
-"""Training with Stable-Baselines3: lessons with a checkpoint after each, from which a killed training goes on.
+"""Training with Stable-Baselines3: stages with a checkpoint after each, from which a killed training goes on.
 
-A lesson begins with fresh worlds and a fresh random state, both set by the seed and the lesson's number, and otherwise
+A stage begins with fresh worlds and a fresh random state, both set by the seed and the stage's number, and otherwise
 depends on the checkpoint before it only. A training that was killed and goes on therefore ends as if nothing had
 happened.
 """
@@ -28,7 +28,7 @@ from d4orm_env.envs.rewards import TrainingReward
 from d4orm_planners.base.settings import Count, Number, PathText, Positive, Whole, one_of
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
-from d4orm_planners.rl.curriculum import Stage, common_batch, make_lessons, team_sizes
+from d4orm_planners.rl.curriculum import Stage, common_batch, make_stages, team_sizes
 from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
@@ -39,13 +39,13 @@ from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 
 Progress = Callable[[str, int, int], object]
 _INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
-"""At most so many of each part are chosen among. All are new in each lesson, but where robots look along ways, which
+"""At most so many of each part are chosen among. All are new in each stage, but where robots look along paths, which
 take long to find: there one is new for so many robot-steps."""
 Drawn = dict[tuple[int, str, int], dict[int, Problem]]
 """Instances by part, scenario and team size, and by their seeds."""
 NETWORKS = ("flat", "sets")
 MIXTURE = "mixture"
-"""Stands for the scenario of lessons that are about several."""
+"""Stands for the scenario of stages that are about several."""
 
 
 def _as_tuple(value: object) -> object:
@@ -61,19 +61,19 @@ class TrainingSettings(TrainConfig):
         steps: Robot-steps, rounded up to whole updates.
         num_envs: Robots that act at once; ``None`` is the algorithm's own number.
         curriculum: Whether smaller teams come first.
-        lessons: Parts of the training, each with a checkpoint and an evaluation at its end.
+        stages: Parts of the training, each with a checkpoint and an evaluation at its end.
         start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
         network: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and
             obstacles, see :mod:`d4orm_planners.rl.set_network`.
         observed_robots: In observations.
-        ways: Whether robots see their goals along their shortest free ways, as is wanted among walls, see
+        shortest_paths: Whether robots see their goals along their shortest paths, as is wanted among walls, see
             :meth:`~d4orm_planners.rl.features.Features.along`.
         learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
         learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
             those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
         reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are
             others.
-        mixture: Scenarios and team sizes to be practised all at once, in place of ``scenario`` and ``num_robots``:
+        mixture: Scenarios and team sizes to be trained on all at once, in place of ``scenario`` and ``num_robots``:
             texts as :meth:`~d4orm_planners.rl.task_mixture.TrainTask.parse` takes them, or names of
             :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow,
             and as many validation worlds as any other.
@@ -86,11 +86,11 @@ class TrainingSettings(TrainConfig):
     steps: Annotated[Count, Field(le=10**15)] = 5_000_000
     num_envs: Many | None = None
     curriculum: bool = False
-    lessons: Annotated[Count, Field(le=1000)] = 50
+    stages: Annotated[Count, Field(le=1000)] = 50
     start_from: PathText | None = None
     network: Annotated[str, one_of(NETWORKS)] = "flat"
     observed_robots: Annotated[Whole, Field(ge=0, le=1000)] = 4
-    ways: bool = False
+    shortest_paths: bool = False
     learning_rate: Annotated[Positive, Field(le=1)] | None = None
     learner_settings: Mapping[str, Number] = field(default_factory=dict)
     reward_settings: Mapping[str, Number] = field(default_factory=dict)
@@ -110,10 +110,10 @@ class TrainingSettings(TrainConfig):
             given = getattr(self, name)
             if given != getattr(TrainingSettings, name, {}):
                 raise ValueError(f"{name} is {given!r} beside a mixture, whose parts say all that; leave one out")
-        self.exercises  # noqa: B018 - refuses what is none
+        self.tasks  # noqa: B018 - refuses what is none
 
     @cached_property
-    def exercises(self) -> tuple[TrainTask, ...]:
+    def tasks(self) -> tuple[TrainTask, ...]:
         """The parts of the mixture."""
         return parse_mixture(self.mixture)
 
@@ -123,50 +123,50 @@ class TrainingSettings(TrainConfig):
         return TrainingReward(**self.reward_settings)
 
     @property
-    def worlds_of_exercises(self) -> tuple[int, ...]:
+    def worlds_per_task(self) -> tuple[int, ...]:
         """Number of worlds of each part of the mixture."""
-        share = (self.num_envs or ALGORITHMS[self.algorithm].num_envs) / max(len(self.exercises), 1)
-        return tuple(max(round(share / exercise.num_robots), 1) for exercise in self.exercises)
+        share = (self.num_envs or ALGORITHMS[self.algorithm].num_envs) / max(len(self.tasks), 1)
+        return tuple(max(round(share / task.num_robots), 1) for task in self.tasks)
 
     @property
     def batch(self) -> int:
         """Robots that act at once."""
         if self.mixture:
-            return sum(worlds * part.num_robots for worlds, part in zip(self.worlds_of_exercises, self.exercises))
+            return sum(worlds * part.num_robots for worlds, part in zip(self.worlds_per_task, self.tasks))
         sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
         return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
 
-    def parts(self, lesson: Stage) -> list[tuple[TrainTask, list[int | None], str | None]]:
+    def parts(self, stage: Stage) -> list[tuple[TrainTask, list[int | None], str | None]]:
         """Return the tasks of a stage, with the observed robots of each of their worlds and the robots' model."""
         if self.mixture:
-            return [(*part, self.model) for part in gather_parts(self.exercises, self.worlds_of_exercises)]
-        exercise = self.exercise(lesson.scenario, lesson.num_robots)
-        return [(exercise, [None] * (self.batch // lesson.num_robots), self.model_in(lesson.scenario))]
+            return [(*part, self.model) for part in gather_parts(self.tasks, self.worlds_per_task)]
+        task = self.task(stage.scenario, stage.num_robots)
+        return [(task, [None] * (self.batch // stage.num_robots), self.model_in(stage.scenario))]
 
     def worlds(
-        self, lesson: Stage, number: int = 0, done: int = 0, drawn: Drawn | None = None
+        self, stage: Stage, number: int = 0, done: int = 0, drawn: Drawn | None = None
     ) -> RobotVecEnv | MixedVecEnv:
-        """Worlds for a lesson.
+        """Worlds for a stage.
 
         Args:
-            lesson: Stage of the training.
-            number: Of the lesson.
-            done: Robot-steps in the lessons before.
-            drawn: Instances of earlier lessons, from which those that are used again are taken; others are left out,
+            stage: Stage of the training.
+            number: Of the stage.
+            done: Robot-steps in the stages before.
+            drawn: Instances of earlier stages, from which those that are used again are taken; others are left out,
                 and new ones added when they are drawn.
         """
         seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
-        for part, (exercise, sights, model) in enumerate(self.parts(lesson)):
-            count = len(sights)
+        for part, (task, max_observed, model) in enumerate(self.parts(stage)):
+            count = len(max_observed)
             size = min(_INSTANCES, 2 * count)
-            own_steps = done * count * exercise.num_robots // self.batch
-            first = own_steps // _STEPS_PER_INSTANCE if self.ways else number * size
+            own_steps = done * count * task.num_robots // self.batch
+            first = own_steps // _STEPS_PER_INSTANCE if self.shortest_paths else number * size
             seeds = [derived_seed(self.seed, Stream.TRAINING_INSTANCES, part, first + index) for index in range(size)]
-            key = part, exercise.scenario, exercise.num_robots
+            key = part, task.scenario, task.num_robots
             drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
-            instances = Instances(partial(exercise.problem, model=model), seeds, drawn[key])
+            instances = Instances(partial(task.problem, model=model), seeds, drawn[key])
             own_seed = derived_seed(seed, Stream.TRAINING_WORLDS, part)
-            parts.append(exercise.worlds(sights, own_seed, instances, model, **self._options))
+            parts.append(task.worlds(max_observed, own_seed, instances, model, **self._options))
         return MixedVecEnv(parts) if self.mixture else parts[0]
 
     def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
@@ -178,13 +178,13 @@ class TrainingSettings(TrainConfig):
         options = {**self._options, **options}
         if not self.mixture:
             return super().validation(**options)
-        count = -(-self.validation_worlds // len(self.exercises))
-        return MixedVecEnv([part.validation(count, VALIDATION_SEED, self.model, **options) for part in self.exercises])
+        count = -(-self.validation_worlds // len(self.tasks))
+        return MixedVecEnv([part.validation(count, VALIDATION_SEED, self.model, **options) for part in self.tasks])
 
     @property
     def _options(self) -> dict[str, Any]:
         """Options of the environments."""
-        return {"observed_robots": self.observed_robots, "reward": self.reward, "ways": self.ways}
+        return {"observed_robots": self.observed_robots, "reward": self.reward, "shortest_paths": self.shortest_paths}
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ class TrainingResult:
 
     Attributes:
         network: The policy with the best validation.
-        curve: One evaluation per lesson.
+        curve: One evaluation per stage.
         policy_path: Path of the policy.
     """
 
@@ -222,7 +222,7 @@ def train(
         OSError: If the folder cannot be used.
     """
     run = _TrainingRun(settings, Path(out), progress or (lambda what, done, total: None), command)
-    for index in range(len(run.evaluations), len(run.lessons)):
+    for index in range(len(run.evaluations), len(run.stages)):
         run.learn(index)
     return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)
 
@@ -234,13 +234,13 @@ class _TrainingRun:
         self.settings, self._out, self._progress, self._command = settings, out, progress, command
         self._algorithm: Algorithm = ALGORITHMS[settings.algorithm]
         unit = settings.batch * self._algorithm.steps_per_update
-        self.lessons = make_lessons(
-            settings.num_robots, settings.scenario, settings.steps, unit, settings.lessons, settings.curriculum
+        self.stages = make_stages(
+            settings.num_robots, settings.scenario, settings.steps, unit, settings.stages, settings.curriculum
         )
         if settings.mixture:
-            largest = max(exercise.num_robots for exercise in settings.exercises)
-            self.lessons = tuple(Stage(largest, MIXTURE, lesson.steps) for lesson in self.lessons)
-        self._total = sum(lesson.steps for lesson in self.lessons)
+            largest = max(task.num_robots for task in settings.tasks)
+            self.stages = tuple(Stage(largest, MIXTURE, stage.steps) for stage in self.stages)
+        self._total = sum(stage.steps for stage in self.stages)
         self._model: BaseAlgorithm | None = None
         self._drawn: Drawn = {}
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
@@ -258,18 +258,18 @@ class _TrainingRun:
                 f"start_from is {path}, which sees the world from another frame ({network.features.frame}) than is "
                 f"trained for ({wanted}); give a policy that was trained for robots of this model"
             )
-        if network.header.ways and not self.settings.ways:
+        if network.header.shortest_paths and not self.settings.shortest_paths:
             raise ValueError(
-                f"start_from is {path}, whose robots look along their shortest free ways; give --ways or another policy"
+                f"start_from is {path}, whose robots look along their shortest paths; give --shortest-paths"
             )
         return network
 
     def learn(self, index: int) -> None:
-        """One lesson, its evaluation and its checkpoint."""
-        begin, lesson, settings = time.perf_counter(), self.lessons[index], self.settings
-        done = sum(earlier.steps for earlier in self.lessons[:index])
-        self._progress(_describe(lesson, self.evaluations), done, self._total)
-        robots = settings.worlds(lesson, index, done, self._drawn)
+        """One stage, its evaluation and its checkpoint."""
+        begin, stage, settings = time.perf_counter(), self.stages[index], self.settings
+        done = sum(earlier.steps for earlier in self.stages[:index])
+        self._progress(_describe(stage, self.evaluations), done, self._total)
+        robots = settings.worlds(stage, index, done, self._drawn)
         making = time.perf_counter() - begin
         normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
         if settings.network == "sets":
@@ -277,23 +277,23 @@ class _TrainingRun:
         model = self._model = self._restored(normalized)
         self._algorithm.prepare(model, robots, self._training_seed(index + 1))
         self._algorithm.set_learning_rate(model, 1 - done / self._total, settings.learning_rate)
-        watch = _Watch(lambda steps: self._progress(_describe(lesson, self.evaluations), done + steps, self._total))
-        model.learn(lesson.steps, callback=watch, reset_num_timesteps=False)
+        watch = _Watch(lambda steps: self._progress(_describe(stage, self.evaluations), done + steps, self._total))
+        model.learn(stage.steps, callback=watch, reset_num_timesteps=False)
         seconds = time.perf_counter() - begin
         before = 0.0 if self._start is None else self._start.training_time or 0.0
         header = self.settings.header(
-            self.settings.algorithm, self._validation, command=self._command, lesson=index + 1,
+            self.settings.algorithm, self._validation, command=self._command, stage=index + 1,
             training_time=round(before + seconds + sum(earlier.seconds for earlier in self.evaluations), 1),
         )  # fmt: skip
         network = network_of(header, model, normalized)
         outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
-            done + lesson.steps, lesson.num_robots, lesson.scenario, outcome.success_rate, outcome.travel_time,
+            done + stage.steps, stage.num_robots, stage.scenario, outcome.success_rate, outcome.travel_time,
             seconds, (making + robots.seconds) / seconds, parts=outcome.parts if settings.mixture else None,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.keep_best(network, self.evaluations)
-        # The checkpoint last: what a lesson that was broken off has written is written again.
+        # The checkpoint last: what a stage that was broken off has written is written again.
         write_curve(self._out, self.evaluations)
         self._checkpoint = self.checkpoints.save(index, model, normalized, self.evaluations)
         robots.close()
@@ -339,6 +339,6 @@ class _Watch(BaseCallback):
         self._report(self.num_timesteps - self._first)
 
 
-def _describe(lesson: Stage, evaluations: list[Evaluation]) -> str:
+def _describe(stage: Stage, evaluations: list[Evaluation]) -> str:
     last = f"; success {evaluations[-1].success_rate:.0%}" if evaluations else ""
-    return f"{lesson.scenario}, {lesson.num_robots} robots{last}"
+    return f"{stage.scenario}, {stage.num_robots} robots{last}"

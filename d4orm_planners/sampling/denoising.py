@@ -15,7 +15,7 @@ from d4orm_planners.engine.sampling_types import DenoisingStep
 __all__ = ["DenoisingFilm"]
 
 POINTS = 26
-"""Points of a way that are kept."""
+"""Points of a path that are kept."""
 
 
 @dataclass(frozen=True)

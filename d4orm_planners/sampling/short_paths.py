@@ -41,7 +41,7 @@ def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
             return task
     slack = SLACK + SLACK_GROWTH * search.iteration
     horizon = min(problem.horizon, math.ceil(slack * float(drive_times(problem, lengths).max()) / problem.dt))
-    part = problem.resumed_at(problem.start, problem.goal, horizon=horizon)
+    part = problem.with_state(problem.start, problem.goal, horizon=horizon)
     return replace(task, problem=part, base=np.ascontiguousarray(task.base[:horizon]), reference_distance=reference)
 
 

@@ -25,7 +25,7 @@ from d4orm_planners.tracking.routes import Routes
 BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""
 RESERVE = 0.8
-"""Share of the way to where it must stop that a robot plans to stop in."""
+"""Share of the path to where it must stop that a robot plans to stop in."""
 BEYOND = 4.0
 """Distance beyond its goal that a robot plans to drive if stopped by arriving, in lengths of a stop from full speed."""
 SLOWEST = 0.1
@@ -144,8 +144,8 @@ def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: f
     after = before = speed
     for i in range(arcs.shape[0] - 1, -1, -1):
         if i + 1 < arcs.shape[0]:
-            way = arcs[i + 1] - arcs[i]
-            after = min(np.sqrt(after * after + 2 * braking * way), before + way / (2 * dt))
+            distance = arcs[i + 1] - arcs[i]
+            after = min(np.sqrt(after * after + 2 * braking * distance), before + distance / (2 * dt))
         after = before = min(min(after, corner[i]), speed)
         paces[i] = max(after, SLOWEST * speed)
 

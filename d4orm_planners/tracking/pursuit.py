@@ -38,7 +38,7 @@ CIRCLES = 0.8
 REACHED, COINCIDING = 2 / 15, 1 / 15
 """Distance from which on a robot has come to a point, and up to which points of a route are taken for one."""
 FACING, CREEP = np.float32(0.8), np.float32(0.01)
-"""Cosine of the angle between heading and way from which on a robot drives, and share of its speed before that."""
+"""Cosine of the angle between heading and path from which on a robot drives, and share of its speed before that."""
 UNDER_WAY = np.float32(0.05)
 """Share of its speed from which on a robot keeps its gear for longer, lest it change it all the time."""
 BEHIND = np.float32(0.5)
@@ -88,7 +88,7 @@ def point_ahead(
     at: int,
     last: int,
     stop: float,
-    sight: tuple[float, float],
+    lookahead: tuple[float, float],
     place: Floats,
     size: float,
 ) -> int:
@@ -103,7 +103,7 @@ def point_ahead(
         at: The point that it is at.
         last: The last point that it may head for.
         stop: Length of the route from which on it heads for no further point [m].
-        sight: Its least look-ahead [m], and the time step [s].
+        lookahead: Its least look-ahead [m], and the time step [s].
         place: ``(3,)`` where it really is [m].
         size: The radius of the largest robot [m].
     """
@@ -112,7 +112,10 @@ def point_ahead(
         target < last
         and route.arcs[target] < stop
         and (
-            (route.arcs[target] - route.arcs[at] < sight[0] + 1.5 * sight[1] * slowest and route.bends[target] > 0.0)
+            (
+                route.arcs[target] - route.arcs[at] < lookahead[0] + 1.5 * lookahead[1] * slowest
+                and route.bends[target] > 0.0
+            )
             or square_to(route.points, target, place) < reached * reached
         )
     ):

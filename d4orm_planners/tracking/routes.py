@@ -9,7 +9,7 @@ from d4orm_env.core.arrays import Floats, IntArray
 
 
 class Route(NamedTuple):
-    """One robot's way as a row of points.
+    """One robot's path as a row of points.
 
     Attributes:
         points: ``(P, 3)`` float64 [m].
@@ -54,7 +54,7 @@ class Routes(NamedTuple):
 
 
 class Corners(NamedTuple):
-    """Corners of ways, one robot's after another's, each from its start on.
+    """Corners of paths, one robot's after another's, each from its start on.
 
     Attributes:
         places: ``(C, 3)`` float64 [m].

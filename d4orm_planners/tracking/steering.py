@@ -46,13 +46,13 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
     return velocities
 
 
-def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
+def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
     """Return where robots without a plan should head: along their shortest paths, as far off as those are long.
 
-    It is their goals where the world is empty, for robots with new goals, and for those without a way.
+    It is their goals where the world is empty, for robots with new goals, and for those without a path.
 
     Args:
-        problem: The world, and the first goals, to which the ways lead.
+        problem: The world, and the first goals, to which the paths lead.
         places: ``(K, d)`` where the robots are [m].
         goals: ``(K, d)`` present goals [m].
 
@@ -63,16 +63,16 @@ def goals_along_ways(problem: Problem, places: FloatArray | Floats, goals: Float
         return goals
     direction, length = problem.shortest_paths.ahead(places)
     first = (goals == problem.goal).all(axis=1)
-    ahead, known = along_ways(direction, np.where(first, length, np.inf))
+    ahead, known = along_paths(direction, np.where(first, length, np.inf))
     return np.where(known[:, None], places + ahead, goals).astype(np.float32)
 
 
-def along_ways(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
+def along_paths(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
     """Vectors along paths ``(N, d)``, as long as they are, and ``(N,)`` robots with one: neither at the goal nor lost.
 
     Args:
         direction: ``(N, d)`` unit vectors, zero at a goal.
-        length: ``(N,)`` [m], infinite without a way.
+        length: ``(N,)`` [m], infinite without a path.
     """
     direction, length = np.asarray(direction, np.float64), np.asarray(length, np.float64)
     known = (direction != 0).any(axis=1) & np.isfinite(length)
@@ -141,7 +141,7 @@ def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Ways that robots could take, each robot alone: ``R`` robots, ``V`` ways each.
+    """Paths that robots could take, each robot alone: ``R`` robots, ``V`` paths each.
 
     Attributes:
         controls: ``(H, R, V, m)``, zero after arrival.
@@ -177,7 +177,7 @@ def drives(
     """
     # Here, because importing numba takes long.
     from d4orm_env.engine.threads import Threads, available_cores
-    from d4orm_planners.tracking.straight_drives import DriveOutputs, DriveRules, drive_kernel
+    from d4orm_planners.tracking.straight_drives import DriveInputs, DriveRules, drive_kernel
 
     switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
     num_steps, dimension = problem.horizon, problem.dimension
@@ -189,11 +189,11 @@ def drives(
     near = NEAR_VIA * problem.team.largest_radius
     rules = DriveRules(arrays.time_step, docking, arrays.docks, np.float32(near * near))
     given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
-    ways = DriveOutputs(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
+    inputs = DriveInputs(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
     threads = Threads(available_cores())
     for model, robots in by_model(problem):
         kernel, index = drive_kernel(model.name), np.array(robots)
-        threads.over(len(index), lambda part: kernel(rules, ways, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
+        threads.over(len(index), lambda part: kernel(rules, inputs, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
     return Rollouts(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
 
 
@@ -206,7 +206,7 @@ def prepare_drives(problem: Problem) -> None:
 
 
 def straight_drives(problem: Problem) -> Rollouts:
-    """Drive from the start straight to the goal: a single way for every robot."""
+    """Drive from the start straight to the goal: a single path for every robot."""
     return drives(problem, *standing(problem), np.zeros((problem.num_robots, 1), int))
 
 

@@ -1,4 +1,4 @@
-"""Robots driving to points on their own, compiled with numba: whole ways, many at a time."""
+"""Robots driving to points on their own, compiled with numba: whole paths, many at a time."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ class RobotSpec(NamedTuple):
         return cls(arrays.time_step, docking, arrays.docks, arrays.limits[robot], goal, start)
 
 
-class DriveOutputs(NamedTuple):
-    """``V`` ways of each of ``R`` robots: as given at first, then straight by points to the goal.
+class DriveInputs(NamedTuple):
+    """``V`` paths of each of ``R`` robots: as given at first, then straight by points to the goal.
 
     Attributes:
         limits: ``(R, L)`` of the robots.
         goals: ``(R, d)``.
         states: ``(R, H+1, n)`` as given.
         controls: ``(R, H, m)`` as given, inside the limits, zero for docked robots.
-        switch: ``(R, V)`` time step from which on a way is driven.
+        switch: ``(R, V)`` time step from which on a path is driven.
         vias: ``(R, V, P, d)`` points to come near to one after the other, before the goal.
     """
 
@@ -83,7 +83,7 @@ class DriveOutputs(NamedTuple):
 
 
 @cache
-def drive_kernel(name: str) -> Kernel[[DriveRules, DriveOutputs, IntArray, FloatArray, FloatArray, BoolArray], None]:
+def drive_kernel(name: str) -> Kernel[[DriveRules, DriveInputs, IntArray, FloatArray, FloatArray, BoolArray], None]:
     """The compiled drives of robots of the model with this name, each as if alone.
 
     The kernel fills, for robots of these numbers, controls ``u`` ``(R, V, H, m)``, left alone once docked,
@@ -97,44 +97,44 @@ def drive_kernel(name: str) -> Kernel[[DriveRules, DriveOutputs, IntArray, Float
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive(
-        rules: DriveRules, ways: DriveOutputs, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
+        rules: DriveRules, given: DriveInputs, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
     ) -> None:
         dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
-        num_ways, horizon, num_vias = ways.switch.shape[1], ways.controls.shape[1], ways.vias.shape[2]
+        num_paths, horizon, num_vias = given.switch.shape[1], given.controls.shape[1], given.vias.shape[2]
         for r in robots:
-            own_limits, goal = to_fixed_tuple(ways.limits[r], num_limits), to_fixed_tuple(ways.goals[r], d)
-            for way in range(num_ways):
-                first, at_goal, passed = ways.switch[r, way], False, 0
+            own_limits, goal = to_fixed_tuple(given.limits[r], num_limits), to_fixed_tuple(given.goals[r], d)
+            for v in range(num_paths):
+                first, at_goal, passed = given.switch[r, v], False, 0
                 for t in range(first + 1):
                     for i in range(n):
-                        x[r, way, t, i] = ways.states[r, t, i]
+                        x[r, v, t, i] = given.states[r, t, i]
                 for t in range(first):
                     for i in range(m):
-                        u[r, way, t, i] = ways.controls[r, t, i]
-                state = to_fixed_tuple(ways.states[r, first], n)
+                        u[r, v, t, i] = given.controls[r, t, i]
+                state = to_fixed_tuple(given.states[r, first], n)
                 if first > 0:
-                    control = to_fixed_tuple(ways.controls[r, first - 1], m)
+                    control = to_fixed_tuple(given.controls[r, first - 1], m)
                     state, _, at_goal = dock(False, state, control, own_limits, goal, docking)
                 for t in range(first, horizon):
                     if transition.stands(at_goal, rules.docks):
                         for i in range(n):
-                            x[r, way, t + 1 :, i] = state[i]
+                            x[r, v, t + 1 :, i] = state[i]
                         break
                     aim = goal
                     while passed < num_vias:
-                        aim = to_fixed_tuple(ways.vias[r, way, passed], d)
+                        aim = to_fixed_tuple(given.vias[r, v, passed], d)
                         if not squared_gap(state, aim) < rules.near2:
                             break
                         passed, aim = passed + 1, goal
                     wanted = track(state, approach(state, aim, own_limits, h, OPS), own_limits, h, OPS)
                     control = limit_control(wanted, own_limits, OPS)
                     for i in range(m):
-                        u[r, way, t, i] = control[i]
+                        u[r, v, t, i] = control[i]
                     state = move(False, state, control, own_limits, h)
                     state, _, at_goal = dock(False, state, control, own_limits, goal, docking)
                     for i in range(n):
-                        x[r, way, t + 1, i] = state[i]
-                arrived[r, way] = at_goal
+                        x[r, v, t + 1, i] = state[i]
+                arrived[r, v] = at_goal
 
     return drive

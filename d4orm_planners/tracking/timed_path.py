@@ -37,7 +37,7 @@ class Timed(NamedTuple):
         corners: ``(C,)`` float64 length of the route up to each corner [m].
         departs: ``(C,)`` float64 step at which it may set out for each corner from the one before.
         arrives: ``(C,)`` float64 step at which it should be there.
-        sight: Least look-ahead of the robot [m].
+        lookahead: Least look-ahead of the robot [m].
         beyond: Distance beyond its goal that it may plan to drive, if that stops it [m].
         size: The radius of the largest robot [m].
     """
@@ -49,7 +49,7 @@ class Timed(NamedTuple):
     corners: Floats
     departs: Floats
     arrives: Floats
-    sight: float
+    lookahead: float
     beyond: np.float32
     size: float
 
@@ -109,7 +109,7 @@ def timed_kernel(name: str) -> Kernel[[RobotSpec, Timed, bool, FloatArray, Float
                 corner += 1
             stop = stop_before(route, step, at, corner, own[0] * dt[0])
             pace = pace_to(route, step, at, corner, stop, dt[0])
-            target = point_ahead(route, route.paces, at, last, stop, (route.sight, dt[0]), here, route.size)
+            target = point_ahead(route, route.paces, at, last, stop, (route.lookahead, dt[0]), here, route.size)
             if route.arcs[target] > stop + near:
                 target = at
             room = RESERVE * max(stop - route.arcs[at], 0.0)
@@ -169,12 +169,14 @@ def drive_by_clock(
     paces = path_drives.paces_along(problem, robot, arcs, route.bends, share)
     controls = np.zeros((steps, problem.control_size), np.float32)
     places = np.empty((steps + 1, 3))
-    sight, beyond, size = (
+    lookahead, beyond, size = (
         pursuit.lookaheads(problem)[robot],
         path_drives.beyond_goal(problem),
         problem.team.largest_radius,
     )
-    timed = Timed(route.points, arcs, paces, route.bends, arcs[at], departs, arrives, sight, np.float32(beyond), size)
+    timed = Timed(
+        route.points, arcs, paces, route.bends, arcs[at], departs, arrives, lookahead, np.float32(beyond), size
+    )
     drive = timed_kernel(problem.team.models[robot])
     arrival = drive(RobotSpec.of(problem, robot), timed, backs_up, controls, places)
     return controls, places, int(arrival)

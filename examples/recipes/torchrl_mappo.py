@@ -76,7 +76,7 @@ def collect(env: TorchRLNavigation, actor: ProbabilisticActor, state: Any) -> tu
     return data, state
 
 
-def judged(data: Any, advantages: GAE) -> Any:
+def with_advantages(data: Any, advantages: GAE) -> Any:
     """The steps with advantages of mean zero and variance one over the robots that acted, zero for others."""
     with torch.no_grad():
         advantages(data)
@@ -117,7 +117,7 @@ def main() -> None:
             ended = data["next", "done"][..., 0]
             successes += data["next", "robots", "info", "success"][ended][:, 0, 0].tolist()
             done += data["next", *REWARD].numel()
-            batch = judged(data, advantages)
+            batch = with_advantages(data, advantages)
             for _ in range(EPOCHS):
                 for rows_of in torch.randperm(len(batch)).chunk(MINIBATCHES):
                     terms = loss(batch[rows_of])

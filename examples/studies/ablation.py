@@ -43,7 +43,7 @@ MEASURES: dict[str, dict[str, Any]] = {
     "expect_losses": {"expect_losses": False},
     "stalls": {"stalls": False},
     "last_resort": {"last_resort": False},
-    "drive_home": {"drive_home": False},
+    "direct_final_approach": {"direct_final_approach": False},
 }
 MEANT_FOR = {
     "delay of 2 steps": "delay",
@@ -52,7 +52,7 @@ MEANT_FOR = {
     "dropout 30%": "expect_losses",
     "one robot stalls": "stalls",
     "pushes 0.2/s, 0.3 m/s": "last_resort",
-    NOTHING: "drive_home",
+    NOTHING: "direct_final_approach",
 }
 """Measure that is tried under each disturbance."""
 SETTINGS: Mapping[str, Mapping[str, Any]] = {

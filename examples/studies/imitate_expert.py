@@ -30,7 +30,7 @@ from d4orm_planners.rl.imitation import ImitationSettings, imitate
 from d4orm_planners.rl.training import TrainingSettings, train
 
 IMITATION = ImitationSettings(num_robots=4)
-REINFORCEMENT = TrainingSettings(num_robots=4, steps=1_000_000, lessons=10)
+REINFORCEMENT = TrainingSettings(num_robots=4, steps=1_000_000, stages=10)
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -39,7 +39,7 @@ def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, Any]]:
     imitation, reinforcement, rows = IMITATION, REINFORCEMENT, []
     if quick:
         imitation = replace(imitation, num_robots=2, episodes=20, rounds=2)
-        reinforcement = replace(reinforcement, num_robots=2, steps=100_000, lessons=2)
+        reinforcement = replace(reinforcement, num_robots=2, steps=100_000, stages=2)
     for seed in range(seeds):
         learned = imitate(replace(imitation, seed=seed), out / f"imitation-{seed}", progress=report)
         rows += [_row("cloning" if not index else "DAgger", seed, point) for index, point in enumerate(learned.curve)]

@@ -6,7 +6,7 @@
 
 The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, a robot
 would accelerate to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
-pass through. It would drive straight, or among walls along the shortest free way, wherever it was heading before.
+pass through. It would drive straight, or among walls along the shortest path, wherever it was heading before.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ def least_times(problem: Problem, joint: JointState) -> np.ndarray:
     velocity = joint.states[:, d : 2 * d]
     towards = (velocity * to_goal).sum(axis=1) / np.maximum(distance, 1e-9)
     if problem.world.num_obstacles:
-        distance = problem.resumed_at(joint.states, joint.goals).shortest_paths.length
+        distance = problem.with_state(joint.states, joint.goals).shortest_paths.length
         towards = np.linalg.norm(velocity, axis=1)
-    way = np.maximum(distance - problem.goal_radius, 0)
+    distance = np.maximum(distance - problem.goal_radius, 0)
     to_top_speed = (speed**2 - towards**2) / (2 * acceleration)
-    accelerating = (np.sqrt(towards**2 + 2 * acceleration * np.minimum(way, to_top_speed)) - towards) / acceleration
-    return accelerating + np.maximum(way - to_top_speed, 0) / speed
+    reached = np.sqrt(towards**2 + 2 * acceleration * np.minimum(distance, to_top_speed))
+    return (reached - towards) / acceleration + np.maximum(distance - to_top_speed, 0) / speed
 
 
 class Film:

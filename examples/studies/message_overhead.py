@@ -67,9 +67,9 @@ def measure(robots: int, ends: tuple[Transport, Transport], repetitions: int) ->
         "send": seconds(send, repetitions),
         "read": seconds(lambda: decode(data, problem, 2), repetitions),
     }
-    judge = seconds(lambda: evaluate_controls(engine, problem, plan.controls), repetitions)
+    evaluation = seconds(lambda: evaluate_controls(engine, problem, plan.controls), repetitions)
     milliseconds = {
-        name: 1e3 * value for name, value in {**parts, "overhead": sum(parts.values()), "judge": judge}.items()
+        name: 1e3 * value for name, value in {**parts, "overhead": sum(parts.values()), "judge": evaluation}.items()
     }
     return {"bytes": len(data), **milliseconds}
 

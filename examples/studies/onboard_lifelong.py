@@ -61,7 +61,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--speed", type=float, default=1.0, help="simulated seconds per second at most")
     parser.add_argument("--samples", type=count, default=576, help="of all robots together")
-    parser.add_argument("--patience", type=float, default=10.0, help="seconds after which a silent robot is given up")
+    parser.add_argument("--timeout", type=float, default=10.0, help="seconds after which a silent robot is given up")
     parser.add_argument("--kill", type=kill_order, action="append", default=[], metavar="ROBOT:SECONDS")
     parser.add_argument("--film", type=float, default=30.0, help="seconds of the animation")
     arguments = parser.parse_args()
@@ -83,7 +83,7 @@ def main() -> int:
         iterations=2,
         think=7,
         agree=3,
-        patience=arguments.patience,
+        timeout=arguments.timeout,
         silence=30.0,
         namespace=f"onboard-{secrets.token_hex(4)}",
         world=world_endpoint,

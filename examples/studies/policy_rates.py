@@ -88,7 +88,7 @@ def measure(files: Sequence[str], seeds: int, observing: Sequence[int]) -> Rows:
             for observed in observing if case.num_robots > min(observing) else observing[:1]:
                 worlds = RobotVecEnv(
                     seeds, case.num_robots, case.scenario, seed=FIRST_SEED, model=model, observed_robots=observed,
-                    ways=bool(network.header.ways), **case.own,
+                    shortest_paths=bool(network.header.shortest_paths), **case.own,
                 )  # fmt: skip
                 ends = run_worlds(network, worlds, FIRST_SEED)
                 worlds.close()

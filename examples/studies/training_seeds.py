@@ -27,13 +27,15 @@ from d4orm_planners.rl.curve import Evaluation
 from d4orm_planners.rl.training import TrainingSettings, train
 
 CROWDS = TrainingSettings(
-    network="sets", mixture=("crowds",), observed_robots=8, num_envs=1536, steps=6_000_000, lessons=12,
+    network="sets", mixture=("crowds",), observed_robots=8, num_envs=1536, steps=6_000_000, stages=12,
     learning_rate=5e-4, validation_worlds=330,
 )  # fmt: skip
 LEARNERS: Mapping[str, TrainingSettings] = {
     "PPO, holonomic2d, crowds": replace(CROWDS, model="holonomic2d"),
     "PPO, differential_drive, crowds": replace(CROWDS, model="differential_drive"),
-    "PPO, holonomic2d, walls": replace(CROWDS, mixture=("walls",), ways=True, lessons=6, validation_worlds=210),
+    "PPO, holonomic2d, walls": replace(
+        CROWDS, mixture=("walls",), shortest_paths=True, stages=6, validation_worlds=210
+    ),
     "SAC, holonomic2d, crowds": TrainingSettings(
         algorithm="sac",
         network="sets",
@@ -41,20 +43,20 @@ LEARNERS: Mapping[str, TrainingSettings] = {
         observed_robots=6,
         num_envs=64,
         steps=1_500_000,
-        lessons=10,
+        stages=10,
         learner_settings={"gradient_steps": 12},
         validation_worlds=330,
     ),
     "SAC, holonomic2d, 4 random robots": TrainingSettings(
-        algorithm="sac", num_robots=4, steps=400_000, lessons=10, curriculum=True
+        algorithm="sac", num_robots=4, steps=400_000, stages=10, curriculum=True
     ),
 }
-QUICK = {"steps": 256, "lessons": 2, "validation_worlds": 2, "num_envs": 16}
+QUICK = {"steps": 256, "stages": 2, "validation_worlds": 2, "num_envs": 16}
 Rows = Sequence[Mapping[str, str]]
 
 
 def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, str]]:
-    """A row per learner, seed and lesson."""
+    """A row per learner, seed and stage."""
     rows = []
     for learner, settings in LEARNERS.items():
         for seed in range(seeds):
@@ -90,15 +92,15 @@ def by_learner(rows: Rows) -> dict[str, dict[int, list[Mapping[str, str]]]]:
 def summary(rows: Rows) -> list[dict[str, object]]:
     """A row per learner: what its seeds came to in the end, and what they took."""
     table: list[dict[str, object]] = []
-    for learner, lessons in by_learner(rows).items():
-        last, every = lessons[max(lessons)], [row for lesson in lessons.values() for row in lesson]
+    for learner, stages in by_learner(rows).items():
+        last, every = stages[max(stages)], [row for stage in stages.values() for row in stage]
         ends = [100 * float(row["success"]) for row in last]
         success, lower, upper = mean_interval(ends)
         minutes = sum(float(row["seconds"]) for row in every) / len(last) / 60
         row = {
             "learner": learner,
             "seeds": len(last),
-            "robot-steps": f"{max(lessons) / 1e6:.1f} million",
+            "robot-steps": f"{max(stages) / 1e6:.1f} million",
             "success in the end": f"{success:.0f}%",
             "95% interval": "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%",
             "least, most": f"{min(ends):.0f}%, {max(ends):.0f}%",
@@ -114,9 +116,9 @@ def draw(rows: Rows, path: Path) -> None:
     """Every seed thin, their mean thick, and its interval."""
     found = by_learner(rows)
     figure, axes = plt.subplots(1, len(found), figsize=(3.6 * len(found), 3), sharey=True, squeeze=False)
-    for axis, (learner, lessons), colour in zip(axes[0], found.items(), COLOURS.values(), strict=False):
-        steps = np.array(sorted(lessons)) / 1e6
-        seeds = np.array([[100 * float(row["success"]) for row in lessons[number]] for number in sorted(lessons)])
+    for axis, (learner, stages), colour in zip(axes[0], found.items(), COLOURS.values(), strict=False):
+        steps = np.array(sorted(stages)) / 1e6
+        seeds = np.array([[100 * float(row["success"]) for row in stages[number]] for number in sorted(stages)])
         ends = [mean_interval(values) for values in seeds.tolist()]
         axis.plot(steps, seeds, color=colour, linewidth=0.7, alpha=0.6)
         axis.plot(steps, seeds.mean(axis=1), color=colour, linewidth=2)

@@ -28,8 +28,8 @@ from d4orm_planners.rl.training import TrainingSettings, train
 
 PPO, SAC = (LEARNERS[f"{name}, holonomic2d, crowds"] for name in ("PPO", "SAC"))
 TRAININGS: Mapping[str, TrainingSettings] = {
-    "ppo": replace(PPO, steps=1_000_000, lessons=1),
-    "sac": replace(SAC, steps=150_000, lessons=1),
+    "ppo": replace(PPO, steps=1_000_000, stages=1),
+    "sac": replace(SAC, steps=150_000, stages=1),
 }
 """The first look of each."""
 LONGER = (1, 2)
@@ -63,7 +63,7 @@ def tune(learner: str, number: int, quick: bool, out: Path) -> list[dict[str, An
     """A row per training."""
     training, chosen, rows = TRAININGS[learner], dict(enumerate(candidates(learner, number))), []
     if quick:
-        training = replace(training, **{**QUICK, "lessons": 1}, mixture=("random 2", "circle 2"))
+        training = replace(training, **{**QUICK, "stages": 1}, mixture=("random 2", "circle 2"))
     for turn, longer in enumerate(LONGER):
         found = {}
         for index, settings in chosen.items():

@@ -1,4 +1,4 @@
-"""A learned policy's first guess: what the team does by it is where the search of a planner begins.
+"""Warm start by a learned policy: what the team does by it is where the search of a planner begins.
 
     python -m examples.studies.warm_start --seeds 20
 
@@ -39,7 +39,7 @@ def solve(planner: str, problem: Problem, seed: int, guess: str | None) -> dict[
 
 def drive(problem: Problem, seed: int, guess: str | None) -> dict[str, Any]:
     """Drive under D4orm-C2F, whose first coarse plan begins with an episode of a policy if there is one."""
-    policy: Any = make_policy("d4orm-c2f", refine="sync", first_guess=guess)
+    policy: Any = make_policy("d4orm-c2f", refine="sync", warm_start=guess)
     metrics = run_episode(navigation_v0.parallel_env(problem=problem), policy, seed=seed).metrics
     travel = float(metrics["travel_time"])
     return {"solved": bool(metrics["success"]), "iterations": None, "seconds": policy.coarse_time, "travel": travel}

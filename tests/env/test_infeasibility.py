@@ -41,7 +41,7 @@ def beside_wall(gap: float, speed: float, model: str = "holonomic2d") -> Problem
 def test_every_planner_ends_at_once_where_nothing_is_a_solution(name: str, tmp_path: Path) -> None:
     plan = cheap_planner(name).solve(sealed_problem(), callback=lambda record: pytest.fail("there is no iteration"))
     assert (plan.status, plan.solved, plan.iterations, plan.history) == ("infeasible", False, 0, ())
-    assert plan.failures == {"robot_0": "has no free way to its goal: walls are closed all round the one or the other"}
+    assert plan.failures == {"robot_0": "has no free path to its goal: walls are closed all round the one or the other"}
     plan.save(tmp_path / "plan.npz")
     loaded = Plan.load(tmp_path / "plan.npz")
     assert (loaded.status, loaded.failures) == ("infeasible", plan.failures)
@@ -53,7 +53,7 @@ def test_a_file_is_told_of_when_it_is_read(tmp_path: Path) -> None:
         warnings.simplefilter("error")
         load_problem(tmp_path / "scene.yaml")  # too small a proof for so little room
     save_problem(sealed_problem(), tmp_path / "scene.yaml")
-    with pytest.warns(UserWarning, match="scene.yaml: nothing solves this problem: robot_0 has no free way"):
+    with pytest.warns(UserWarning, match="scene.yaml: nothing solves this problem: robot_0 has no free path"):
         assert load_problem(tmp_path / "scene.yaml") == sealed_problem()
 
 
@@ -73,9 +73,9 @@ def test_a_reason_that_proves_nothing_is_kept(name: str) -> None:
     planner = make_planner(name, engine="cpu", **{key: value for key, value in few.items() if key in known})
     plan = planner.solve(walled_in_problem(), max_iterations=2)
     assert (plan.status, plan.iterations) == ("iteration_limit", 2)
-    assert "robot_0 has no way from start to goal that is 0.2 m clear of obstacles" in plan.history[0].note
+    assert "robot_0 has no path from start to goal that is 0.2 m clear of obstacles" in plan.history[0].note
     assert plan.history[0].unreachable == (0,)
-    assert "has no way from start to goal that is 0.2 m clear of obstacles" in plan.failures["robot_0"]
+    assert "has no path from start to goal that is 0.2 m clear of obstacles" in plan.failures["robot_0"]
 
 
 def test_what_path_finding_knew_is_in_a_plans_file(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_the_command_line_says_what_is_proved(d4orm, tmp_path: Path, command: tu
     assert outcome.status == 1
     assert outcome.err.splitlines() == [
         "there is no solution",
-        "  robot_0 has no free way to its goal: walls are closed all round the one or the other",
+        "  robot_0 has no free path to its goal: walls are closed all round the one or the other",
     ]
 
 
@@ -113,7 +113,7 @@ def test_slow_robots_cannot_leap_over_the_margin() -> None:
     assert list(prove_infeasible(slow)) == [0]
 
 
-def test_a_way_round_the_wall_is_a_way() -> None:
+def test_a_path_round_the_wall_is_a_path() -> None:
     assert not prove_infeasible(passage(0.0, upper=2.0))
     outside = passage(0.0)
     assert not prove_infeasible(Problem(outside.team, outside.start, outside.goal, World(boxes=outside.world.boxes)))

@@ -92,7 +92,7 @@ def test_the_fastest_robots_stay_finite_over_the_longest_episodes(model: str) ->
     goal = start[:, : team.dimension] + 1
     problem = Problem(team, start, goal, dt=MAX_TIME_STEP, horizon=2)
     start[:, 0] = LARGEST * MAX_TIME_STEP * 1e6, -LARGEST * MAX_TIME_STEP * 1e6
-    env = JointNavigationEnv(problem=problem.resumed_at(start, goal))
+    env = JointNavigationEnv(problem=problem.with_state(start, goal))
     env.reset(seed=0)
     observation, reward, *_ = env.step(np.full(env.action_space.shape, MAX_ACTION))
     assert np.isfinite(observation).all()

@@ -286,7 +286,7 @@ class TestMapScenario:
         assert (problem.start[:, 0] > 6.6).all()
         assert (problem.goal[:, 0] > 6.6).all()
 
-    def test_ways_one_cell_wide_are_ways(self, tmp_path: Path) -> None:
+    def test_paths_one_cell_wide_are_paths(self, tmp_path: Path) -> None:
         blocked = np.ones((5, 9), int)
         blocked[1:4, 1:3] = blocked[1:4, 6:8] = blocked[2, 1:8] = 0
         path = written(tmp_path, text_of(blocked))

@@ -281,10 +281,10 @@ def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion() -> 
     model, robots = get_model("differential_drive"), np.arange(3)
     found = Integrated(model, robots, start, controls, problem.team, problem.dt)
     steps = slice(None)
-    np.testing.assert_allclose(found.way(steps, 12), exact.way(steps, 12), atol=1e-6)
+    np.testing.assert_allclose(found.displacement(steps, 12), exact.displacement(steps, 12), atol=1e-6)
     np.testing.assert_allclose(found.pace, exact.pace, atol=1e-9)
     # Its bound on the acceleration holds, and is not far off.
-    inner = np.diff(exact.way(steps, 40), n=2, axis=1) * (40 / problem.dt) ** 2
+    inner = np.diff(exact.displacement(steps, 40), n=2, axis=1) * (40 / problem.dt) ** 2
     acceleration = np.sqrt((inner**2).sum(axis=-1)).max(axis=1)
     assert (found.bend >= acceleration).all()
     assert (found.bend <= 2 * acceleration + 0.1).all()
@@ -301,7 +301,9 @@ def test_the_judge_integrates_all_steps_at_once_as_one_after_another(
     at_once = Integrated(MODELS[name], *arguments)
     monkeypatch.setattr(integrated, "CORRECTIONS", 0)
     one_by_one = Integrated(MODELS[name], *arguments)
-    np.testing.assert_allclose(at_once.way(slice(None), 5), one_by_one.way(slice(None), 5), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        at_once.displacement(slice(None), 5), one_by_one.displacement(slice(None), 5), rtol=0, atol=1e-9
+    )
     np.testing.assert_allclose(at_once.pace, one_by_one.pace, rtol=0, atol=1e-9)
 
 

@@ -148,14 +148,14 @@ def test_a_drive_keeps_to_its_circle() -> None:
 
 def test_a_drive_does_not_slide_sideways_and_slips_on_ice() -> None:
     problem = Problem(Team(("differential_drive",), max_acceleration=4.0), [[0, 0, 0, 0]], [[5.0, 5.0]])
-    ways = []
+    positions = []
     for friction in (0.8, 0.1):
         env = mujoco.parallel_env(problem=problem, physics=Physics(wheel_friction=friction))
         env.reset(seed=0)
         x, y, _, _ = driven(env, [0.0, 4.0], 5)
         assert y == pytest.approx(0, abs=1e-3)
-        ways.append(x)
-    assert ways[1] < 0.5 * ways[0]
+        positions.append(x)
+    assert positions[1] < 0.5 * positions[0]
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def unchecked(team: Team, start: Any, world: World) -> Problem:
     far = Problem(
         team, np.concatenate([apart, apart * 0], axis=1), apart, World(team.dimension), goal_radius=0.2, horizon=40
     )
-    return far.resumed_at(states, apart, world=world)
+    return far.with_state(states, apart, world=world)
 
 
 def near_each_other(positions: Any, reach: float) -> Any:
@@ -192,7 +192,7 @@ def test_verify_sees_how_near_a_way_comes_to_a_polygon(seed: int, corners: int) 
 
 
 def wall_problem(model: str = "holonomic2d") -> Problem:
-    """One robot, and across its straight way a slanted wall that leaves a gap at one side."""
+    """One robot, and across its straight path a slanted wall that leaves a gap at one side."""
     wall = [(-0.3, -2.0), (0.2, -2.1), (0.1, 0.4), (-0.2, 0.3)]
     start = np.zeros((1, 4), np.float32)
     start[0, 0] = -1.5

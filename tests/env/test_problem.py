@@ -237,7 +237,7 @@ def test_headings_of_many_turns_are_refused() -> None:
 
 def test_what_is_under_way_is_not_checked() -> None:
     problem = drive()
-    coarse = problem.resumed_at(problem.start, problem.goal, dt=2.0, horizon=5)
+    coarse = problem.with_state(problem.start, problem.goal, dt=2.0, horizon=5)
     assert (coarse.dt, coarse.horizon) == (2.0, 5)
 
 

@@ -48,8 +48,8 @@ def straight_drive(problem: Problem, arrival: float = 0.8) -> Trajectory:
     states[..., :d] = positions
     for k, model in enumerate(problem.team.robot_models):
         if model.heading_index is not None:
-            way = problem.goal[k] - problem.start[k, :2]
-            states[:, k, model.heading_index] = np.arctan2(way[1], way[0])
+            offset = problem.goal[k] - problem.start[k, :2]
+            states[:, k, model.heading_index] = np.arctan2(offset[1], offset[0])
     radius = np.asarray(problem.team.radius)
     gap = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1) - radius[:, None] - radius
     nearest = np.minimum((gap + 1e3 * np.eye(robots)).min(axis=-1), problem.world.clearance(positions) - radius)

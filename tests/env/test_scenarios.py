@@ -173,8 +173,8 @@ def test_four_obstacles_congest_the_centre() -> None:
     np.testing.assert_allclose(problem.world.circles[:, 2], 0.15)
     assert problem.replace(world=None) == make_problem("circle", num_robots=16)
     # A straight drive runs into an obstacle: the scenario is not the plain circle in disguise.
-    way = np.linspace(starts(problem)[0], problem.goal[0], 101)
-    assert problem.world.clearance(way).min() < 0
+    line = np.linspace(starts(problem)[0], problem.goal[0], 101)
+    assert problem.world.clearance(line).min() < 0
     assert make_problem("four_obstacles", model="holonomic3d").world.cylinders.shape == (4, 3)
 
 

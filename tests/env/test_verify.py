@@ -575,13 +575,13 @@ def test_long_steps_are_cut_finely_enough():
     radius = 2 / math.pi
     world = World(circles=[[0, radius, radius - 0.16]])
     problem = make(["differential_drive"], [(0, 0, 0, 1)], [(0, 0)], world=world, horizon=1)
-    # RK4 would not follow such a step; verify does, and resumed_at() does not ask.
-    problem = problem.resumed_at(problem.start, problem.goal, dt=4.0)
+    # RK4 would not follow such a step; verify does, and with_state() does not ask.
+    problem = problem.with_state(problem.start, problem.goal, dt=4.0)
     report = verify(problem, hold(problem, (math.pi / 2, 0)))
     assert report.ok
     assert report.min_clearance == pytest.approx(0.01, abs=CHORD)
     narrow = World(circles=[[0, radius, radius - 0.16]], lower=(-9, -9), upper=(radius + 0.14, 9))
-    tight = problem.resumed_at(problem.start, problem.goal, world=narrow)
+    tight = problem.with_state(problem.start, problem.goal, world=narrow)
     report = verify(tight, hold(tight, (math.pi / 2, 0)))
     assert kinds(report) == ["bounds contact"]
     assert report.violations[0].time == pytest.approx(1.0, abs=0.15)

@@ -1,4 +1,4 @@
-"""Scenarios with walls: everybody has a way that keeps clear of all who stand, at starts and at goals."""
+"""Scenarios with walls: everybody has a path that keeps clear of all who stand, at starts and at goals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from d4orm_env.scenarios import make_problem
 
 
 def lattice_step(problem: Problem) -> float:
-    """A fraction of the step of the lattice on which the places were drawn, so that its ways are found again [m]."""
+    """A fraction of the step of the lattice on which the places were drawn, so that its paths are found again [m]."""
     radius = float(np.max(problem.team.radius))
     return 0.3 / 8 if problem.name == "map" else (2 * radius + problem.margin) / 8
 
@@ -29,7 +29,7 @@ def blocked_by(problem: Problem, points: Any, robot: int, standing: Any, clear: 
     return found
 
 
-def way(problem: Problem, robot: int, standing: Any, clear: float) -> list[Any]:
+def lattice_path(problem: Problem, robot: int, standing: Any, clear: float) -> list[Any]:
     """Lattice points from a robot's start to its goal, each beside the one before, by breadth-first search."""
     low, high = problem.world.bounds.astype(np.float64)
     step = lattice_step(problem)
@@ -50,7 +50,7 @@ def way(problem: Problem, robot: int, standing: Any, clear: float) -> list[Any]:
                 if near not in before and 0 <= near[axis] < shape[axis] and not blocked[near]:
                     before[near] = node
                     queue.append(near)
-    assert goal in before, f"robot_{robot} has no way"
+    assert goal in before, f"robot_{robot} has no path"
     nodes = [goal]
     while nodes[-1] != start:
         nodes.append(before[nodes[-1]])
@@ -58,14 +58,14 @@ def way(problem: Problem, robot: int, standing: Any, clear: float) -> list[Any]:
 
 
 def ways_past_everybody(problem: Problem) -> list[list[Any]]:
-    """The way of each robot clear of all other starts and goals, and of all places where others may dock."""
+    """The path of each robot clear of all other starts and goals, and of all places where others may dock."""
     places = np.concatenate([problem.start[:, : problem.dimension], problem.goal]).astype(np.float64)
     around = problem.goal_radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-    ways = []
+    paths = []
     for robot in range(problem.num_robots):
         others = np.delete(places, [robot, problem.num_robots + robot], axis=0)
-        ways.append(way(problem, robot, (others[:, None] + around).reshape(-1, 2), clear=5e-4))
-    return ways
+        paths.append(lattice_path(problem, robot, (others[:, None] + around).reshape(-1, 2), clear=5e-4))
+    return paths
 
 
 def one_after_another(problem: Problem, order: Any) -> tuple[Problem, Any]:
@@ -73,7 +73,7 @@ def one_after_another(problem: Problem, order: Any) -> tuple[Problem, Any]:
     places = np.asarray(problem.start, np.float64)
     turns = []
     for robot in order:
-        driven = way(problem, robot, np.delete(places, robot, axis=0), clear=5e-3)
+        driven = lattice_path(problem, robot, np.delete(places, robot, axis=0), clear=5e-3)
         path = np.array([problem.start[robot], *driven, problem.goal[robot]])
         moves = np.diff(path, axis=0)
         parts = np.maximum(np.ceil(np.linalg.norm(moves, axis=1) / (0.9 * problem.dt)), 1).astype(int)
@@ -212,5 +212,5 @@ def test_tiny_and_huge_robots_are_placed_or_refused(name: str) -> None:
 
 def test_the_horizon_suits_the_way() -> None:
     problem = make_problem("maze", 4, 3, model="velocity2d")
-    longest = max(lattice_step(problem) * len(way(problem, robot, (), 0.0)) for robot in range(4))
+    longest = max(lattice_step(problem) * len(lattice_path(problem, robot, (), 0.0)) for robot in range(4))
     assert math.ceil(longest / problem.dt) < problem.horizon

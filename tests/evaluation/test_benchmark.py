@@ -121,7 +121,7 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
         (0, 0), (0, 0), (5, 0), (5, 0), (0, 3), (0, 3), (walls, 0), (0, 0), (0, 0), (0, 0)
     ]  # fmt: skip
     names = {row["environment"] for row in results["environments"]}
-    assert {"make_vec, rooms along ways", "FunctionalEnv"} <= names
+    assert {"make_vec, rooms along paths", "FunctionalEnv"} <= names
     assert [(row["obstacles"], row["where"]) for row in results["obstacles"]] == [(3, "near"), (5, "far")]
     assert [row["mode"] for row in results["robots"]] == ["nominal", "measured"]
     assert all(row["loop"].count > 30 and row["loop_95"] > 0 for row in results["robots"])

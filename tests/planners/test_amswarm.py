@@ -168,7 +168,7 @@ def test_obstacles_are_gone_round(kind: str) -> None:
 
 
 def test_a_guess_within_a_box_leaves_it_by_the_nearest_side() -> None:
-    # The straight way to the goal leads through the box, nearer to its upper side.
+    # The straight path to the goal leads through the box, nearer to its upper side.
     problem = Problem(
         Team(("holonomic2d",)), [[-1.5, 0.2, 0, 0]], [[1.5, 0.2]], World(boxes=[[-0.2, -0.8, 0.2, 0.4]]), horizon=100
     )

@@ -22,7 +22,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.d4orm_c2f.actuator_gain_estimator import Weakness
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
-from d4orm_planners.d4orm_c2f.direct_final_approach import drive_home
+from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.d4orm_c2f.latency_estimator import MOST, Lateness
 from d4orm_planners.d4orm_c2f.packet_loss_estimator import Losses
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
@@ -215,16 +215,16 @@ def test_who_is_nearly_there_drives_straight_home() -> None:
     states[:, 1] += [0.1, 0.1, 0.1, 0.1]
     states[:, 2] = [1.0, 1.0, 1.0, 1.0]
     controls = np.zeros((20, 4, 2), np.float32)
-    window, engine = problem.resumed_at(states, problem.goal), get_sampling_engine("cpu")
+    window, engine = problem.with_state(states, problem.goal), get_sampling_engine("cpu")
     nobody = np.zeros(4, bool)
-    chosen, home = drive_home(window, engine, controls, np.array([True, False, True, True]), nobody)
+    chosen, home = direct_final_approach(window, engine, controls, np.array([True, False, True, True]), nobody)
     assert home.tolist() == [True, False, True, False]
     np.testing.assert_array_equal(chosen[:, ~home], controls[:, ~home])
     missed, met = engine.rollout(window, controls).arrived, engine.rollout(window, chosen).arrived
     assert not missed[-1].any()
     assert met[-1].tolist() == home.tolist()
     assert np.argmax(met[:, 0]) == 9  # 0.9 m at 1 m/s, but for the goal's radius and the turn
-    again, home = drive_home(window, engine, chosen, np.array([True, False, False, False]), nobody)
+    again, home = direct_final_approach(window, engine, chosen, np.array([True, False, False, False]), nobody)
     assert home.tolist() == [True, False, False, False]
     np.testing.assert_array_equal(again, chosen)
 
@@ -238,10 +238,10 @@ def parked_cars(*, beside: float) -> Problem:
 
 @pytest.mark.parametrize("beside", [0.1, 0.3, 0.6])
 def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> None:
-    """Within its turning circle there is no way home that does not lead away first."""
+    """Within its turning circle there is no path home that does not lead away first."""
     problem, docked = parked_cars(beside=beside), np.array([False, True])
     window, still = problem.replace(horizon=20), np.zeros((20, 2, 2), np.float32)
-    controls, home = drive_home(window, get_sampling_engine("cpu"), still, np.zeros(2, bool), docked)
+    controls, home = direct_final_approach(window, get_sampling_engine("cpu"), still, np.zeros(2, bool), docked)
     assert home.tolist() == [True, False]
     places = get_sampling_engine("cpu").rollout(window, controls).positions[:, 0]
     assert np.linalg.norm(places - problem.goal[0], axis=1).max() > beside + 0.05
@@ -257,7 +257,7 @@ def test_no_manoeuvre_leads_through_what_stands() -> None:
     goal[0] = [0, 1]
     problem = Problem(Team(("car",) * 7), start, goal, horizon=30)
     controls, docked = np.zeros((problem.horizon, 7, 2), np.float32), np.arange(7) > 0
-    chosen, home = drive_home(problem, get_sampling_engine("cpu"), controls, ~docked, docked)
+    chosen, home = direct_final_approach(problem, get_sampling_engine("cpu"), controls, ~docked, docked)
     assert not home.any()
     np.testing.assert_array_equal(chosen, controls)
 

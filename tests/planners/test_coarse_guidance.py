@@ -24,7 +24,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     subgoal_indices,
 )
 from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, STUCK_WITHIN, StagnationMonitor, keep_time
-from d4orm_planners.d4orm_c2f.lookahead import LEAST, within_sight
+from d4orm_planners.d4orm_c2f.line_of_sight import LEAST, visible_subgoals
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.select import get_sampling_engine
@@ -161,7 +161,7 @@ def right_angle(num_robots: int = 2) -> Any:
 def test_a_subgoal_behind_a_corner_is_exchanged_for_one_in_sight(walls: bool) -> None:
     problem = hop_problem(1, world=World(boxes=[[0.3, 0.3, 0.6, 2.0]]))
     begin = np.zeros(1, int)
-    nearer = within_sight(
+    nearer = visible_subgoals(
         problem, np.zeros((1, 2), np.float32), right_angle(1), begin, begin + 40, np.array([False]), walls
     )
     # A body of 0.15 m passes the corner at (0.6, 0.3) to no more than (1, 0.3) or so.
@@ -173,7 +173,7 @@ def test_who_stands_in_the_way_of_a_subgoal_hides_it() -> None:
     path, places = right_angle(2), np.array([[0, 0], [0.5, 0.5]], np.float32)
     indices, targets = np.zeros(2, int), np.full(2, 40)
     for standing in (False, True):
-        nearer = within_sight(problem, places, path, indices, targets, np.array([False, standing]), walls=False)
+        nearer = visible_subgoals(problem, places, path, indices, targets, np.array([False, standing]), walls=False)
         assert (nearer[0] == 40) != standing
         assert nearer[0] > LEAST
         assert nearer[1] == 40
@@ -186,22 +186,22 @@ def joint(problem: Any, states: Any, steps: int = 0) -> JointState:
 
 def test_who_does_not_get_on_is_stuck() -> None:
     problem = hop_problem(3)
-    patience, indices = StagnationMonitor(joint(problem, problem.start)), np.zeros(3, int)
+    monitor, indices = StagnationMonitor(joint(problem, problem.start)), np.zeros(3, int)
     for step in range(1, STUCK_AFTER + 2):
         indices[2] = step
         # The second one has to wait where it is, and the third one moves.
-        idle, careful = patience.observe(step, indices, np.array([False, True, False]))
+        idle, careful = monitor.observe(step, indices, np.array([False, True, False]))
         np.testing.assert_array_equal(idle, [step, 0, step % STUCK_WITHIN])
         np.testing.assert_array_equal(careful, [step > STUCK_AFTER, False, False])
     indices[0] += 10
-    idle, careful = patience.observe(STUCK_AFTER + 2, indices, np.zeros(3, bool))
+    idle, careful = monitor.observe(STUCK_AFTER + 2, indices, np.zeros(3, bool))
     assert idle[0] == 0
     assert careful[0]
 
 
 def test_a_path_is_followed() -> None:
     problem, engine, path = hop_problem(1, horizon=100), get_sampling_engine("cpu"), right_angle(1)
-    present = problem.resumed_at(problem.start, path[-1])
+    present = problem.with_state(problem.start, path[-1])
     controls = keep_time(problem, engine, joint(present, problem.start), path, np.zeros(1, int), 100)
     places = engine.rollout(present, controls).positions[:, 0]
     off = np.linalg.norm(places[:, None] - path[:, 0], axis=2).min(axis=1)

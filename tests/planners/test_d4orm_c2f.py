@@ -343,7 +343,7 @@ def replanned(
 
 
 def straight(problem: Problem, joint: JointState, factor: int) -> Any:
-    return straight_drives(coarse_problem(problem.resumed_at(joint.states, joint.goals), factor)).controls[:, :, 0]
+    return straight_drives(coarse_problem(problem.with_state(joint.states, joint.goals), factor)).controls[:, :, 0]
 
 
 def test_robots_within_the_margin_of_each_other_part() -> None:
@@ -378,7 +378,7 @@ def test_intruders_are_avoided(seed: int) -> None:
     assert executed.metrics["success"], executed.metrics
 
 
-def test_ways_through_rooms_are_kept_in_order() -> None:
+def test_paths_through_rooms_are_kept_in_order() -> None:
     problem = make_problem("rooms", num_robots=6, seed=1)
     policy = controller()
     executed = episode(policy, problem)
@@ -409,7 +409,7 @@ def test_the_first_coarse_plan_may_begin_with_what_a_policy_does() -> None:
     problem = make_problem("circle", num_robots=8)
     env = navigation_v0.parallel_env(problem=problem)
     env.reset(seed=0)
-    policy = make_policy("d4orm-c2f", first_guess="ppo", refine="off")
+    policy = make_policy("d4orm-c2f", warm_start="ppo", refine="off")
     policy.reset(env, seed=0)
     coarse = coarse_problem(problem, policy.config.coarse_factor)
     episode = run_episode(navigation_v0.parallel_env(problem=coarse), "ppo", seed=0)
@@ -418,7 +418,7 @@ def test_the_first_coarse_plan_may_begin_with_what_a_policy_does() -> None:
     np.testing.assert_array_equal(guided[: len(episode.controls)], episode.controls)
     assert not guided[len(episode.controls) :].any()
     with pytest.raises(ValueError, match="nobody"):
-        make_policy("d4orm-c2f", first_guess="nobody").reset(env, seed=0)
+        make_policy("d4orm-c2f", warm_start="nobody").reset(env, seed=0)
 
 
 def test_with_new_goals_for_some_the_others_keep_to_their_ways(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -434,16 +434,16 @@ def test_with_new_goals_for_some_the_others_keep_to_their_ways(monkeypatch: pyte
             continue
         assert iterations == 2
         some += changed.any() and not changed.all()
-        coarse = coarse_problem(problem.resumed_at(joint.states, joint.goals), factor)
-        ways = guidance.path[index - index % factor :: factor][: len(initial) + 1, ~changed]
-        driven = get_sampling_engine("cpu").rollout(coarse, initial).positions[: len(ways), ~changed]
-        off = np.linalg.norm(driven - ways, axis=2)
+        coarse = coarse_problem(problem.with_state(joint.states, joint.goals), factor)
+        expected = guidance.path[index - index % factor :: factor][: len(initial) + 1, ~changed]
+        driven = get_sampling_engine("cpu").rollout(coarse, initial).positions[: len(expected), ~changed]
+        off = np.linalg.norm(driven - expected, axis=2)
         assert (off <= np.maximum(off[0], 0.25)).all()
         np.testing.assert_array_equal(initial[:, changed], straight(problem, joint, factor)[:, changed])
     assert some
 
 
-def test_ways_of_robots_that_were_pushed_lead_on_to_their_ends() -> None:
+def test_paths_of_robots_that_were_pushed_lead_on_to_their_ends() -> None:
     problem = circle(4)
     policy, env = controller(), navigation_v0.parallel_env(problem=problem)
     env.reset(seed=0)
@@ -452,7 +452,7 @@ def test_ways_of_robots_that_were_pushed_lead_on_to_their_ends() -> None:
     states = joint.states + np.float32([0.1, -0.1, 0.4, 0.3])
     everybody = np.ones(4, bool)
     initial = policy._guide._beginning(joint._replace(states=states), everybody)
-    coarse = coarse_problem(problem.resumed_at(states, problem.goal), policy.config.coarse_factor)
+    coarse = coarse_problem(problem.with_state(states, problem.goal), policy.config.coarse_factor)
     assert get_sampling_engine("cpu").rollout(coarse, initial).arrived[-1].all()
 
 

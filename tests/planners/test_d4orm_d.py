@@ -117,7 +117,7 @@ def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
         search.advance()
         repairs += 1
         if not search.current.failed.any():
-            break  # The last repair shortens everybody's way.
+            break  # The last repair shortens everybody's path.
         same = (search.current.controls == before.controls).all(axis=(0, 2))
         assert same[~before.failed].all()
     assert repairs >= 1
@@ -134,7 +134,7 @@ class Astray(CpuSamplingEngine):
 
 
 def test_a_repair_that_makes_things_worse_is_not_taken_over() -> None:
-    """Robot 0 cannot reach its goal, and on every way there it meets robot 1, which has docked in between."""
+    """Robot 0 cannot reach its goal, and on every path there it meets robot 1, which has docked in between."""
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     ring = np.column_stack([4 + 0.8 * np.cos(angle), 0.8 * np.sin(angle), np.full(12, 0.25)])
     start = [[0, 0, 0, 0], [1.5, -0.5, 0, 0]]

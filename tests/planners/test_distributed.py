@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from network_support import PATIENCE, wait_until
+from network_support import TIMEOUT, wait_until
 from planner_support import cheap_planner, hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
@@ -29,7 +29,7 @@ from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm import evaluator as judge_module
+from d4orm_planners.d_d4orm import evaluator as evaluator_module
 from d4orm_planners.d_d4orm import messages, node
 from d4orm_planners.d_d4orm.evaluator import Evaluator, Stopped
 from d4orm_planners.d_d4orm.inbox import Inbox
@@ -249,7 +249,7 @@ def test_collecting_waits_for_a_message_or_the_end() -> None:
         waiting = threading.Thread(target=lambda kept=collected: kept.append(second.collect(timeout=3600)), daemon=True)
         waiting.start()
         action()
-        waiting.join(PATIENCE)
+        waiting.join(TIMEOUT)
         assert collected == [expected]
     second.close()
     first.publish(b"b")
@@ -325,13 +325,13 @@ def test_what_arrives_is_gone_on_from_as_planned_and_counts_as_executed() -> Non
 
 def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch) -> None:
     box, other = inbox()
-    judged = []
+    calls = []
 
-    def judge(*arguments: Any) -> Any:
-        judged.append(arguments)
+    def evaluator(*arguments: Any) -> Any:
+        calls.append(arguments)
         return evaluate_controls(*arguments)
 
-    monkeypatch.setattr(judge_module, "evaluate_controls", judge)
+    monkeypatch.setattr(evaluator_module, "evaluate_controls", evaluator)
     other.publish(encode(message(), PROBLEM))
     (first,) = box.receive()
     told, executed = first.candidate.planned, first.candidate.controls
@@ -340,34 +340,34 @@ def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch)
         (again,) = box.receive()
         np.testing.assert_array_equal(again.candidate.controls, executed)
         assert again.candidate.rank == first.candidate.rank
-    assert len(judged) == 1
+    assert len(calls) == 1
 
 
 def test_what_a_process_has_made_is_judged_once() -> None:
-    judge = Evaluator(get_sampling_engine("cpu"), PROBLEM, remembered=2)
-    made = [judge.own(message().controls * scale) for scale in (0.25, 0.5, 1.0)]
-    assert judge.received(made[2].controls.copy()) is made[2]
-    assert judge.received(made[1].controls) is made[1]
-    forgotten = judge.received(made[0].controls)
+    evaluator = Evaluator(get_sampling_engine("cpu"), PROBLEM, remembered=2)
+    made = [evaluator.own(message().controls * scale) for scale in (0.25, 0.5, 1.0)]
+    assert evaluator.received(made[2].controls.copy()) is made[2]
+    assert evaluator.received(made[1].controls) is made[1]
+    forgotten = evaluator.received(made[0].controls)
     assert forgotten is not made[0]
     assert forgotten.rank == made[0].rank
     changed = made[2].controls.copy()
     changed[0, 0, 0] += 0.125
-    assert judge.received(changed).rank != made[2].rank
+    assert evaluator.received(changed).rank != made[2].rank
 
 
-def alone(planner: Planner, judge: Evaluator | None = None) -> Node:
+def alone(planner: Planner, evaluator: Evaluator | None = None) -> Node:
     """A network's only node."""
     task = Task(1, 0, None, "max", 1)
-    return Node(0, task, planner, LocalNetwork().join(), judge or Evaluator(get_sampling_engine("cpu"), PROBLEM))
+    return Node(0, task, planner, LocalNetwork().join(), evaluator or Evaluator(get_sampling_engine("cpu"), PROBLEM))
 
 
 def test_the_word_to_stop_ends_judging_and_denoising() -> None:
-    judge = Evaluator(get_sampling_engine("cpu"), PROBLEM, remembered=1)
-    judge.stop.set()
+    evaluator = Evaluator(get_sampling_engine("cpu"), PROBLEM, remembered=1)
+    evaluator.stop.set()
     with pytest.raises(Stopped):
-        judge.own(message().controls)
-    node = alone(cheap_planner("d4orm"), judge)
+        evaluator.own(message().controls)
+    node = alone(cheap_planner("d4orm"), evaluator)
     with pytest.raises(Stopped):
         node.refine()
     assert node.search.planner.iterate(node.search, None)[1].denoising_steps == 0
@@ -399,7 +399,7 @@ def test_a_node_whose_time_is_over_makes_no_other_round() -> None:
     for limit, again in ((3600.0, True), (1e-9, False)):
         node = alone(cheap_planner("d4orm"))
         node.search.time_limit = limit
-        assert node.step(threading.Event(), patience=0.0, improve=True) is again
+        assert node.step(threading.Event(), timeout=0.0, improve=True) is again
 
 
 def test_engines_that_share_the_cores_use_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -491,8 +491,8 @@ def test_a_node_that_fails_does_not_take_the_others_down(
         raise ZeroDivisionError("the node is broken")
 
     spoil(monkeypatch, 5, fail)
-    # Whoever waits for somebody who is gone waits until patience ends, once.
-    planner = distributed(mode=mode, nodes=3, improve=True, patience=0.2)
+    # Whoever waits for somebody who is gone waits until the timeout passes, once.
+    planner = distributed(mode=mode, nodes=3, improve=True, timeout=0.2)
     plan = planner.solve(hop_problem(2), seed=5, max_iterations=4)
     assert_verified(plan)
     assert "node 1 failed (ZeroDivisionError" in caplog.text
@@ -522,7 +522,7 @@ def test_a_node_that_sends_nonsense_is_harmless(mode: str, spoilt: str, monkeypa
         return encode(replace(sent, controls=np.zeros_like(sent.controls), reward=1e9, feasible=True), problem)
 
     monkeypatch.setattr(node, "encode", send)
-    plan = distributed(mode=mode, improve=True, patience=0.2).solve(hop_problem(2), seed=1, max_iterations=3)
+    plan = distributed(mode=mode, improve=True, timeout=0.2).solve(hop_problem(2), seed=1, max_iterations=3)
     assert_verified(plan)
     notes = " ".join(record.note for record in plan.history)
     assert f"x {'false claim' if spoilt == 'claim' else 'garbage'}" in notes
@@ -535,7 +535,7 @@ def test_a_node_that_hangs_does_not_hang_the_solve(mode: str, monkeypatch: pytes
     release, woken = threading.Event(), []
     spoil(monkeypatch, 5, lambda search: woken.append(release.wait(60)))
     try:
-        planner = distributed(mode=mode, patience=0.2, max_iterations=10**6)
+        planner = distributed(mode=mode, timeout=0.2, max_iterations=10**6)
         plan = planner.solve(walled_in_problem(), seed=5, time_limit=0.5)
         assert not woken, "the node hung to the end"
     finally:
@@ -550,7 +550,7 @@ def test_a_node_that_hangs_does_not_hang_the_solve(mode: str, monkeypatch: pytes
 @MODE
 def test_a_plan_tells_what_its_nodes_sent(mode: str) -> None:
     problem = walled_in_problem()
-    plan = cheap_planner("d-d4orm", nodes=3, mode=mode, patience=10).solve(problem, max_iterations=2)
+    plan = cheap_planner("d-d4orm", nodes=3, mode=mode, timeout=10).solve(problem, max_iterations=2)
     length = len(encode(Message(0, 1, plan.controls, 0.0, False), problem))
     if mode == "sync":
         assert plan.metrics["messages"] == 6
@@ -563,7 +563,7 @@ def test_a_plan_tells_what_its_nodes_sent(mode: str) -> None:
 @MODE
 def test_who_is_quick_waits_for_who_is_slow(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil(monkeypatch, 6, lambda search: time.sleep(0.5))
-    plan = cheap_planner("d-d4orm", mode=mode, patience=60).solve(walled_in_problem(), seed=6)
+    plan = cheap_planner("d-d4orm", mode=mode, timeout=60).solve(walled_in_problem(), seed=6)
     # Half a second of waiting, and whatever a slow machine takes to plan.
     assert plan.metrics["waiting_share"] > 0.02
 
@@ -583,8 +583,8 @@ POSIX = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs si
 @POSIX
 @MODE
 def test_ctrl_c_ends_an_iteration_under_way(mode: str) -> None:
-    # Which would take minutes, and patience as long.
-    planner = distributed(mode=mode, num_steps=10**6, patience=600)
+    # Which would take minutes, and the timeout as long.
+    planner = distributed(mode=mode, num_steps=10**6, timeout=600)
 
     def interrupt() -> None:
         wait_until(lambda: len(node_threads()) == planner.config.nodes, "nodes that plan")
@@ -617,7 +617,7 @@ def test_ctrl_c_loses_nothing_that_a_node_has_found(mode: str, monkeypatch: pyte
     monkeypatch.setattr(node, "encode", send)
     spoil(monkeypatch, 5, lambda search: release.wait(60))
     threading.Thread(target=interrupt).start()
-    plan = distributed(mode=mode, patience=60).solve(planned, seed=5)
+    plan = distributed(mode=mode, timeout=60).solve(planned, seed=5)
     assert plan.status == "interrupted"
     assert plan.controls.any()
 
@@ -632,14 +632,14 @@ def test_ctrl_c_while_a_node_starts_leaves_no_thread(mode: str, monkeypatch: pyt
             raise KeyboardInterrupt
 
     monkeypatch.setattr(threading.Thread, "start", interrupted)
-    plan = distributed(mode=mode, num_steps=10**6, patience=60).solve(walled_in_problem())
+    plan = distributed(mode=mode, num_steps=10**6, timeout=60).solve(walled_in_problem())
     assert plan.status == "interrupted"
     assert not node_threads()
 
 
 def test_no_thread_outlives_a_solve() -> None:
     for mode in ("sync", "async"):
-        distributed(mode=mode, patience=10).solve(walled_in_problem(), max_iterations=2)
+        distributed(mode=mode, timeout=10).solve(walled_in_problem(), max_iterations=2)
         assert not [thread for thread in threading.enumerate() if thread.name.startswith("d-d4orm-")]
 
 
@@ -648,9 +648,9 @@ def test_an_observer_is_told_what_a_node_does() -> None:
     planner = D4orm(D4ormConfig(engine="cpu", num_samples=64, num_steps=5))
     events: list[Event] = []
     controls = np.zeros((problem.horizon, 2, 2), np.float32)
-    task, judge = Task(2, 0, controls, "max", 1), Evaluator(get_sampling_engine("cpu"), problem)
+    task, evaluator = Task(2, 0, controls, "max", 1), Evaluator(get_sampling_engine("cpu"), problem)
     nodes = [
-        Node(i, task, planner, network.join(), judge, observer=observer)
+        Node(i, task, planner, network.join(), evaluator, observer=observer)
         for i, observer in enumerate((events.append, None))
     ]
     for one in nodes:
@@ -671,8 +671,8 @@ def test_an_observer_is_told_what_a_node_does() -> None:
 def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
     problem, network = hop_problem(2), LocalNetwork()
     task = Task(2, 0, distributed().solve(problem).controls, "max", 1)
-    judge = Evaluator(get_sampling_engine("cpu"), problem)
-    first, second = (Node(i, task, cheap_planner("d4orm"), network.join(), judge) for i in range(2))
+    evaluator = Evaluator(get_sampling_engine("cpu"), problem)
+    first, second = (Node(i, task, cheap_planner("d4orm"), network.join(), evaluator) for i in range(2))
     assert not first.settle(0), "nobody has told it anything"
     assert second.settle(0)
     assert first.settle(0)
@@ -682,14 +682,14 @@ def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
 def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     release = threading.Event()
     spoil(monkeypatch, 5, lambda search: release.wait(60))
-    patience, enough = 3, 10
-    planner = distributed(mode="async", patience=patience, num_steps=2)
+    timeout, enough = 3, 10
+    planner = distributed(mode="async", timeout=timeout, num_steps=2)
     search = SolveRun(planner, walled_in_problem(), 5, None)
     try:
         search.advance()
         fast, silent = search.state.crew.alive
         # Waiting every time, the other node would not get so far in that time.
-        while fast.search.iteration <= enough and search.watch.elapsed < enough * patience:
+        while fast.search.iteration <= enough and search.watch.elapsed < enough * timeout:
             search.advance()
         assert silent.search.iteration == 0
         assert fast.search.iteration > enough
@@ -714,7 +714,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
         ({"transport": "zenoh", "mode": "async", "node": 0, "zenoh": {"port": 1}}, "'port' is no setting of zenoh"),
         ({"nodes": 2.0}, "nodes must be a whole number, not 2.0"),
         ({"k": 0}, "k is 0; it must be at least 1"),
-        ({"patience": -1}, "patience is -1; it must be zero or more"),
+        ({"timeout": -1}, "timeout is -1; it must be zero or more"),
         ({"nodes": 8, "num_samples": 15}, "num_samples is 15 for 8 nodes together; .* 16 or more"),
         ({"planner": "d4orm-d", "repair_samples": 3}, "repair_samples is 3 for 2 nodes together"),
     ],

@@ -22,7 +22,7 @@ FURTHER_IN = "d4orm_planners.base.solve.drive_further_in"
 
 
 def quarters(model: str = "unicycle", goal_radius: float = 0.1, **changes: Any) -> Problem:
-    """Two robots whose way to the goal radius is a whole number of strides, the first one's as float32 has it."""
+    """Two robots whose path to the goal radius is a whole number of strides, the first one's as float32 has it."""
     start = np.zeros((2, {"unicycle": 3, "velocity2d": 2}[model]))
     start[:, :2] = [[-1.25, 0], [-1.25, 2.0]]
     goal = start[:, :2] + [[2.0, 0], [0.77, 0]]
@@ -61,13 +61,13 @@ def given(controls: FloatArray) -> Given:
     return planner
 
 
-def judged(problem: Problem, controls: FloatArray) -> Candidate:
+def evaluated(problem: Problem, controls: FloatArray) -> Candidate:
     return evaluate_controls(SolveRun(given(controls), problem, 0).engine, problem, controls)
 
 
 def test_a_candidate_knows_whom_verify_refuses() -> None:
     problem = quarters()
-    candidate = judged(problem, straight(problem))
+    candidate = evaluated(problem, straight(problem))
     assert not candidate.failed.any()
     assert not candidate.solved
     assert candidate.unsolved.tolist() == [True, False]
@@ -78,7 +78,7 @@ def test_a_candidate_knows_whom_verify_refuses() -> None:
 
 def test_who_fails_at_the_steps_is_not_verified() -> None:
     problem = quarters()
-    candidate = judged(problem, np.zeros_like(straight(problem)))
+    candidate = evaluated(problem, np.zeros_like(straight(problem)))
     assert candidate.report is None
     assert candidate.unsolved.all()
 
@@ -91,7 +91,7 @@ def test_every_planner_drives_further_in(name: str, monkeypatch: pytest.MonkeyPa
     assert (plan.status, plan.iterations) == ("solved", 1)
     assert plan.verified
     # The other one does as it did.
-    np.testing.assert_array_equal(plan.controls[:, 1], judged(problem, straight(problem)).controls[:, 1])
+    np.testing.assert_array_equal(plan.controls[:, 1], evaluated(problem, straight(problem)).controls[:, 1])
 
 
 @pytest.mark.parametrize("model", ["unicycle", "velocity2d"])
@@ -104,7 +104,7 @@ def test_robots_that_drive_by_quarters_of_a_metre_arrive(model: str, goal_radius
 
 
 def test_a_plan_that_verify_refuses_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FURTHER_IN, lambda search, candidate, judge: candidate)
+    monkeypatch.setattr(FURTHER_IN, lambda search, candidate, evaluate: candidate)
     problem = quarters()
     plan = given(straight(problem)).solve(problem, max_iterations=3)
     assert plan.status == "iteration_limit"
@@ -114,17 +114,17 @@ def test_a_plan_that_verify_refuses_says_why(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_repairs_see_whom_verify_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FURTHER_IN, lambda search, candidate, judge: candidate)
+    monkeypatch.setattr(FURTHER_IN, lambda search, candidate, evaluate: candidate)
     problem = quarters()
     plan = make_planner("d4orm-d", engine="cpu").solve(problem, initial_controls=straight(problem), max_iterations=3)
     assert plan.solved, plan.failures
     # Not the whole team is deformed for it.
-    np.testing.assert_array_equal(plan.controls[:, 1], judged(problem, straight(problem)).controls[:, 1])
+    np.testing.assert_array_equal(plan.controls[:, 1], evaluated(problem, straight(problem)).controls[:, 1])
 
 
 def test_robots_that_leap_through_each_other_are_both_to_blame() -> None:
     problem, controls = leap()
-    candidate = judged(problem, controls)
+    candidate = evaluated(problem, controls)
     assert not candidate.failed.any()
     assert candidate.unsolved.all()
     plan = given(controls).solve(problem, max_iterations=1)
@@ -134,13 +134,13 @@ def test_robots_that_leap_through_each_other_are_both_to_blame() -> None:
 
 def test_who_is_refused_is_at_fault_until_it_moves() -> None:
     problem, controls = leap()
-    candidate = judged(problem, controls)
+    candidate = evaluated(problem, controls)
     team = WorkingPlan(SolveRun(given(controls), problem, 0), candidate.trajectory, candidate.report)
     faults, first = team.faults([0, 1])
     assert faults.tolist() == [1, 1]
     assert first.tolist() == [2, 2]  # they meet within the second step
-    way = drives(problem, *standing(problem), [[0], [0]], np.full((2, 1, 1, 2), [[0.0, 1.0]]))
-    team.take_best([0], way)
+    path = drives(problem, *standing(problem), [[0], [0]], np.full((2, 1, 1, 2), [[0.0, 1.0]]))
+    team.take_best([0], path)
     assert team.faults([0, 1])[0].tolist() == [0, 1]
     # What it does already is no other way.
     before = team.controls.copy()

@@ -19,7 +19,7 @@ from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.lacam import TeamMoves, find_moves
 from d4orm_planners.mapf.planner import needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
-from d4orm_planners.mapf.replanning import Trip, find_way
+from d4orm_planners.mapf.replanning import Trip, find_path
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
 from d4orm_planners.mapf.safe_intervals import Others
@@ -227,14 +227,14 @@ def test_a_robot_that_turns_as_it_drives_chooses_its_gear(
 
 
 @pytest.mark.parametrize("heading", np.arange(-180, 180, 45))
-@pytest.mark.parametrize("way", [[(0, 0), (3, 0)], [(0, 0), (2, 0), (2, 2)], [(0, 0), (1.5, 0), (1.5, 1), (0, 1)]])
+@pytest.mark.parametrize("path", [[(0, 0), (3, 0)], [(0, 0), (2, 0), (2, 2)], [(0, 0), (1.5, 0), (1.5, 1), (0, 1)]])
 @pytest.mark.slow
-def test_a_car_follows_a_route_from_every_heading(way: Any, heading: float) -> None:
+def test_a_car_follows_a_route_from_every_heading(path: Any, heading: float) -> None:
     start = [[0, 0, np.radians(heading), 0, 0]]
-    problem = Problem(Team(("car",)), start, [way[-1]], World(dimension=2), horizon=400)
-    corners = np.hstack([np.array(way, float), np.zeros((len(way), 1))])
-    times = np.arange(len(way)) * 40.0
-    stops = Corners(corners, np.array([0, len(way)]), np.append(-1.0, times[:-1]), times)
+    problem = Problem(Team(("car",)), start, [path[-1]], World(dimension=2), horizon=400)
+    corners = np.hstack([np.array(path, float), np.zeros((len(path), 1))])
+    times = np.arange(len(path)) * 40.0
+    stops = Corners(corners, np.array([0, len(path)]), np.append(-1.0, times[:-1]), times)
     (route,) = make_routes(problem, stops, [0], 0.1)
     turning = problem.team.turning_radius[0]
     assert (route.bends > turning - 1e-6).all()
@@ -259,7 +259,7 @@ def test_a_car_alone_finds_its_way_among_walls(scenario: str, seed: int) -> None
 
 
 @pytest.mark.parametrize("fault", ["nobody", "across", "ahead"])
-def test_a_way_in_space_and_time_lets_others_pass(fault: str) -> None:
+def test_a_path_in_space_and_time_lets_others_pass(fault: str) -> None:
     """Another robot crosses, or drives the same way ahead and stops for a while where both have to go."""
     boxes = [[-0.3, 0.35, 0.3, 4], [-0.3, -4, 0.3, -0.35]]
     problem = walled([[-2, 0], [3, 3]], [[2, 0], [3, 2]], boxes)
@@ -274,12 +274,12 @@ def test_a_way_in_space_and_time_lets_others_pass(fault: str) -> None:
         places[200:, 1] = [3, 3, 0]
     others = Others(places, np.full(2, 0.41))
     bodies = replanning.bodies
-    way = find_way(roadmap, replanning.cells, bodies, others, 0, Trip(0.09, 4, 400, -1))
-    assert way[0].tolist() == [roadmap.starts[0], 0, 0]
-    assert way[-1, 0] == roadmap.goals[0]
-    assert (way[1:, 1] >= way[:-1, 2]).all()
-    assert (way[-1, 2] > 100) == (fault != "nobody")
-    for (tail, _, _), (head, depart, arrive) in pairwise(way):
+    path = find_path(roadmap, replanning.cells, bodies, others, 0, Trip(0.09, 4, 400, -1))
+    assert path[0].tolist() == [roadmap.starts[0], 0, 0]
+    assert path[-1, 0] == roadmap.goals[0]
+    assert (path[1:, 1] >= path[:-1, 2]).all()
+    assert (path[-1, 2] > 100) == (fault != "nobody")
+    for (tail, _, _), (head, depart, arrive) in pairwise(path):
         for step in range(depart, arrive + 1):
             share = (step - depart) / (arrive - depart)
             place = roadmap.nodes[tail] * (1 - share) + roadmap.nodes[head] * share
@@ -300,7 +300,7 @@ def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
     assert verify(problem, driven.until(problem.horizon)).ok
 
 
-def test_ways_one_by_one_displace_those_in_the_way() -> None:
+def test_paths_one_by_one_displace_those_in_the_way() -> None:
     problem = corridor_with_bay(right=1.0)
     replanning = Replanning(problem, lay_roadmap(problem))
     driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
@@ -341,7 +341,7 @@ def test_improving_never_makes_it_worse_and_mostly_better() -> None:
 def test_a_goal_without_a_way_is_named_at_once() -> None:
     plan = make_planner("mapf").solve(walled_in_problem(), max_iterations=2)
     assert not plan.solved
-    assert plan.history[0].note.startswith("robot_0 has no way from start to goal")
+    assert plan.history[0].note.startswith("robot_0 has no path from start to goal")
 
 
 @pytest.mark.parametrize(("scenario", "mapf"), [("circle", False), ("four_obstacles", False), ("maze", True)])
@@ -351,7 +351,7 @@ def test_paths_are_found_where_obstacles_lead_far_round(scenario: str, mapf: boo
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_who_is_alone_drives_about_as_fast_as_it_can(seed: int) -> None:
-    """Along its shortest way at full speed, and as long again as it takes to get to that."""
+    """Along its shortest path at full speed, and as long again as it takes to get to that."""
     problem = make_problem("rooms", num_robots=4, seed=seed).select([0])
     plan = make_planner("mapf").solve(problem, seed=0)
     speed, acceleration = problem.team.limits[0, :2]

@@ -1,4 +1,4 @@
-"""Large maps: lattices that get coarser say so, only free points count, and ways are found in narrow corridors."""
+"""Large maps: lattices that get coarser say so, only free points count, and paths are found in narrow corridors."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def alone(world: World, start: tuple[float, float], goal: tuple[float, float]) -
 
 
 def joined(problem: Problem, fineness: float) -> np.ndarray:
-    """Who has a way on the roadmap."""
+    """Who has a path on the roadmap."""
     roadmap = lay_roadmap(problem, fineness)
     return np.isfinite(Searched(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts])
 
@@ -125,7 +125,7 @@ def test_a_roadmap_does_not_get_coarser_with_the_horizon() -> None:
     np.testing.assert_array_equal(short.nodes, long.nodes)
 
 
-def test_ways_are_refined_beyond_the_limit_that_made_them_coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_are_refined_beyond_the_limit_that_made_them_coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shortest_paths, "MAX_NODES", 400)
     world = GridMap(maze(9, 3), 0.6).world
     problem = alone(world, (0.9, 0.9), (10.5, 10.5))

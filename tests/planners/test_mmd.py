@@ -21,6 +21,15 @@ from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.constraint_tree import Constraint, Planning
 from d4orm_planners.baselines.mmd.guiding import Surroundings, guide
+from d4orm_planners.baselines.mmd.path_frame import (
+    FEATURES,
+    MODES,
+    POINTS,
+    PathFrame,
+    make_frame,
+    sine_table,
+    world_space,
+)
 from d4orm_planners.baselines.mmd.planner import MMDConfig
 from d4orm_planners.baselines.mmd.prior import (
     CLIP,
@@ -36,15 +45,6 @@ from d4orm_planners.baselines.mmd.prior import (
 from d4orm_planners.baselines.mmd.reverse_process import Denoiser
 from d4orm_planners.baselines.mmd.tracking import drive_along
 from d4orm_planners.baselines.mmd.training_set import draw_examples, modes_of
-from d4orm_planners.baselines.mmd.way_frame import (
-    FEATURES,
-    MODES,
-    POINTS,
-    WayFrame,
-    make_frame,
-    sine_table,
-    world_space,
-)
 
 # The network.
 
@@ -129,7 +129,7 @@ def test_the_posterior_keeps_the_marginals(steps: int, data: st.DataObject) -> N
 # The frame, and what is learned.
 
 
-def frame_of(problem: Problem, robot: int = 0) -> WayFrame:
+def frame_of(problem: Problem, robot: int = 0) -> PathFrame:
     frame = make_frame(problem, robot, world_space(problem), np.array([0.3, -0.5, 0.8]))
     assert frame is not None
     return frame
@@ -161,7 +161,7 @@ def test_who_has_no_way_has_no_frame() -> None:
 
 
 def still(problem: Problem, count: int = 1) -> dict[str, Any]:
-    """Arguments of a drive along motions that are the way itself."""
+    """Arguments of a drive along motions that are the path itself."""
     return {
         "frame": frame_of(problem),
         "sines": sine_table(),
@@ -272,7 +272,7 @@ def test_other_robots_pull_as_much_as_they_are_told_to() -> None:
 
 
 def test_obstacles_are_left_on_the_side_of_the_way() -> None:
-    # The way touches the box's corner; the motion is moved far into it.
+    # The path touches the box's corner; the motion is moved far into it.
     problem = lone_problem(world=World(boxes=[[1.5, 0.21, 2.5, 1.5]]))
     arguments = still(problem)
     arguments["motions"][0, MODES] = 0.5 / 4 / arguments["deviation"][MODES]
@@ -376,7 +376,7 @@ def test_in_space_there_is_room_on_all_sides() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["rooms", "warehouse", "forest"])
-def test_ways_lead_round_obstacles(scenario: str) -> None:
+def test_paths_lead_round_obstacles(scenario: str) -> None:
     assert_solves(make_problem(scenario, num_robots=3, seed=0))
 
 
@@ -387,7 +387,7 @@ def test_who_may_not_dock_comes_to_its_goal_too() -> None:
 def test_a_goal_out_of_reach_is_named() -> None:
     plan = make_planner("mmd", engine="cpu").solve(walled_in_problem(), max_iterations=2)
     assert plan.status == "iteration_limit"
-    assert "robot_0 has no way" in plan.history[0].note
+    assert "robot_0 has no path" in plan.history[0].note
     assert not plan.trajectory.collided.any()
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from network_support import PATIENCE, FaultyTransport, Link, free_endpoint, wait_until
+from network_support import TIMEOUT, FaultyTransport, Link, free_endpoint, wait_until
 from planner_support import hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
@@ -55,18 +55,18 @@ class Solve:
         node: int,
         nodes: int,
         zenoh: dict[str, Any],
-        time_limit: float = PATIENCE,
+        time_limit: float = TIMEOUT,
         callback: Callback | None = None,
         **settings: Any,
     ) -> None:
         planner = make_planner(
             "d-d4orm",
-            **{"engine": "cpu", "max_iterations": 10**6, "patience": 0.2, **settings},
+            **{"engine": "cpu", "max_iterations": 10**6, "timeout": 0.2, **settings},
             transport="zenoh",
             mode="async",
             node=node,
             nodes=nodes,
-            zenoh={"linger": PATIENCE, **zenoh},
+            zenoh={"grace_period": TIMEOUT, **zenoh},
         )
         self.iterations = 0
         self.found = False
@@ -94,7 +94,7 @@ class Solve:
     @property
     def plan(self) -> Plan:
         """The plan, once there is one."""
-        self._thread.join(3 * PATIENCE)
+        self._thread.join(3 * TIMEOUT)
         assert not self._thread.is_alive(), "the solve hangs"
         if self._error is not None:
             raise self._error
@@ -168,7 +168,7 @@ def test_messages_that_are_lost_doubled_and_late_do_no_harm(monkeypatch: pytest.
     )
     endpoint = free_endpoint()
     # Who loses the last word of another waits for it until this is over.
-    listens, connects = {"listen": [endpoint], "linger": 10.0}, {"connect": [endpoint], "linger": 10.0}
+    listens, connects = {"listen": [endpoint], "grace_period": 10.0}, {"connect": [endpoint], "grace_period": 10.0}
     weak = [Solve(CIRCLE, node=1, nodes=3, zenoh=listens, **WEAK)]
     weak += [Solve(CIRCLE, node=2, nodes=3, zenoh=connects, **WEAK)]
     wait_until(lambda: all(solve.iterations > 3 for solve in weak), "some iterations")
@@ -271,7 +271,7 @@ def test_what_has_arrived_is_not_lost_with_the_planner_here(heard: bool, monkeyp
     try:
         failing = Solve(CIRCLE, node=1, nodes=2, zenoh={"listen": [endpoint]}, **STRONG)
         if heard:
-            other = Solve(CIRCLE, node=0, nodes=2, zenoh={"connect": [endpoint], "linger": 2.0}, **STRONG)
+            other = Solve(CIRCLE, node=0, nodes=2, zenoh={"connect": [endpoint], "grace_period": 2.0}, **STRONG)
             assert_verified(other.plan)
     finally:
         go.set()
@@ -357,7 +357,7 @@ def test_a_plan_that_claims_a_false_reward_is_not_believed(attacker: Callable[[s
 
 def test_a_solution_is_found_among_liars(attacker: Callable[[str], ZenohTransport]) -> None:
     endpoint = free_endpoint()
-    solve = Solve(CIRCLE, node=0, nodes=2, zenoh={"listen": [endpoint], "linger": 1.0}, **STRONG)
+    solve = Solve(CIRCLE, node=0, nodes=2, zenoh={"listen": [endpoint], "grace_period": 1.0}, **STRONG)
     end = attacker(endpoint)
     claim = Message(1, 1, np.zeros((CIRCLE.horizon, 4, 2), np.float32), 1e9, True)
     for sequence in range(1, 50):

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from network_support import PATIENCE, free_endpoint, wait_until
+from network_support import TIMEOUT, free_endpoint, wait_until
 from planner_support import hop_problem, walled_in_problem
 
 from d4orm_env.scenarios import make_problem, save_problem
@@ -71,8 +71,8 @@ class Process:
 
     def end(self) -> int:
         """Its exit status."""
-        status = self.process.wait(3 * PATIENCE)
-        self._reader.join(PATIENCE)
+        status = self.process.wait(3 * TIMEOUT)
+        self._reader.join(TIMEOUT)
         if status < 0:
             sys.stdout.write("\n".join(self.lines))  # which pytest shows if the test fails
         return status
@@ -109,7 +109,9 @@ def test_all_nodes_end_and_name_the_same_best_candidate(start: Any, tmp_path: Pa
             nodes=3,
             problem="team.yaml",
             out=f"plan{node}.npz",
-            zenoh={"connect": [endpoint], "linger": PATIENCE} if node else {"listen": [endpoint], "linger": PATIENCE},
+            zenoh={"connect": [endpoint], "grace_period": TIMEOUT}
+            if node
+            else {"listen": [endpoint], "grace_period": TIMEOUT},
         )
         for node in range(3)
     ]
@@ -128,9 +130,9 @@ def test_all_nodes_end_and_name_the_same_best_candidate(start: Any, tmp_path: Pa
 def test_the_others_go_on_when_a_node_is_killed_while_it_plans(start: Any, tmp_path: Path) -> None:
     endpoint = free_endpoint()
     save_problem(hop_problem(2), tmp_path / "hop.yaml")
-    settings = {"engine": "cpu", "num_samples": 192, "num_steps": 20, "improve": True, "patience": 0.2}
+    settings = {"engine": "cpu", "num_samples": 192, "num_steps": 20, "improve": True, "timeout": 0.2}
     # All would plan on for long, and the others know each other only by the one that is killed.
-    common = {"nodes": 3, "problem": "hop.yaml", "settings": settings, "time_limit": 10 * PATIENCE}
+    common = {"nodes": 3, "problem": "hop.yaml", "settings": settings, "time_limit": 10 * TIMEOUT}
     victim = start(node=0, zenoh={"listen": [endpoint]}, **common)
     victim.says("iteration 1 ")
     nodes = {node: start(node=node, out=f"plan{node}.npz", zenoh={"connect": [endpoint]}, **common) for node in (1, 2)}
@@ -152,7 +154,7 @@ def test_the_others_go_on_when_a_node_is_killed_while_it_plans(start: Any, tmp_p
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_a_node_with_the_best_so_far(number: int, start: Any, tmp_path: Path) -> None:
     save_problem(walled_in_problem(), tmp_path / "ring.yaml")
-    node = start(node=0, nodes=2, problem="ring.yaml", time_limit=10 * PATIENCE)
+    node = start(node=0, nodes=2, problem="ring.yaml", time_limit=10 * TIMEOUT)
     node.says("iteration 2 ")
     node.process.send_signal(number)
     assert node.end() == 1

@@ -8,7 +8,7 @@ import numpy as np
 import oracle
 import pytest
 from engine_support import ENGINE_NAMES, MODEL_NAMES, RecordedRules, cpu_rewards, random_controls, toward_goals
-from reference import judge, position_error
+from reference import evaluate, position_error
 
 from d4orm_env import make_problem
 from d4orm_env.core.problem import Problem
@@ -67,7 +67,7 @@ def test_sampled_rewards_agree(model: str) -> None:
     samples = oracle.sample_controls(task, np.zeros_like(task.base), 0.7, 96, 3, 0)
     expected = oracle.score(problem, task.base[None] + samples).T
     # A comparison with a threshold may fall either way by rounding, and then one step's penalty makes the difference.
-    clear = judge(task, task.base + samples).doubt > position_error(task, samples)
+    clear = evaluate(task, task.base + samples).doubt > position_error(task, samples)
     assert clear.mean() > 0.8
     np.testing.assert_allclose(rewards[:, clear], expected[:, clear], atol=2e-4)
 
@@ -81,7 +81,7 @@ def test_a_denoising_run_agrees(name: str) -> None:
     result = get_sampling_engine(name).denoise(task, recorded.rules, mean, noise_scale, 128, 5)
     for step, (sigma, rewards) in enumerate(zip(noise_scale, recorded.rewards, strict=True)):
         samples = oracle.sample_controls(task, mean, sigma, 128, 5, step)
-        clear = judge(task, task.base + samples).doubt > position_error(task, samples, control_error=1e-5)
+        clear = evaluate(task, task.base + samples).doubt > position_error(task, samples, control_error=1e-5)
         assert clear.mean() > 0.8
         expected = oracle.score(problem, task.base + samples).mean(axis=1)
         np.testing.assert_allclose(rewards[0, clear], expected[clear], atol=2e-4)

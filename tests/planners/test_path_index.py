@@ -15,14 +15,14 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.threads import Threads
 from d4orm_planners.engine import path_index
-from d4orm_planners.engine.path_index import PathIndex, judge_alone
+from d4orm_planners.engine.path_index import PathIndex, check_alone
 
 RADIUS = np.array([0.125, 0.25, 0.5, 0.0, 0.25])
 
 
-def near(paths: np.ndarray, way: np.ndarray, robot: int, margin: float) -> np.ndarray:
-    """``(H, K)`` whom a robot on a way comes near after each step, by looking at all."""
-    gap2 = ((paths[1:].astype(np.float64) - way[1:, None].astype(np.float64)) ** 2).sum(axis=2)
+def near(paths: np.ndarray, path: np.ndarray, robot: int, margin: float) -> np.ndarray:
+    """``(H, K)`` whom a robot on a path comes near after each step, by looking at all."""
+    gap2 = ((paths[1:].astype(np.float64) - path[1:, None].astype(np.float64)) ** 2).sum(axis=2)
     close = gap2 <= (RADIUS + RADIUS[robot] + margin) ** 2
     close[:, robot] = False
     return close
@@ -36,16 +36,16 @@ def drawn_paths(dimension: int, count: int = 5) -> st.SearchStrategy[np.ndarray]
 @pytest.mark.parametrize("dimension", [2, 3])
 @given(st.data(), st.floats(0, 1))
 def test_pairs_and_counts_are_those_of_looking_at_all(dimension: int, data: Any, margin: float) -> None:
-    paths, ways = data.draw(drawn_paths(dimension)), data.draw(drawn_paths(dimension, 3))
+    paths, others = data.draw(drawn_paths(dimension)), data.draw(drawn_paths(dimension, 3))
     index = PathIndex(paths, RADIUS, margin)
     expected = [(i, j) for i in range(5) for j in range(i + 1, 5) if near(paths, paths[:, i], i, margin)[:, j].any()]
     assert [tuple(pair) for pair in index.pairs().tolist()] == expected
-    met, when = index.count_meetings([4, 1], np.stack([ways.swapaxes(0, 1)] * 2))
+    met, when = index.count_meetings([4, 1], np.stack([others.swapaxes(0, 1)] * 2))
     for row, robot in enumerate([4, 1]):
-        for way in range(3):
-            close = near(paths, ways[:, way], robot, margin)
-            assert met[row, way] == close.any(axis=0).sum()
-            assert when[row, way] == (close.any(axis=1).argmax() + 1 if close.any() else 22)
+        for path in range(3):
+            close = near(paths, others[:, path], robot, margin)
+            assert met[row, path] == close.any(axis=0).sum()
+            assert when[row, path] == (close.any(axis=1).argmax() + 1 if close.any() else 22)
 
 
 @given(drawn_paths(2), drawn_paths(2, 2))
@@ -79,23 +79,23 @@ def test_any_number_of_threads_says_the_same(monkeypatch: pytest.MonkeyPatch) ->
     for threads in (1, 2, 5):
         monkeypatch.setattr(path_index, "Threads", lambda _, threads=threads: Threads(threads))
         index = PathIndex(paths, np.full(60, 0.15), 0.05)
-        ways = np.ascontiguousarray(paths.swapaxes(0, 1))[:, None]
-        results.append([index.pairs(), *index.count_meetings(np.arange(60), ways)])
+        others = np.ascontiguousarray(paths.swapaxes(0, 1))[:, None]
+        results.append([index.pairs(), *index.count_meetings(np.arange(60), others)])
     for other in results[1:]:
         for one, same in zip(results[0], other, strict=True):
             np.testing.assert_array_equal(one, same)
     assert len(results[0][0]) > 10
 
 
-def test_a_way_alone_touches_stops_and_is_unsure_when_it_is() -> None:
+def test_a_path_alone_touches_stops_and_is_unsure_when_it_is() -> None:
     """Past a circle, and on to where the goal begins: there rounding decides."""
     world = World(circles=[[2, 0.4, 0.25]])
     problem = Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[4, 0]], world, horizon=50, goal_radius=0.25)
-    way = np.zeros((1, 2, 51, 2), np.float32)
-    way[0, 0, :, 0] = np.minimum(np.linspace(0, 5, 51), 3.75)
-    way[0, 1, :, 1] = -np.minimum(np.arange(51) / 10, 1)
-    touching, moves, unsure = judge_alone(problem.arrays, [0], way)
-    clearance = world.clearance(way[0, 0]) <= float(problem.team.radius[0]) + problem.margin
+    path = np.zeros((1, 2, 51, 2), np.float32)
+    path[0, 0, :, 0] = np.minimum(np.linspace(0, 5, 51), 3.75)
+    path[0, 1, :, 1] = -np.minimum(np.arange(51) / 10, 1)
+    touching, moves, unsure = check_alone(problem.arrays, [0], path)
+    clearance = world.clearance(path[0, 0]) <= float(problem.team.radius[0]) + problem.margin
     assert touching.tolist() == [[int(clearance.argmax()), 51]]
     assert moves.tolist() == [[38, 10]]
     assert unsure.tolist() == [[38, 51]]

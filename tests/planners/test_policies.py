@@ -22,7 +22,7 @@ from d4orm_planners import OpenLoop, Plan, Policy, list_planners, list_policies,
 from d4orm_planners.base.adapters import SharedPolicy
 from d4orm_planners.base.planner_registry import PLANNERS, POLICIES, describe_policy
 from d4orm_planners.rl.learned import LearnedPolicy
-from d4orm_planners.tracking.steering import goals_along_ways, limit_controls
+from d4orm_planners.tracking.steering import goals_along_paths, limit_controls
 
 ALL = pytest.mark.parametrize("name", list_policies())
 
@@ -356,24 +356,25 @@ def test_orca_goes_around_obstacles_and_docked_robots_and_stays_in_bounds() -> N
     assert episode.metrics["success"] == 1
 
 
-@pytest.mark.parametrize("ways", [True, False])
-def test_orca_finds_its_way_through_rooms(ways: bool) -> None:
+@pytest.mark.parametrize("shortest_paths", [True, False])
+def test_orca_finds_its_way_through_rooms(shortest_paths: bool) -> None:
     env = navigation_v0.parallel_env("rooms", num_robots=4)
-    assert run_episode(env, make_policy("orca", ways=ways), seed=0).metrics["success"] == ways
+    policy = make_policy("orca", shortest_paths=shortest_paths)
+    assert run_episode(env, policy, seed=0).metrics["success"] == shortest_paths
 
 
 def test_goals_lie_along_the_ways_of_those_that_have_one() -> None:
     problem = make_problem("rooms", num_robots=4, seed=0)
     places, goals = problem.start[:, :2], problem.goal.copy()
     goals[3] += 0.1
-    ahead = goals_along_ways(problem, places, goals)
+    ahead = goals_along_paths(problem, places, goals)
     np.testing.assert_array_equal(ahead[3], goals[3])
     np.testing.assert_allclose(np.linalg.norm(ahead - places, axis=1)[:3], problem.shortest_paths.length[:3], rtol=1e-5)
     directions = (ahead - places)[:3] / problem.shortest_paths.length[:3, None]
     np.testing.assert_allclose(directions, problem.shortest_paths.direction(places)[:3], atol=1e-5)
-    np.testing.assert_array_equal(goals_along_ways(problem, problem.goal, problem.goal), problem.goal)
+    np.testing.assert_array_equal(goals_along_paths(problem, problem.goal, problem.goal), problem.goal)
     empty = make_problem("random", num_robots=4)
-    assert goals_along_ways(empty, empty.start[:, :2], empty.goal) is empty.goal
+    assert goals_along_paths(empty, empty.start[:, :2], empty.goal) is empty.goal
 
 
 def test_orca_keeps_two_velocity_controlled_robots_outside_the_margin() -> None:

@@ -26,7 +26,7 @@ def _mark(radius, margin, bodies, first, count, places, scratch):
 
 @numba.njit
 def _near_static(arrays, k, bounds, scratch):
-    return proximity.near_static(arrays, k, bounds, scratch.boxes, scratch.spare)
+    return proximity.near_static(arrays, k, bounds, scratch.boxes, scratch.buffer)
 
 
 def places_of(positions):

@@ -1,4 +1,4 @@
-"""Plans become shorter and never worse: groups of robots find faster ways around all others."""
+"""Plans become shorter and never worse: groups of robots find faster paths around all others."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_ways
+from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
 from d4orm_planners.mapf.lns import improve_paths
 from d4orm_planners.tracking.steering import straight_drives
 
@@ -41,7 +41,7 @@ def travel_time(team: WorkingPlan) -> float:
 
 
 @pytest.mark.parametrize("model", MODEL_NAMES)
-def test_ways_become_shorter_and_stay_free(model: str) -> None:
+def test_paths_become_shorter_and_stay_free(model: str) -> None:
     team = solved_team(make_problem("random", num_robots=10, model=model, seed=1))
     before = travel_time(team)
     improve_paths(team, seed=0, rounds=6, temperature=0.0)
@@ -49,7 +49,7 @@ def test_ways_become_shorter_and_stay_free(model: str) -> None:
     assert verify(team.problem, team.controls).ok
 
 
-def test_ways_among_obstacles_become_shorter() -> None:
+def test_paths_among_obstacles_become_shorter() -> None:
     team = solved_team(make_problem("four_obstacles", num_robots=12))
     before = travel_time(team)
     improve_paths(team, seed=0, rounds=6, temperature=0.0)
@@ -88,30 +88,31 @@ def crossing() -> WorkingPlan:
     return WorkingPlan(search, search.current.trajectory)
 
 
-def arrival(ways: Any) -> int:
-    """Steps that the only robot's only way takes, or -1 for none."""
-    moves = (np.diff(ways.positions[:, 0, 0], axis=0) != 0).any(axis=1)
-    return int(np.flatnonzero(moves).max()) + 1 if ways.arrived[0, 0] else -1
+def arrival(found: Any) -> int:
+    """Steps that the only robot's only path takes, or -1 for none."""
+    moves = (np.diff(found.positions[:, 0, 0], axis=0) != 0).any(axis=1)
+    return int(np.flatnonzero(moves).max()) + 1 if found.arrived[0, 0] else -1
 
 
 def test_a_robot_minds_whom_it_is_told_to() -> None:
     team, me = crossing(), np.array([0])
     straight = straight_drives(team.problem.select([0]))
     nobody = np.zeros((1, 0, 81, 2), np.float32)
-    alone = find_ways(team, me, 0, STRAIGHT, STRICT, company=OtherAgents(np.array([[0, 1]]), nobody, np.zeros((1, 0))))
-    around = find_ways(team, me, 0, STRAIGHT, STRICT)
+    nobody_else = OtherAgents(np.array([[0, 1]]), nobody, np.zeros((1, 0)))
+    alone = find_paths(team, me, 0, STRAIGHT, STRICT, other_agents=nobody_else)
+    around = find_paths(team, me, 0, STRAIGHT, STRICT)
     assert arrival(alone) == arrival(straight)
     assert arrival(around) > arrival(alone)
     # Somebody who is not in the team stands where robot 1 does.
     there = np.broadcast_to(np.float32([1.5, 0]), (1, 1, 81, 2)).copy()
-    company = OtherAgents(np.array([[0, 1]]), there, np.array([[0.15]]))
-    np.testing.assert_array_equal(find_ways(team, me, 0, STRAIGHT, STRICT, company=company).states, around.states)
+    others = OtherAgents(np.array([[0, 1]]), there, np.array([[0.15]]))
+    np.testing.assert_array_equal(find_paths(team, me, 0, STRAIGHT, STRICT, other_agents=others).states, around.states)
 
 
-def test_a_way_that_costs_too_much_is_not_found() -> None:
+def test_a_path_that_costs_too_much_is_not_found() -> None:
     team, me = crossing(), np.array([0])
-    time = arrival(find_ways(team, me, 0, STRAIGHT, STRICT)) * team.problem.dt
-    assert find_ways(team, me, 0, STRAIGHT, STRICT, time + 0.1).arrived.all()
-    ways = find_ways(team, me, 0, STRAIGHT, STRICT, time - 0.15)
-    assert not ways.arrived.any()
-    np.testing.assert_array_equal(ways.states[:, :, 0], team.states[:, me])
+    time = arrival(find_paths(team, me, 0, STRAIGHT, STRICT)) * team.problem.dt
+    assert find_paths(team, me, 0, STRAIGHT, STRICT, time + 0.1).arrived.all()
+    found = find_paths(team, me, 0, STRAIGHT, STRICT, time - 0.15)
+    assert not found.arrived.any()
+    np.testing.assert_array_equal(found.states[:, :, 0], team.states[:, me])

@@ -1,4 +1,4 @@
-"""Ways for a team that never rests: new ones around those that the others have, who leave their goals again."""
+"""Paths for a team that never rests: new ones around those that the others have, who leave their goals again."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.mapf.planner import compile_path_finding
-from d4orm_planners.mapf.relay import LINGER, relay_ways
+from d4orm_planners.mapf.relay import DWELL, relay_paths
 from d4orm_planners.mapf.roadmap import lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning
 
 
 def standing(problem: Problem) -> FloatArray:
-    """Ways of robots that stay where they are."""
+    """Paths of robots that stay where they are."""
     return problem.start[None, :, : problem.dimension]
 
 
@@ -25,37 +25,37 @@ def everybody(problem: Problem) -> np.ndarray:
     return np.ones(problem.num_robots, bool)
 
 
-def arrivals(problem: Problem, ways: FloatArray) -> np.ndarray:
+def arrivals(problem: Problem, paths: FloatArray) -> np.ndarray:
     """``(K,)`` first step at which each robot is at its goal."""
-    there = np.linalg.norm(ways - problem.goal, axis=2) <= problem.goal_radius
+    there = np.linalg.norm(paths - problem.goal, axis=2) <= problem.goal_radius
     assert there.any(axis=0).all()
     return there.argmax(axis=0)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_ways_keep_everybody_apart_until_they_leave_their_goals(seed: int) -> None:
+def test_paths_keep_everybody_apart_until_they_leave_their_goals(seed: int) -> None:
     problem = make_problem("warehouse", num_robots=12, seed=seed)
-    ways = relay_ways(problem, standing(problem), everybody(problem), seed)
-    assert ways is not None
-    assert ways.shape == (problem.horizon + 1, 12, 2)
-    np.testing.assert_array_equal(ways[0], problem.start[:, :2])
-    ends, radius = arrivals(problem, ways) + round(LINGER / problem.dt), np.asarray(problem.team.radius)
+    paths = relay_paths(problem, standing(problem), everybody(problem), seed)
+    assert paths is not None
+    assert paths.shape == (problem.horizon + 1, 12, 2)
+    np.testing.assert_array_equal(paths[0], problem.start[:, :2])
+    ends, radius = arrivals(problem, paths) + round(DWELL / problem.dt), np.asarray(problem.team.radius)
     for i, j in combinations(range(12), 2):
         together = slice(None, min(ends[i], ends[j]))
-        gap = np.linalg.norm(ways[together, i] - ways[together, j], axis=1).min()
+        gap = np.linalg.norm(paths[together, i] - paths[together, j], axis=1).min()
         assert gap > radius[i] + radius[j] + problem.margin
-    clearance = problem.world.clearance(ways.reshape(-1, 2)).reshape(ways.shape[:2])
+    clearance = problem.world.clearance(paths.reshape(-1, 2)).reshape(paths.shape[:2])
     assert (clearance > radius).all()
 
 
 def test_who_keeps_its_goal_keeps_its_way_if_it_can() -> None:
     problem = make_problem("warehouse", num_robots=6, seed=0)
-    ways = relay_ways(problem, standing(problem), everybody(problem), 0)
-    assert ways is not None
+    paths = relay_paths(problem, standing(problem), everybody(problem), 0)
+    assert paths is not None
     changed = np.arange(6) == 2
-    again = relay_ways(problem, ways, changed, 1)
+    again = relay_paths(problem, paths, changed, 1)
     assert again is not None
-    np.testing.assert_array_equal(again[:, ~changed], ways[:, ~changed])
+    np.testing.assert_array_equal(again[:, ~changed], paths[:, ~changed])
     assert arrivals(problem, again)[2] < problem.horizon
 
 
@@ -70,9 +70,9 @@ def corridor_past_a_goal() -> Problem:
 
 def test_a_goal_can_be_passed_once_who_arrived_has_gone_on() -> None:
     problem = corridor_past_a_goal()
-    ways = relay_ways(problem, standing(problem), everybody(problem), 0)
-    assert ways is not None
-    first, second = arrivals(problem, ways)
+    paths = relay_paths(problem, standing(problem), everybody(problem), 0)
+    assert paths is not None
+    first, second = arrivals(problem, paths)
     assert first < second < problem.horizon
     # Nobody gets past a robot that stays for good.
     compile_path_finding(problem)
@@ -87,7 +87,7 @@ def test_a_goal_without_a_way_has_no_ways() -> None:
         lower=problem.world.lower, upper=problem.world.upper,
     )  # fmt: skip
     closed = Problem(problem.team, problem.start, problem.goal, walls, horizon=problem.horizon)
-    assert relay_ways(closed, standing(closed), everybody(closed), 0) is None
+    assert relay_paths(closed, standing(closed), everybody(closed), 0) is None
 
 
 def ring(place: FloatArray) -> list[list[float]]:

@@ -1,4 +1,4 @@
-"""Robots that fail find ways around all others: waiting, turning off, in space and among obstacles."""
+"""Robots that fail find paths around all others: waiting, turning off, in space and among obstacles."""
 
 from __future__ import annotations
 

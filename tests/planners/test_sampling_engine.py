@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, RecordedRules, cpu_rewards, engine_noise, toward_goals
 from env_support import mixed_problem
-from reference import ROUNDOFF, judge, position_error
+from reference import ROUNDOFF, evaluate, position_error
 from scenario_support import needed
 
 from d4orm_env.core.problem import Problem
@@ -185,13 +185,13 @@ def step_by_step(
 
 def assert_rewards(task: SamplingTask, controls: np.ndarray, rewards: np.ndarray, drift: float = 0.0) -> None:
     """Hold ``rewards`` ``(1 or K, M)`` to those of the reference, in all samples that leave no doubt."""
-    judged, error = judge(task, controls), position_error(task, controls, drift)
-    clear = judged.doubt > error
+    expected, error = evaluate(task, controls), position_error(task, controls, drift)
+    clear = expected.doubt > error
     # Else the comparison would say little. Two samples in three is what the fullest of worlds here leaves.
     assert clear.mean() > 0.6
-    gap, tolerance = rewards - judged.rewards, error * judged.inverse_distance
+    gap, tolerance = rewards - expected.rewards, error * expected.inverse_distance
     if task.credit == "team":
-        gap, tolerance = rewards - judged.rewards.mean(axis=0), tolerance.mean(keepdims=True)
+        gap, tolerance = rewards - expected.rewards.mean(axis=0), tolerance.mean(keepdims=True)
     penalty = task.penalty * task.problem.collision_penalty
     assert (np.abs(gap[:, clear]) <= (tolerance + 16 * ROUNDOFF * penalty)[:, None]).all()
 
@@ -269,7 +269,7 @@ def test_the_reference_tells_contacts_and_docking_apart() -> None:
     """Were no sample ever near anything, agreement on it would say nothing."""
 
     def mean_reward(task: SamplingTask) -> float:
-        return float(judge(task, sampled_controls(task, 0, np.float32(0.7), 3, 0)).rewards.mean())
+        return float(evaluate(task, sampled_controls(task, 0, np.float32(0.7), 3, 0)).rewards.mean())
 
     free, crowded, moving = (mean_reward(TASKS[name]()) for name in ("no collisions", "holonomic2d", "moving"))
     assert moving + 0.02 < crowded

@@ -50,7 +50,7 @@ def made(kind: type[CheckedSettings], setting: str, value: Any) -> CheckedSettin
 def test_the_numbers_of_all_kinds_are_looked_at() -> None:
     found = {(param.values[0].__name__, param.values[1]) for param in numbers()}
     assert {("D4ormConfig", "beta_start"), ("D4ormC2FConfig", "deadline"), ("OrcaConfig", "max_neighbors")} <= found
-    assert {("IpoptConfig", "lookout"), ("DD4ormConfig", "patience"), ("DD4ormConfig", "nodes")} <= found
+    assert {("IpoptConfig", "lookout"), ("DD4ormConfig", "timeout"), ("DD4ormConfig", "nodes")} <= found
 
 
 @NUMBERS

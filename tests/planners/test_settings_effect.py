@@ -23,7 +23,7 @@ from d4orm_planners.tracking.steering import straight_drives
 TESTS = Path(__file__).parent
 
 ELSEWHERE = {
-    "patience": ("test_distributed.py", "test_an_asynchronous_node_waits_once_for_one_that_is_silent"),
+    "timeout": ("test_distributed.py", "test_an_asynchronous_node_waits_once_for_one_that_is_silent"),
     "transport": ("test_distributed_ray.py", "test_rounds_over_ray"),
     "address": ("test_distributed_ray.py", "test_a_cluster_that_is_not_there_is_one_clear_error"),
     "node": ("test_network_faults.py", "test_of_two_nodes_with_one_number_the_second_is_refused"),
@@ -181,7 +181,7 @@ def test_the_same_settings_have_the_same_outcome() -> None:
 
 
 def lone() -> Problem:
-    """One robot, whose straight way is a solution."""
+    """One robot, whose straight path is a solution."""
     return make_problem("circle", num_robots=1, diameter=2.0, horizon=60)
 
 
@@ -198,13 +198,13 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "coarse_steps": (6, {}),
         "coarse_repair_steps": (6, {}),
         "coarse_preset": ("paper", {}),
-        "first_guess": ("go-to-goal", {}),
+        "warm_start": ("go-to-goal", {}),
         "coarse_iterations": (1, {}),
         "max_lag": (0, {}),
-        "sight": (False, {"scenario": "maze", "max_cycles": 60}),
-        "relative_distance": (True, {}),
+        "line_of_sight": (False, {"scenario": "maze", "max_cycles": 60}),
+        "normalise_distance": (True, {}),
         "safe_mix": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Push(3.0, 0.5)]}),
-        "drive_home": (False, {"scenario": "circle", "max_cycles": 60}),
+        "direct_final_approach": (False, {"scenario": "circle", "max_cycles": 60}),
         "expect_losses": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Dropout(0.5)]}),
         "filter_states": (False, {"disturbances": [StateNoise(0.05, 0.05)], "max_cycles": 60}),
         "learn_limits": (False, {"disturbances": [LimitMismatch(0.6)]}),
@@ -239,7 +239,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "neighbor_distance": (10.0, {}),
         "max_neighbors": (1, {}),
         "clearance": (0.2, {}),
-        "ways": (False, {"scenario": "rooms"}),
+        "shortest_paths": (False, {"scenario": "rooms"}),
         "deviation": (0.4, {}),
     },
 }

@@ -118,19 +118,19 @@ def test_arguments_are_left_alone() -> None:
 
 
 @pytest.mark.parametrize("model", [*MODEL_NAMES, "mixed"])
-def test_a_way_by_points_comes_near_all_of_them_in_turn(model: str) -> None:
+def test_a_path_by_points_comes_near_all_of_them_in_turn(model: str) -> None:
     problem = problem_of(model).replace(horizon=300)
     given, _ = closing(problem, np.zeros((300, problem.num_robots, problem.control_size), np.float32))
     start = np.asarray(problem.start)[:, None, None, : problem.dimension]
     steps = np.zeros((1, 2, 2, problem.dimension))
     steps[0, :, :, :2] = [[[1, 1], [2, -1]], [[-1, -1], [-1, 1]]]
     switch = np.zeros((problem.num_robots, 2), int)
-    ways = drives(problem, given.states, given.controls, switch, start + steps)
-    assert ways.arrived.all()
-    gap = np.linalg.norm(ways.positions[:, :, :, None] - (start + steps), axis=4)
+    drawn = drives(problem, given.states, given.controls, switch, start + steps)
+    assert drawn.arrived.all()
+    gap = np.linalg.norm(drawn.positions[:, :, :, None] - (start + steps), axis=4)
     near = NEAR_VIA * problem.team.largest_radius
     assert (gap.min(axis=0) < near).all()
     first = (gap < near).argmax(axis=0)
     assert (first[..., 1] > first[..., 0]).all()
-    rollout = CPU.rollout(problem, ways.controls[:, :, 1])
-    np.testing.assert_allclose(rollout.states, ways.states[:, :, 1], atol=1e-4)
+    rollout = CPU.rollout(problem, drawn.controls[:, :, 1])
+    np.testing.assert_allclose(rollout.states, drawn.states[:, :, 1], atol=1e-4)

@@ -64,7 +64,7 @@ def test_no_iteration_goes_on_beyond_the_limit(name: str, scenario: str, clock: 
     assert plan.status == "time_limit"
     assert longest_iteration(plan) <= LOOKS
     if name == "ipopt":
-        # Where there is no way, a quick solver may have found that out with its last iteration.
+        # Where there is no path, a quick solver may have found that out with its last iteration.
         found_out = ("Infeasible_Problem_Detected",) if scenario == "walled in" else ()
         assert plan.history[-1].note in ("User_Requested_Stop", ABANDONED, OUT_OF_TIME, *found_out)
     elif name not in ("mapf", "amswarm") and (name, scenario) != ("mmd", "walled in"):
@@ -75,7 +75,7 @@ def test_no_iteration_goes_on_beyond_the_limit(name: str, scenario: str, clock: 
 @pytest.mark.parametrize("inner", ["d4orm", "d4orm-d"])
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_no_node_goes_on_beyond_the_limit(inner: str, mode: str, clock: None) -> None:
-    planner = long_winded("d-d4orm", planner=inner, mode=mode, nodes=3, improve=True, patience=60)
+    planner = long_winded("d-d4orm", planner=inner, mode=mode, nodes=3, improve=True, timeout=60)
     plan = planner.solve(make_problem("circle", num_robots=8), time_limit=LOOKS, max_iterations=10**6)
     assert plan.status == "time_limit"
     # Had a node not finished in time, a note would tell.

@@ -166,7 +166,7 @@ def test_any_text_is_an_endpoint_or_refused(text: str) -> None:
         ({"connect": ["pigeon/1.2.3.4:1"]}, "connect has 'pigeon/1.2.3.4:1'.* with one of tcp, tls"),
         ({"connect": [7447]}, "connect has 7447"),
         ({"multicast": "yes"}, "multicast must be true or false, not 'yes'"),
-        ({"linger": -1}, "linger is -1; it must be zero or more"),
+        ({"grace_period": -1}, "grace_period is -1; it must be zero or more"),
         ({"colour": 1}, "'colour' is no setting of zenoh; it takes namespace, listen"),
     ],
 )

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser_support import PATIENCE, Page, browser, missing
+from browser_support import TIMEOUT, Page, browser, missing
 
 from d4orm_env import Problem, World, load_problem, make_problem
 from d4orm_planners import make_planner, register_policy
@@ -195,17 +195,17 @@ def drag_until(
 
 def repeat_until(condition: Callable[[], object], act: Callable[[], None]) -> None:
     """Act, and again as long as that does nothing: a busy machine may not have drawn yet what is acted on."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
         act()
-        patience = time.monotonic() + 10
-        while not condition() and time.monotonic() < patience:
+        soon = time.monotonic() + 10
+        while not condition() and time.monotonic() < soon:
             time.sleep(0.01)
 
 
 def wait_for(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -250,7 +250,7 @@ def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
 def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path: Path) -> None:
     world = World(boxes=[[-0.2, -0.2, 0.2, 0.2]])
     problem = make_problem("circle", num_robots=2, seed=0)
-    with running(problem.resumed_at(problem.start, problem.goal, world=world), "go-to-goal") as playground:
+    with running(problem.with_state(problem.start, problem.goal, world=world), "go-to-goal") as playground:
         session = playground.session
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         look_at(page, playground, "circle, 2 robots, go-to-goal")
@@ -405,7 +405,7 @@ class Slow(GoToGoal):
         self._ended = ended
 
     def _begin(self, env: object, seed: int) -> None:
-        self._ended.wait(PATIENCE)
+        self._ended.wait(TIMEOUT)
 
 
 @viser_leaves_loops

@@ -28,12 +28,12 @@ from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.scene_frame import closest_approach
 from d4orm_planners.play.session import Session
 
-PATIENCE = 60.0
+TIMEOUT = 60.0
 
 
 def until(condition: Callable[[], object]) -> None:
     """Wait for something that another thread does."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
@@ -68,7 +68,7 @@ def test_a_goal_goes_where_it_is_dragged(scene: Problem) -> None:
 def test_a_robot_stands_where_it_is_put(scene: Problem) -> None:
     start = np.array(scene.start)
     start[2, 2:] = 0.3
-    moved = edits.move_robot(scene.resumed_at(start, scene.goal), 2, [0.1, 0.2])
+    moved = edits.move_robot(scene.with_state(start, scene.goal), 2, [0.1, 0.2])
     np.testing.assert_allclose(moved.start[2], [0.1, 0.2, 0, 0])
 
 
@@ -89,7 +89,7 @@ def test_what_makes_no_sense_is_refused(scene: Problem, edit: edits.Edit, compla
 
 
 def test_walls_stop_goals_and_robots(scene: Problem) -> None:
-    walled = scene.resumed_at(scene.start, scene.goal, world=World(boxes=[[-0.2, -0.2, 0.2, 0.2]]))
+    walled = scene.with_state(scene.start, scene.goal, world=World(boxes=[[-0.2, -0.2, 0.2, 0.2]]))
     with pytest.raises(ValueError, match="would touch an obstacle"):
         edits.move_goal(walled, 0, [0, 0])
     with pytest.raises(ValueError, match="the obstacle would touch the robot_"):
@@ -128,7 +128,7 @@ def test_obstacles_come_and_go(scenario: str, kind: str, random: np.random.Gener
 )
 def test_obstacles_move(scene: Problem, world: World) -> None:
     kind = next(name for name in ("circles", "boxes", "polygons") if len(getattr(world, name)))
-    moved = edits.move_obstacle(scene.resumed_at(scene.start, scene.goal, world=world), kind, 0, [0.3, 0.1])
+    moved = edits.move_obstacle(scene.with_state(scene.start, scene.goal, world=world), kind, 0, [0.3, 0.1])
     points = np.random.default_rng(1).uniform(-1, 1, (50, 2))
     np.testing.assert_allclose(moved.world.clearance(points + np.array([0.3, 0.1])), world.clearance(points), atol=1e-5)
 
@@ -376,7 +376,7 @@ def test_a_level_that_makes_no_sense_is_left(session: Session) -> None:
 
 def test_a_slow_planner_holds_nobody_up(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
-    monkeypatch.setattr(GoToGoal, "_begin", lambda *_: go_on.wait(PATIENCE))
+    monkeypatch.setattr(GoToGoal, "_begin", lambda *_: go_on.wait(TIMEOUT))
     session.reset()
     until(lambda: session.frame.status.state == "planning")
     begin = time.monotonic()
@@ -384,7 +384,7 @@ def test_a_slow_planner_holds_nobody_up(session: Session, monkeypatch: pytest.Mo
     session.disturb({})
     assert session.replay().html
     assert session.scene.num_robots == 4
-    assert time.monotonic() - begin < PATIENCE, "nobody waits for the planner"
+    assert time.monotonic() - begin < TIMEOUT, "nobody waits for the planner"
     assert session.frame.status.state == "planning"
     go_on.set()
     until(lambda: session.frame.status.state == "running")
@@ -410,7 +410,7 @@ def test_scenes_go_through_files(scene: Problem, random: np.random.Generator) ->
     changed = edits.add_obstacle(edits.add_robot(scene, random), "box", random)
     start = np.array(changed.start)
     start[:, 2] = 0.4
-    under_way = changed.resumed_at(start, changed.goal)
+    under_way = changed.with_state(start, changed.goal)
     read = panel.read_scene(scenario_text(edits.at_rest(under_way)).encode())
     assert read.replace(name="x") == changed.replace(name="x")
 
@@ -458,7 +458,7 @@ def gate() -> Iterator[AuthenticatingProxy]:
 
 def asked(gate: AuthenticatingProxy, path: str, **headers: str) -> tuple[int, str, str]:
     """Status, cookie and body of an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=PATIENCE)
+    connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=TIMEOUT)
     connection.request("GET", path, headers=headers)
     answer = connection.getresponse()
     body = answer.read().decode()
@@ -487,7 +487,7 @@ def test_a_closed_gate_leaves_no_port(gate: AuthenticatingProxy) -> None:
     other = AuthenticatingProxy("127.0.0.1", 0, gate.port)
     other.close()
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", other.port), timeout=PATIENCE)
+        socket.create_connection(("127.0.0.1", other.port), timeout=TIMEOUT)
 
 
 def test_without_the_extra_one_line_names_it() -> None:
@@ -532,16 +532,16 @@ def test_ctrl_c_leaves_no_process_and_no_port() -> None:
         assert process.stdout is not None
         told = "".join(process.stdout.readline() for _ in range(2))
         port = int(re.search(r"http://127\.0\.0\.1:(\d+)/", told)[1])  # type: ignore[index]
-        page = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+        page = http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT)
         page.request("GET", "/")
         assert b"<html" in page.getresponse().read()
         page.close()
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130
+        assert process.wait(TIMEOUT) == 130
         assert process.stderr is not None
         assert "Traceback" not in process.stderr.read()
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
+        socket.create_connection(("127.0.0.1", port), timeout=TIMEOUT)
 
 
 @pytest.mark.parametrize(("module", "program"), [("typer", "cli"), ("viser", "cli"), ("viser", "cli.app")])
@@ -564,7 +564,7 @@ sys.argv[1:] = ["play", "-k", "2", "--no-open"]
 from d4orm_planners.{program} import main
 main()
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=PATIENCE)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=TIMEOUT)
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
 
 

@@ -21,7 +21,7 @@ pytest.importorskip("viser")
 
 from play_support import (
     CAMERA,
-    PATIENCE,
+    TIMEOUT,
     control,
     drag,
     reached,
@@ -201,7 +201,7 @@ def test_who_sends_garbage_is_hung_up_on_in_silence(
         connection.send(frame)
         with pytest.raises(ConnectionClosed):  # noqa: PT012 - it may have been told something before
             while True:
-                connection.recv(timeout=PATIENCE)
+                connection.recv(timeout=TIMEOUT)
         refused(playground, lambda: say(other, update(control(playground, "Robots"), 0)))
     assert not caplog.records
 
@@ -221,7 +221,7 @@ def test_requests_that_cannot_be_read_are_not_printed(
     handlers = logging.root.handlers[:]
     logging.root.handlers.clear()  # as without pytest: what nobody takes, Python prints
     try:
-        with socket.create_connection(("127.0.0.1", playground._server.get_port()), timeout=PATIENCE) as raw:
+        with socket.create_connection(("127.0.0.1", playground._server.get_port()), timeout=TIMEOUT) as raw:
             raw.sendall(sent)
             raw.shutdown(socket.SHUT_WR)
             with suppress(ConnectionError):
@@ -431,7 +431,7 @@ def test_closing_does_not_wait_for_a_plan(monkeypatch: pytest.MonkeyPatch) -> No
     ended = threading.Event()
     with running(make_problem("circle", num_robots=2), "go-to-goal") as playground:
         visitor(playground)  # who does not hang up
-        monkeypatch.setattr(GoToGoal, "_begin", lambda *_: ended.wait(PATIENCE))
+        monkeypatch.setattr(GoToGoal, "_begin", lambda *_: ended.wait(TIMEOUT))
         playground.session.reset()
         until(lambda: playground.session.frame.status.state == "planning")
     assert playground.session._thread.is_alive(), "it was not waited for"
@@ -459,6 +459,6 @@ def test_ctrl_c_ends_what_never_ends(tmp_path: Path) -> None:
         while "Ctrl-C" not in process.stdout.readline():
             pass
         process.send_signal(signal.SIGINT)
-        assert process.wait(PATIENCE) == 130
+        assert process.wait(TIMEOUT) == 130
         assert process.stderr is not None
         assert "Traceback" not in process.stderr.read()

@@ -173,7 +173,7 @@ def test_samples_come_back_from_their_file(tmp_path: Path) -> None:
 def test_ppo_goes_on_from_what_was_imitated(imitated: Path, tmp_path: Path) -> None:
     path = imitated / "policy.safetensors"
     settings = TrainingSettings(
-        num_robots=2, steps=1, num_envs=16, lessons=1, validation_worlds=20, seed=5,
+        num_robots=2, steps=1, num_envs=16, stages=1, validation_worlds=20, seed=5,
         scenario_settings={"size": 2.5}, start_from=path,
     )  # fmt: skip
     learned = train(settings, tmp_path / "on").network
@@ -200,10 +200,10 @@ def test_an_expert_is_told_that_another_drives() -> None:
     make_policy("d4orm-c2f", **own)
 
 
-def test_what_is_practised_along_with_a_scenario_has_robots_like_its_own(tmp_path: Path) -> None:
+def test_what_is_trained_on_along_with_a_scenario_has_robots_like_its_own(tmp_path: Path) -> None:
     spatial = replace(TINY, scenario="sphere", scenario_settings={}, episodes=4, rounds=2, epochs=1)
     assert imitate(spatial, tmp_path / "imitation").network.header.model == "holonomic3d"
-    settings = TrainingSettings(scenario="sphere", num_robots=2, steps=1024, num_envs=16, lessons=2)
+    settings = TrainingSettings(scenario="sphere", num_robots=2, steps=1024, num_envs=16, stages=2)
     assert train(settings, tmp_path / "ppo").network.header.model == "holonomic3d"
 
 

@@ -17,7 +17,7 @@ from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
 from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.network import Header, Network, load_network
-from d4orm_planners.rl.perturbed_scenarios import clearing, loosened
+from d4orm_planners.rl.perturbed_scenarios import clutter, perturbed
 
 OWN, NEIGHBOR, OBSTACLE = 11, 9, 5
 
@@ -140,20 +140,20 @@ def test_malformed_files_of_sets_are_refused(tmp_path: Path, change, message: st
 
 
 @pytest.mark.parametrize("base", ["circle", "four_obstacles", "swap"])
-def test_loosened_scenarios_differ_from_seed_to_seed_in_places_only(base: str) -> None:
-    one, same, other = (make_problem(loosened, num_robots=8, seed=seed, base=base) for seed in (0, 0, 1))
+def test_perturbed_scenarios_differ_from_seed_to_seed_in_places_only(base: str) -> None:
+    one, same, other = (make_problem(perturbed, num_robots=8, seed=seed, base=base) for seed in (0, 0, 1))
     assert one == same
     assert np.abs(one.start - other.start).max() > 0.05
     assert np.abs(one.goal - other.goal).max() > 0.05
     assert one.horizon == other.horizon
     np.testing.assert_array_equal(one.world.circles, other.world.circles)
     given = make_problem(base, num_robots=8)
-    moved = make_problem(loosened, num_robots=8, base=base, shrink=0, shift=0)
+    moved = make_problem(perturbed, num_robots=8, base=base, shrink=0, shift=0)
     np.testing.assert_allclose(np.linalg.norm(moved.start, axis=1), np.linalg.norm(given.start, axis=1), atol=1e-6)
 
 
-def test_a_clearing_keeps_its_obstacles_and_leaves_room_at_starts_and_goals() -> None:
-    problems = [make_problem(clearing, num_robots=8, seed=seed, places=3, obstacles=5) for seed in range(4)]
+def test_clutter_keeps_its_obstacles_and_leaves_room_at_starts_and_goals() -> None:
+    problems = [make_problem(clutter, num_robots=8, seed=seed, places=3, obstacles=5) for seed in range(4)]
     assert len({problem.world.circles.tobytes() for problem in problems}) == 1
     assert len(set(problems)) == 4
     for problem in problems:
@@ -161,7 +161,7 @@ def test_a_clearing_keeps_its_obstacles_and_leaves_room_at_starts_and_goals() ->
             gaps = np.linalg.norm(points[:, None] - problem.world.circles[:, :2], axis=2) - problem.world.circles[:, 2]
             assert gaps.min() > problem.team.radius[0] + problem.margin
     with pytest.raises(ValueError, match="num_robots is 40; so many do not fit on a size of 5 m among the"):
-        make_problem(clearing, num_robots=40, obstacles=300)
+        make_problem(clutter, num_robots=40, obstacles=300)
 
 
 pytest.importorskip("stable_baselines3")
@@ -173,8 +173,8 @@ from d4orm_planners.rl.task_mixture import MIXTURES, MixedVecEnv, TrainTask, par
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
 TINY = TrainingSettings(
-    steps=2 * 32 * 20, num_envs=20, lessons=2, validation_worlds=4, seed=5, network="sets", observed_robots=3,
-    mixture=("random 2 size=4", "circle 4 sight=1"),
+    steps=2 * 32 * 20, num_envs=20, stages=2, validation_worlds=4, seed=5, network="sets", observed_robots=3,
+    mixture=("random 2 size=4", "circle 4 max_observed=1"),
 )  # fmt: skip
 
 
@@ -223,9 +223,9 @@ def test_a_training_on_a_mixture_tells_how_each_part_goes(
         assert evaluation.parts is not None
         assert len(evaluation.parts) == 2
         assert evaluation.success_rate == pytest.approx(np.mean(evaluation.parts))
-    lessons = result.network.header.training["lesson"]
-    spent = sum(evaluation.seconds for evaluation in result.curve[:lessons])
-    assert result.network.training_time == pytest.approx(spent, abs=0.1), "up to the lesson that was best"
+    stages = result.network.header.training["stage"]
+    spent = sum(evaluation.seconds for evaluation in result.curve[:stages])
+    assert result.network.training_time == pytest.approx(spent, abs=0.1), "up to the stage that was best"
     again = train(practised, tmp_path, command="d4orm train ...").network
     for name, array in load_network(trained / "policy.safetensors").arrays.items():
         np.testing.assert_array_equal(array, again.arrays[name])
@@ -235,7 +235,7 @@ def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(
     practised: TrainingSettings, trained: Path, tmp_path: Path
 ) -> None:
     path = str(trained / "policy.safetensors")
-    further = replace(practised, start_from=path, learning_rate=1e-9, lessons=1, steps=32, observed_robots=4)
+    further = replace(practised, start_from=path, learning_rate=1e-9, stages=1, steps=32, observed_robots=4)
     result = train(further, tmp_path / "further")
     learned = result.network
     for name, array in load_network(path).arrays.items():
@@ -253,7 +253,7 @@ def test_a_policy_of_sets_learns_on_and_a_flat_one_is_refused(
 def test_a_policy_of_robots_that_turn_says_along_what_it_sees_and_learns_on_from_none_that_sees_otherwise(
     practised: TrainingSettings, trained: Path, tmp_path: Path
 ) -> None:
-    turning = replace(practised, model="differential_drive", lessons=1, steps=32)
+    turning = replace(practised, model="differential_drive", stages=1, steps=32)
     network = train(turning, tmp_path / "first").network
     assert load_network(tmp_path / "first" / "policy.safetensors").features.frame == network.header.frame == "heading"
     assert load_network(trained / "policy.safetensors").features.frame == "goal"
@@ -266,12 +266,12 @@ def test_a_policy_of_robots_that_turn_says_along_what_it_sees_and_learns_on_from
     assert not (tmp_path / "second").exists()
 
 
-def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
-    parts = TINY.exercises
-    assert parts == (TrainTask("random", 2, {"size": 4}), TrainTask("circle", 4, {}, sight=1))
-    assert TINY.worlds_of_exercises == (5, 2)
+def test_every_part_of_a_mixture_has_its_worlds_robots_and_observed_robots() -> None:
+    parts = TINY.tasks
+    assert parts == (TrainTask("random", 2, {"size": 4}), TrainTask("circle", 4, {}, max_observed=1))
+    assert TINY.worlds_per_task == (5, 2)
     assert TINY.batch == 18
-    env = TINY.worlds(None)  # type: ignore[arg-type] # a mixture is the same in every lesson
+    env = TINY.worlds(None)  # type: ignore[arg-type] # a mixture is the same in every stage
     assert isinstance(env, MixedVecEnv)
     assert [part.problem.name for part in env.parts] == ["random", "circle"]
     assert env.num_envs == 18
@@ -287,10 +287,10 @@ def test_every_part_of_a_mixture_has_its_worlds_robots_and_sight() -> None:
         both.close()
 
 
-def test_parts_that_differ_in_sight_only_are_stepped_together() -> None:
-    mixture = ("circle 3", "circle 2", "circle 3 sight=1", "circle 3 disturb.delay=1", "circle 3 sight=0")
+def test_parts_that_differ_in_max_observed_only_are_stepped_together() -> None:
+    mixture = ("circle 3", "circle 2", "circle 3 max_observed=1", "circle 3 disturb.delay=1", "circle 3 max_observed=0")
     settings = replace(TINY, mixture=mixture, num_envs=30)
-    assert settings.worlds_of_exercises == (2, 3, 2, 2, 2)
+    assert settings.worlds_per_task == (2, 3, 2, 2, 2)
     env = settings.worlds(None)  # type: ignore[arg-type]
     assert [(part.num_worlds, part.problem.num_robots) for part in env.parts] == [(6, 3), (3, 2), (2, 3)]
     seen = [2] * 6 + [1] * 6 + [0] * 6 + [1] * 6 + [2] * 6
@@ -311,10 +311,10 @@ def test_parts_that_differ_in_sight_only_are_stepped_together() -> None:
     one_by_one.close()
 
 
-@pytest.mark.parametrize(("ways", "kept"), [(True, 6), (False, 0)])
-def test_instances_with_ways_last_for_some_time(ways: bool, kept: int) -> None:
-    """Whether those of earlier lessons are at hand or have to be drawn again, as when a killed training goes on."""
-    settings = replace(TINY, mixture=("random 2 size=4",), num_envs=8, ways=ways)
+@pytest.mark.parametrize(("shortest_paths", "kept"), [(True, 6), (False, 0)])
+def test_instances_with_paths_last_for_some_time(shortest_paths: bool, kept: int) -> None:
+    """Whether those of earlier stages are at hand or have to be drawn again, as when a killed training goes on."""
+    settings = replace(TINY, mixture=("random 2 size=4",), num_envs=8, shortest_paths=shortest_paths)
     drawn: dict = {}
 
     def begun(number: int, drawn: dict) -> list[set[tuple[float, ...]]]:
@@ -330,12 +330,12 @@ def test_instances_with_ways_last_for_some_time(ways: bool, kept: int) -> None:
         assert len(set.union(*starts)) == 8 == len(*drawn.values())
         instances.append(set(*drawn.values()))
     assert len(instances[0] & instances[1]) == len(instances[1] & instances[2]) == kept
-    assert len(instances[0] & instances[2]) == (4 if ways else 0)
+    assert len(instances[0] & instances[2]) == (4 if shortest_paths else 0)
 
 
 def test_a_part_of_a_mixture_may_be_disturbed() -> None:
-    part = TrainTask.parse("circle 2 disturb.delay=2 disturb.push.speed=0.5 sight=1")
-    assert part == TrainTask("circle", 2, {}, sight=1, disturbances={"delay": 2, "push.speed": 0.5})
+    part = TrainTask.parse("circle 2 disturb.delay=2 disturb.push.speed=0.5 max_observed=1")
+    assert part == TrainTask("circle", 2, {}, max_observed=1, disturbances={"delay": 2, "push.speed": 0.5})
     env = part.validation(3, 1)
     assert env.num_worlds == 3, "what goes wrong differs, though places do not"
     assert TrainTask.parse("circle 2").validation(3, 1).num_worlds == 1
@@ -392,12 +392,12 @@ def test_parts_of_different_models_are_refused() -> None:
 def test_named_mixtures_are_what_they_stand_for() -> None:
     for name, texts in MIXTURES.items():
         assert parse_mixture((name, "circle 3")) == (*map(TrainTask.parse, texts), TrainTask("circle", 3, {}))
-        for exercise in parse_mixture((name,)):
-            make_problem(exercise.scenario, num_robots=exercise.num_robots, **exercise.settings)
+        for task in parse_mixture((name,)):
+            make_problem(task.scenario, num_robots=task.num_robots, **task.settings)
 
 
 def test_a_network_of_sets_learns_where_nobody_is_seen(tmp_path: Path) -> None:
-    train(replace(TINY, observed_robots=0, steps=32, lessons=1, mixture=("random 2",)), tmp_path)
+    train(replace(TINY, observed_robots=0, steps=32, stages=1, mixture=("random 2",)), tmp_path)
     assert load_network(tmp_path / "policy.safetensors").header.num_neighbors == 0
 
 
@@ -438,7 +438,7 @@ def test_rewards_are_those_asked_for() -> None:
         ({"mixture": ("random 0",)}, "mixture has 'random 0'; it must be"),
         ({"mixture": ("random 2 size",)}, "'size' is no new setting of the form name=value"),
         ({"mixture": ("random 2 size=3 size=4",)}, "'size=4' is no new setting"),
-        ({"mixture": ("random 2 sight=many",)}, "sight must be a whole number"),
+        ({"mixture": ("random 2 max_observed=many",)}, "max_observed must be a whole number"),
         ({"mixture": ("random 2 seed=3",)}, "'seed' has no place"),
         ({"mixture": ("random 2 width=3",)}, "takes no argument 'width'"),
         ({"mixture": ("labyrinth 2",)}, "labyrinth"),
@@ -464,7 +464,7 @@ def test_bad_settings_are_refused(change: dict, message: str) -> None:
 
 def test_the_command_line_trains_on_a_mixture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--network", "sets", "--mixture", "random 2", "--mixture", "circle 2", "--num-envs", "8"]
-    options += ["--steps", "512", "--lessons", "1", "--validation-worlds", "2", "--learning-rate", "1e-3"]
+    options += ["--steps", "512", "--stages", "1", "--validation-worlds", "2", "--learning-rate", "1e-3"]
     with pytest.raises(SystemExit) as exit_:
         cli.main(["train", "ppo", *options, "--out", str(tmp_path)])
     assert exit_.value.code == 0

@@ -1,4 +1,4 @@
-"""Training: lessons, checkpoints that survive a kill, policy files, and the policies that act by them."""
+"""Training: stages, checkpoints that survive a kill, policy files, and the policies that act by them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
-from d4orm_planners.rl.curriculum import Stage, common_batch, make_lessons, team_sizes
+from d4orm_planners.rl.curriculum import Stage, common_batch, make_stages, team_sizes
 from d4orm_planners.rl.network import MAX_BYTES, load_network
 
 
@@ -35,9 +35,9 @@ def test_a_batch_makes_whole_worlds_of_every_size() -> None:
     assert common_batch((1, 2, 4, 8), 3) == 8
 
 
-def test_lessons_grow_and_mix_scenarios() -> None:
-    lessons = make_lessons(4, "circle", steps=800, unit=100, count=8, gradual=True)
-    assert lessons == tuple(
+def test_stages_grow_and_mix_scenarios() -> None:
+    stages = make_stages(4, "circle", steps=800, unit=100, count=8, gradual=True)
+    assert stages == tuple(
         Stage(robots, scenario, 100)
         for robots, scenario in [
             (1, "random"), (2, "random"), (2, "random"), (4, "random"),
@@ -46,18 +46,18 @@ def test_lessons_grow_and_mix_scenarios() -> None:
     )  # fmt: skip
 
 
-def test_lessons_take_whole_updates_and_all_of_them() -> None:
-    lessons = make_lessons(2, "random", steps=1001, unit=100, count=4, gradual=False)
-    assert [lesson.steps for lesson in lessons] == [200, 300, 300, 300]
-    assert {lesson.num_robots for lesson in lessons} == {2}
-    assert len(make_lessons(2, "random", steps=1, unit=100, count=4, gradual=True)) == 1
+def test_stages_take_whole_updates_and_all_of_them() -> None:
+    stages = make_stages(2, "random", steps=1001, unit=100, count=4, gradual=False)
+    assert [stage.steps for stage in stages] == [200, 300, 300, 300]
+    assert {stage.num_robots for stage in stages} == {2}
+    assert len(make_stages(2, "random", steps=1, unit=100, count=4, gradual=True)) == 1
 
 
 pytest.importorskip("stable_baselines3")
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
 TINY = TrainingSettings(
-    num_robots=2, steps=4 * 16 * 32, num_envs=16, lessons=4, validation_worlds=3, seed=5, curriculum=True
+    num_robots=2, steps=4 * 16 * 32, num_envs=16, stages=4, validation_worlds=3, seed=5, curriculum=True
 )
 TINY_SAC = replace(TINY, algorithm="sac", steps=4 * 256)
 
@@ -112,7 +112,7 @@ def test_a_training_that_was_broken_off_goes_on_to_the_same_end(
 
 @pytest.mark.slow
 def test_a_training_that_is_killed_goes_on(tmp_path: Path) -> None:
-    arguments = ["train", "ppo", "--num-robots", "2", "--steps", "5120", "--num-envs", "16", "--lessons", "10"]
+    arguments = ["train", "ppo", "--num-robots", "2", "--steps", "5120", "--num-envs", "16", "--stages", "10"]
     command = [sys.executable, "-m", "d4orm_planners.cli.app", *arguments, "--out", str(tmp_path)]
     process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"})
     deadline = time.monotonic() + 120

@@ -415,7 +415,7 @@ def test_recipes_learn_something(name: str, module: str, tmp_path: Path) -> None
     assert success[-1] > 20
 
 
-def test_a_policy_gives_a_planner_its_first_guess(tmp_path: Path) -> None:
+def test_a_policy_gives_a_planner_its_warm_start(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("warm_start", out)
     rows = table(out / "warm_start.csv")

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from network_support import PATIENCE
+from network_support import TIMEOUT
 from PIL import Image
 from test_examples import PNG, ROOT, run, table
 
@@ -90,7 +90,7 @@ def test_who_would_run_into_a_body_stops_and_the_others_go_on(onboard: Any) -> N
 
 
 def test_who_follows_does_not_touch_a_robot_that_stops_for_a_tick(onboard: Any) -> None:
-    """The margin that plans keep is more than the way of a tick."""
+    """The margin that plans keep is more than the distance of a tick."""
     problem = mission(onboard).problem()
     assert problem.margin > float(np.max(np.asarray(problem.team.max_speed))) * problem.dt
 
@@ -129,7 +129,7 @@ def test_a_plan_has_the_same_name_after_it_was_passed_on(onboard: Any, lost: lis
 def mission(onboard: Any, **changes: Any) -> Any:
     settings = {
         "robots": 3, "seed": 0, "side": 4.0, "horizon": 80, "samples": 96, "denoising_steps": 50, "iterations": 1,
-        "think": 7, "agree": 3, "patience": 1.0, "silence": 1.0, "namespace": "test", "world": "tcp/127.0.0.1:1",
+        "think": 7, "agree": 3, "timeout": 1.0, "silence": 1.0, "namespace": "test", "world": "tcp/127.0.0.1:1",
         "team": "tcp/127.0.0.1:2",
     }  # fmt: skip
     return onboard.mission.Mission(**(settings | changes))
@@ -225,7 +225,7 @@ def test_ctrl_c_ends_all_processes_and_writes_what_there_is(tmp_path: Path) -> N
             assert line, "it ended before the robots were ready"
         time.sleep(2)
         os.killpg(process.pid, signal.SIGINT)
-        rest, _ = process.communicate(timeout=PATIENCE)
+        rest, _ = process.communicate(timeout=TIMEOUT)
         assert process.returncode == 130, rest
         assert "Traceback" not in rest
         (row,) = table(out / "onboard_lifelong.csv")

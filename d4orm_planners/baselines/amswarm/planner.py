@@ -109,7 +109,7 @@ class AMSwarm(Planner):
         engine.step(problem.arrays, np.asarray(problem.start), arrived, controls)
         if not alternate.signatures:
             alone = problem.select([0])
-            step = alone.resumed_at(alone.start, alone.goal, horizon=1)
+            step = alone.with_state(alone.start, alone.goal, horizon=1)
             Swarm(step, self.config, np.random.default_rng(0)).run(engine, lambda: False)
 
 

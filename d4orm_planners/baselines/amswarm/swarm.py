@@ -47,7 +47,7 @@ class Swarm:
         self._limits[~inertia, 1] = np.inf
         self._motions = np.zeros((team.num_robots, config.degree + 1, d))
         self._accelerations = np.zeros((team.num_robots, d))
-        self._guesses = self._first_guesses()
+        self._guesses = self._warm_start()
         self._first = self._guesses.place[:, 0], self._guesses.velocity[:, 0]
         self.violation = 0.0
 
@@ -101,7 +101,7 @@ class Swarm:
         mean = (places - states[:, : self._problem.dimension]) / self._problem.dt
         return np.where(self._fixed[:, None] > 1, velocities, mean).astype(np.float32)
 
-    def _first_guesses(self) -> Guess:
+    def _warm_start(self) -> Guess:
         """All robots straight to their goals, as fast as allowed."""
         problem = self._problem
         places = problem.start[:, None, : problem.dimension].astype(np.float64)

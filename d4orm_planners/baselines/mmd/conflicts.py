@@ -11,10 +11,10 @@ from d4orm_env.engine.compiling import OPTIONS
 
 @cached_kernel(variant="count", **OPTIONS)
 def count_conflicts(places: Floats, others: Floats, distances: Floats, counts: IntArray) -> None:
-    """Fill ``counts`` ``(B, 2)`` int64 with how many others each of some ways conflicts with, and at how many steps.
+    """Fill ``counts`` ``(B, 2)`` int64 with how many others each of some paths conflicts with, and at how many steps.
 
     Args:
-        places: ``(B, T, 3)`` the ways [m].
+        places: ``(B, T, 3)`` the paths [m].
         others: ``(S, T, 3)`` where the others are [m].
         distances: ``(S,)`` to keep from each [m].
         counts: Output.

@@ -14,13 +14,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.paths.wavefront import Space
 from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.guiding import Surroundings
+from d4orm_planners.baselines.mmd.path_frame import PathFrame
 from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
-from d4orm_planners.baselines.mmd.way_frame import WayFrame
 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig
 
-SPARE = 1 / 75
+SLACK = 1 / 75
 """Added to distances when conflicts are sought, for rounding, in radii of the largest robot."""
 PADDING = 2
 """Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published."""
@@ -96,7 +96,7 @@ class Tree:
         made: Number of nodes made so far.
     """
 
-    frames: tuple[WayFrame, ...]
+    frames: tuple[PathFrame, ...]
     space: Space
     nodes: tuple[TreeNode, ...]
     made: int
@@ -124,12 +124,12 @@ class Planning:
     """
 
     def __init__(
-        self, problem: Problem, config: MMDConfig, denoiser: Denoiser, frames: tuple[WayFrame, ...], space: Space
+        self, problem: Problem, config: MMDConfig, denoiser: Denoiser, frames: tuple[PathFrame, ...], space: Space
     ) -> None:
         self._problem, self._config, self._denoiser = problem, config, denoiser
         self._frames, self._space = frames, space
-        radius, self._spare = np.asarray(problem.team.radius, np.float64), SPARE * problem.team.largest_radius
-        self._distances: Floats = radius[:, None] + radius + problem.margin + self._spare
+        radius, self._slack = np.asarray(problem.team.radius, np.float64), SLACK * problem.team.largest_radius
+        self._distances: Floats = radius[:, None] + radius + problem.margin + self._slack
         self.steps = 0
 
     def root(self, seeds: list[int]) -> TreeNode:
@@ -195,7 +195,7 @@ class Planning:
     ) -> Motion:
         """The motion of a robot that conflicts least with these others, of those that were denoised together."""
         config, frame = self._config, self._frames[robot]
-        ways = np.stack([motions[other].places for other in others]) if others else np.empty((0, 1, 3))
+        paths = np.stack([motions[other].places for other in others]) if others else np.empty((0, 1, 3))
         distances = self._distances[robot, others]
         surroundings = Surroundings(
             space=self._space,
@@ -204,20 +204,20 @@ class Planning:
             dt=self._problem.dt,
             spheres=np.array([constraint.sphere for constraint in constraints]).reshape(-1, 4),
             spans=np.array([constraint.span for constraint in constraints], np.int64).reshape(-1, 2),
-            others=ways,
+            others=paths,
             radii=distances * config.constraint_radius,
             pull=config.soft_pull,
         )
         batch = self._denoiser.denoise(robot, frame, surroundings, seed, before)
         self.steps += batch.steps
-        return self._choose(batch, ways, distances, frame.reach)
+        return self._choose(batch, paths, distances, frame.reach)
 
-    def _choose(self, batch: Batch, ways: Floats, distances: Floats, reach: float) -> Motion:
+    def _choose(self, batch: Batch, paths: Floats, distances: Floats, reach: float) -> Motion:
         driven = batch.driven
         counts: NDArray[np.int64] = np.zeros((len(batch.motions), 2), np.int64)
-        if len(ways):
-            count_conflicts(driven.places, ways, distances, counts)
-        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < reach + self._spare)
+        if len(paths):
+            count_conflicts(driven.places, paths, distances, counts)
+        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < reach + self._slack)
         best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
         controls, places = driven.controls[best].copy(), driven.places[best].copy()
         return Motion(batch.motions, controls, places, int(driven.arrivals[best]), bool(fails[best]))

@@ -1,4 +1,4 @@
-"""Guidance: what pushes motions out of obstacles, constraints and other robots' ways while they are denoised.
+"""Guidance: what pushes motions out of obstacles, constraints and other robots' paths while they are denoised.
 
 Every step of guidance goes once along the motion. Where a point violates something, the motion's modes are changed by
 as little as it takes, measured by their deviation among the examples: a gradient step on one point's hinge loss in the
@@ -17,7 +17,7 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.wavefront import Space, clearance_at
 from d4orm_planners.baselines.mmd.clock import fill_clock
-from d4orm_planners.baselines.mmd.way_frame import WayFrame, locate, trace
+from d4orm_planners.baselines.mmd.path_frame import PathFrame, locate, trace
 
 _PROBE, _WITHIN = 1 / 150, 2.0**-27
 """Distance over which the slope of the clearance is measured, in radii of the largest robot, and share of a sphere's
@@ -68,7 +68,7 @@ def _point_variance(sines: Floats, deviation: Floats) -> Floats:
 
 @cached_kernel(variant="guide", **OPTIONS)
 def guide(
-    frame: WayFrame,
+    frame: PathFrame,
     sines: Floats,
     deviation: Floats,
     surroundings: Surroundings,
@@ -135,7 +135,7 @@ def _violation(surroundings: Surroundings, step: Whole, spot: Floats, push: Floa
 
 @compiled
 def _push_clear(space: Space, clearance: float, probe: float, spot: Floats, push: Floats) -> bool:
-    """Add to ``push`` what brings a place out of obstacles, on the side where the way is; whether it is too near."""
+    """Add to ``push`` what brings a place out of obstacles, on the side where the path is; whether it is too near."""
     x, y, z = spot[0, 0], spot[0, 1], spot[0, 2]
     missing = clearance - clearance_at(space, x, y, z)
     if not missing > 0.0:

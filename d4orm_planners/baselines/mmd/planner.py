@@ -35,12 +35,12 @@ class MMDConfig(PlannerConfig):
         noise_scale: Of the noise between denoising steps; 1 is DDPM's.
         reuse_steps: Denoising steps when a robot plans again, from its motions with as much noise as that many steps
             take away (MMD-xECBS); ``None`` begins with noise (MMD-ECBS).
-        soft_pull: Share of a violation of soft constraints, which are the other robots' ways, that a step of guidance
+        soft_pull: Share of a violation of soft constraints, which are the other robots' paths, that a step of guidance
             takes away; 0 leaves them out (MMD-CBS).
         constraint_radius: Of constraints, as a multiple of the distance that two robots keep.
         clearance: Distance from obstacles beyond radius and margin that guidance leads to, in steps of the fastest
             robot at full speed.
-        quickest: Times the shortest time of its way that a motion takes at least.
+        quickest: Times the shortest time of its path that a motion takes at least.
         slowest: And at most; between the two it is drawn.
 
     Raises:
@@ -106,7 +106,7 @@ class MMD(Planner):
 def _begin(search: SolveRun) -> Tree | NoPaths:
     """The tree before its root."""
     from d4orm_planners.baselines.mmd.constraint_tree import Tree
-    from d4orm_planners.baselines.mmd.way_frame import make_frame, world_space
+    from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
 
     problem, space = search.problem, world_space(search.problem)
     reason = NoPaths.unless_reachable(problem)
@@ -126,9 +126,9 @@ def compile_mmd(problem: Problem) -> None:
     """Compile what the method needs for such a team, if it is not yet."""
     from d4orm_planners.baselines.mmd.constraint_tree import Planning
     from d4orm_planners.baselines.mmd.guiding import guide
+    from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
     from d4orm_planners.baselines.mmd.reverse_process import Denoiser
     from d4orm_planners.baselines.mmd.tracking import tracking_kernel
-    from d4orm_planners.baselines.mmd.way_frame import make_frame, world_space
 
     if guide.signatures and all(tracking_kernel(name).signatures for name in problem.team.models):
         return

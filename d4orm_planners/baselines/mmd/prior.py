@@ -16,12 +16,12 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.portable import cos
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_planners.baselines.mmd.way_frame import FEATURES, MODES
+from d4orm_planners.baselines.mmd.path_frame import FEATURES, MODES
 
 WEIGHTS = Path(__file__).with_name("weights.npz")
 """Weights that come with the package; see `docs/planners/mmd.md` for their card."""
 SIZE = 2 * MODES
-"""Numbers of a motion: modes along the way's line, then across."""
+"""Numbers of a motion: modes along the path's line, then across."""
 LEVELS = 9
 """Numbers by which the network is told how noisy a motion is."""
 CLIP = np.float32(4.0)
@@ -34,7 +34,7 @@ class Prior(NamedTuple):
     """The network's weights, all float32, and what whitens motions.
 
     Attributes:
-        deviation: ``(SIZE,)`` of the modes among the examples, in lengths of the way.
+        deviation: ``(SIZE,)`` of the modes among the examples, in lengths of the path.
         features_mean: ``(FEATURES,)``.
         features_deviation: ``(FEATURES,)``.
         into: ``(SIZE + LEVELS, W)`` from motion and noise level to the first layer.

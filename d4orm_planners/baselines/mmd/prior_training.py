@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_planners.baselines.mmd.path_frame import FEATURES
 from d4orm_planners.baselines.mmd.prior import LEVELS, SIZE, Prior, kept_signal, level_features
 from d4orm_planners.baselines.mmd.training_set import Examples, draw_examples
-from d4orm_planners.baselines.mmd.way_frame import FEATURES
 
 _RESOLUTION = 1000
 """Noise levels that are trained."""

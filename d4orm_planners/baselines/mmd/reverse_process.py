@@ -12,6 +12,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.counter_draws import draw_normals, draw_uniforms
 from d4orm_planners.baselines.mmd.guiding import Surroundings, guide
+from d4orm_planners.baselines.mmd.path_frame import PathFrame, sine_table
 from d4orm_planners.baselines.mmd.prior import (
     SIZE,
     Prior,
@@ -23,7 +24,6 @@ from d4orm_planners.baselines.mmd.prior import (
     predict,
 )
 from d4orm_planners.baselines.mmd.tracking import TrackedMotions, drive_along
-from d4orm_planners.baselines.mmd.way_frame import WayFrame, sine_table
 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig
@@ -63,13 +63,13 @@ class Denoiser:
         self._deviation = self._prior.deviation.astype(np.float64)
 
     def denoise(
-        self, robot: int, frame: WayFrame, surroundings: Surroundings, seed: int, before: FloatArray | None = None
+        self, robot: int, frame: PathFrame, surroundings: Surroundings, seed: int, before: FloatArray | None = None
     ) -> Batch:
         """Motions of a robot that mind its surroundings, as well as guidance achieves it.
 
         Args:
             robot: Its number.
-            frame: Its way.
+            frame: Its path.
             surroundings: Constraints on the motion.
             seed: Of the noise and the durations.
             before: ``(B, SIZE)`` motions to begin with, which get the noise of the last ``reuse_steps`` again; noise by
@@ -107,7 +107,7 @@ class Denoiser:
         scale = np.float32(self._config.noise_scale * deviation)
         return np.float32(of_clean) * clean + np.float32(of_noisy) * noisy + scale * draw.normals(noisy.shape)
 
-    def _durations(self, frame: WayFrame, draw: _Draws) -> Floats:
+    def _durations(self, frame: PathFrame, draw: _Draws) -> Floats:
         """``(B,)`` between the quickest and the slowest that the settings allow, within the horizon [s]."""
         config = self._config
         slack = np.array(draw.uniforms(config.num_samples), np.float64)

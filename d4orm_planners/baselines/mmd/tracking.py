@@ -17,7 +17,7 @@ from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import make_stepper, models_key
 from d4orm_env.paths.wavefront import Space, clearance_at
 from d4orm_planners.baselines.mmd.clock import fill_clock
-from d4orm_planners.baselines.mmd.way_frame import WayFrame, trace
+from d4orm_planners.baselines.mmd.path_frame import PathFrame, trace
 from d4orm_planners.tracking.straight_drives import RobotSpec
 
 GAIN = np.float32(1.5)
@@ -55,7 +55,7 @@ def _catch_up(
 @cache
 def tracking_kernel(
     name: str,
-) -> Kernel[[RobotSpec, WayFrame, Floats, Floats, Space, Floats, FloatArray, TrackedMotions], None]:
+) -> Kernel[[RobotSpec, PathFrame, Floats, Floats, Space, Floats, FloatArray, TrackedMotions], None]:
     """The compiled drives of a robot of the model with this name; see :func:`drive_along`."""
     model = MODELS[name]
     move, dock = make_stepper(model)
@@ -66,7 +66,7 @@ def tracking_kernel(
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive(
         robot: RobotSpec,
-        frame: WayFrame,
+        frame: PathFrame,
         sines: Floats,
         deviation: Floats,
         space: Space,
@@ -118,7 +118,7 @@ def tracking_kernel(
 def drive_along(
     problem: Problem,
     robot: int,
-    frame: WayFrame,
+    frame: PathFrame,
     sines: Floats,
     deviation: Floats,
     space: Space,
@@ -130,7 +130,7 @@ def drive_along(
     Args:
         problem: The team.
         robot: The robot's number.
-        frame: Its way.
+        frame: Its path.
         sines: ``(POINTS + 1, MODES)``.
         deviation: ``(2 MODES,)`` of the modes.
         space: The world, of :func:`~d4orm_planners.baselines.mmd.way_frame.world_space`.

@@ -12,7 +12,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.baselines.mmd.way_frame import POINTS, WayFrame, make_frame, sine_table, world_space
+from d4orm_planners.baselines.mmd.path_frame import POINTS, PathFrame, make_frame, sine_table, world_space
 
 KINDS: tuple[tuple[str, dict[str, object]], ...] = (
     ("random", {"size": 5.0}),
@@ -26,14 +26,14 @@ KINDS: tuple[tuple[str, dict[str, object]], ...] = (
 PLANNERS = ("mapf", "hybrid")
 """Planners whose plans are learned from, in turn."""
 _PHANTOMS = 3
-"""Most circles near the way that a plan has to go round and the model is not told of."""
+"""Most circles near the path that a plan has to go round and the model is not told of."""
 _SIZES, _ASIDE = (0.1, 0.45), 0.5
-"""Radius of these, and distance from the way at most [m]."""
+"""Radius of these, and distance from the path at most [m]."""
 _LONGEST = 1.4
-"""Times the length of the way that a plan may be; a longer one leads elsewhere."""
+"""Times the length of the path that a plan may be; a longer one leads elsewhere."""
 _PER_MAP = 4
 _FINENESS = 16
-"""Places per point at which the way is compared with a plan."""
+"""Places per point at which the path is compared with a plan."""
 
 
 class Examples(NamedTuple):
@@ -41,7 +41,7 @@ class Examples(NamedTuple):
 
     Attributes:
         features: ``(E, FEATURES)`` float32.
-        modes: ``(E, 2, MODES)`` float32 differences from the way, ahead and aside, in lengths of the way.
+        modes: ``(E, 2, MODES)`` float32 differences from the path, ahead and aside, in lengths of the path.
     """
 
     features: FloatArray
@@ -66,20 +66,20 @@ def draw_examples(count: int, seed: int, progress: Callable[[int], object] = lam
     return Examples(np.stack(features), np.stack(modes))
 
 
-def modes_of(frame: WayFrame, places: Floats) -> Floats:
+def modes_of(frame: PathFrame, places: Floats) -> Floats:
     """``(2, MODES)`` of planar places ``(POINTS + 1, 3)``: how far ahead on the way they are, and to its left."""
     fine = np.linspace(0, POINTS, _FINENESS * POINTS + 1)
-    way, tangents = (
+    path, tangents = (
         np.column_stack([np.interp(fine, np.arange(POINTS + 1), rows[:, axis]) for axis in range(2)])
         for rows in (frame.reference, frame.tangents)
     )
     nearest, at = np.zeros(POINTS + 1, int), 0
     for i, place in enumerate(places[:, :2]):
-        # Ways may come near to themselves: only what lies next on them counts.
-        ahead = way[at : at + _FINENESS * POINTS // 8]
+        # Paths may come near to themselves: only what lies next on them counts.
+        ahead = path[at : at + _FINENESS * POINTS // 8]
         at += int(((ahead - place) ** 2).sum(axis=1).argmin())
         nearest[i] = at
-    offset = places[:, :2] - way[nearest]
+    offset = places[:, :2] - path[nearest]
     aside = (offset[:, 1] * tangents[nearest, 0] - offset[:, 0] * tangents[nearest, 1]) / frame.length
     differences = np.stack([fine[nearest] / POINTS - np.arange(POINTS + 1) / POINTS, aside])
     # A plan ends within the goal's radius, and a motion at the goal.
@@ -87,7 +87,7 @@ def modes_of(frame: WayFrame, places: Floats) -> Floats:
     return 2 / POINTS * differences @ sine_table()
 
 
-def _motions(seed: int) -> Iterator[tuple[WayFrame, Floats]]:
+def _motions(seed: int) -> Iterator[tuple[PathFrame, Floats]]:
     """Frames and ``(POINTS + 1, 3)`` places at equal times from start to arrival."""
     random, number = np.random.default_rng(seed), seed
     while True:
@@ -108,8 +108,8 @@ def _motions(seed: int) -> Iterator[tuple[WayFrame, Floats]]:
                 yield frame, places
 
 
-def _with_phantoms(problem: Problem, frame: WayFrame, random: np.random.Generator, number: int) -> Problem | None:
-    """The problem with so many circles near its way; ``None`` if they leave no way."""
+def _with_phantoms(problem: Problem, frame: PathFrame, random: np.random.Generator, number: int) -> Problem | None:
+    """The problem with so many circles near its path; ``None`` if they leave no path."""
     number = min(number, _PHANTOMS)
     at = frame.reference[random.integers(0, POINTS + 1, number), :2]
     circles = np.column_stack(

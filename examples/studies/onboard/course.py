@@ -161,10 +161,10 @@ def present_problem(problem: Problem, states: Any, goals: Any, lost: Collection[
     speed = np.array(problem.team.max_speed)
     speed[list(lost)] = STANDSTILL
     team = Team(problem.team.models, problem.team.radius, speed)
-    return problem.resumed_at(states, goals, margin=margin, team=team)
+    return problem.with_state(states, goals, margin=margin, team=team)
 
 
-def first_guess(course: Course, problem: Problem, tick: int) -> Any:
+def warm_start(course: Course, problem: Problem, tick: int) -> Any:
     """``(H, K, m)`` controls to start planning from: the course's, or straight to the goal where that is new."""
     controls = course.rest(tick, problem.horizon)
     new = (course.goals != problem.goal).any(axis=1)

@@ -34,7 +34,7 @@ class Mission:
         iterations: Of a round, at least; where they take longer than real time allows, the clock waits for them.
         think: Ticks that a round of planning is given.
         agree: Ticks from then on until the best plan, which the robots agree on meanwhile, takes over.
-        patience: Seconds that the world waits for a robot's command before it is given up.
+        timeout: Seconds that the world waits for a robot's command before it is given up.
         silence: Seconds without a word from the world after which a robot ends.
         namespace: Of the run on the network.
         world: Endpoint that the world listens at for the robots.
@@ -50,7 +50,7 @@ class Mission:
     iterations: int
     think: int
     agree: int
-    patience: float
+    timeout: float
     silence: float
     namespace: str
     world: str
@@ -88,7 +88,7 @@ class Mission:
 
     def planning(self) -> DD4ormConfig:
         """The settings of D-D4orm."""
-        # Search for shorter ways takes a second an iteration where a round has less.
+        # Search for shorter paths takes a second an iteration where a round has less.
         samples = D4ormConfig(num_samples=self.samples, num_steps=self.denoising_steps)
         return DD4ormConfig(nodes=self.robots, refinement=samples, engine="cpu", improve=True)
 

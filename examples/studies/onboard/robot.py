@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from examples.studies.onboard import wire
-from examples.studies.onboard.course import Course, first_guess, goals_to_plan_for, present_problem
+from examples.studies.onboard.course import Course, goals_to_plan_for, present_problem, warm_start
 from examples.studies.onboard.log import Log
 from examples.studies.onboard.mission import Mission
 from examples.studies.onboard.thinking import Agenda, Round
@@ -72,7 +72,7 @@ class Robot:
     def end(self) -> None:
         """Stop planning."""
         if self._round is not None:
-            self._round.end(self._mission.patience)
+            self._round.end(self._mission.timeout)
 
     def _heed_stops(self, joint: JointState, lost: list[int]) -> None:
         """Stop robots in danger when another stands or is elsewhere than planned, and begin to plan anew."""
@@ -97,7 +97,7 @@ class Robot:
 
     def _drop_round(self) -> None:
         if self._round is not None:
-            self._round.end(self._mission.patience / 3)
+            self._round.end(self._mission.timeout / 3)
         self._former, self._round, self._ballot = self._round, None, None
 
     def _begin_round(self, joint: JointState) -> None:
@@ -116,7 +116,7 @@ class Robot:
         # Where nothing has changed since a round in vain, its work is gone on with.
         guess = None if self._former is None else self._former.progress_on(problem)
         if guess is None:
-            guess = first_guess(self._course, problem, takeover)
+            guess = warm_start(self._course, problem, takeover)
         members = [robot for robot in range(self._mission.robots) if robot not in self._lost]
         self._log.members = members
         agenda = Agenda(self._rounds, tuple(members), takeover, problem, guess)
@@ -126,7 +126,7 @@ class Robot:
         """Announce the best plan known when thinking is over, and then the best of those that all have announced."""
         if self._round is None:
             return
-        left, wait = self._round.agenda.takeover - tick.number, self._mission.patience / 3
+        left, wait = self._round.agenda.takeover - tick.number, self._mission.timeout / 3
         if left == self._mission.agree:
             self._round.enough(wait)
         elif left == 2:

@@ -19,7 +19,7 @@ from d4orm_planners.d_d4orm.node import Node, Task
 from d4orm_planners.d_d4orm.node_events import Event
 from d4orm_planners.d_d4orm.transport import Transport
 
-PATIENCE = 0.25
+TIMEOUT = 0.25
 """Seconds that a node waits for the others after each of its iterations."""
 
 RESEND = 0.2
@@ -98,8 +98,9 @@ class Round:
         nodes, own = len(agenda.members), agenda.members.index(robot)
         seed = derived_seed(self._mission.seed, Stream.TAKEOVER, agenda.takeover)
         task = Task(nodes, seed, agenda.guess, planning.selection, planning.k)
-        planner, judge = planning.node_planners(nodes)[own], Evaluator(self._engine, agenda.problem)
-        return Node(own, task, planner, self._team, judge, sequence=SEQUENCE * agenda.number, observer=self._observe)
+        planner, evaluator = planning.node_planners(nodes)[own], Evaluator(self._engine, agenda.problem)
+        sequence = SEQUENCE * agenda.number
+        return Node(own, task, planner, self._team, evaluator, sequence=sequence, observer=self._observe)
 
     def _observe(self, event: Event) -> None:
         plan = digest(self._engine, self.agenda.problem, event.candidate)
@@ -111,7 +112,7 @@ class Round:
     def _think(self, node: Node) -> None:
         iterations = 0
         while not self._enough.is_set():
-            node.step(self._enough, PATIENCE, improve=True)
+            node.step(self._enough, TIMEOUT, improve=True)
             iterations += 1
             if iterations == self._mission.iterations:
                 self._iterated.set()

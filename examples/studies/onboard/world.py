@@ -67,7 +67,7 @@ class World:
     """The environment, in lifelong mode, at the other end of the robots' network.
 
     A tick begins when all robots have answered the one before, but no sooner than real time allows: who is slow
-    holds the world up, and who does not answer within the mission's patience is given up and stops.
+    holds the world up, and who does not answer within the mission's timeout is given up and stops.
 
     Args:
         mission: The settings.
@@ -117,7 +117,7 @@ class World:
             time.sleep(max(due - time.perf_counter(), 0))
             record.began.append(time.perf_counter())
             due = max(due, record.began[-1] - self.problem.dt / self._speed) + self.problem.dt / self._speed
-            missing = self._ask(tick, self._mission.patience)
+            missing = self._ask(tick, self._mission.timeout)
             record.answered.append(time.perf_counter() - record.began[-1])
             self._lost |= missing
             self._step()

@@ -14,7 +14,7 @@ _SHARES = np.linspace(0, 1, 9)[1:]
 """Shares of the straight line at which its clearance from obstacles is looked at."""
 
 
-def within_sight(
+def visible_subgoals(
     problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, docked: BoolArray,
     walls: bool,
 ) -> IntArray:  # fmt: skip
@@ -55,7 +55,7 @@ def within_sight(
 def _meets_standing(
     begin: FloatArray, offset: FloatArray, reach: FloatArray, others: FloatArray, radius: FloatArray
 ) -> BoolArray:
-    """``(N,)`` whether the straight way from ``begin`` by ``offset`` comes within reach of one of the others."""
+    """``(N,)`` whether the straight path from ``begin`` by ``offset`` comes within reach of one of the others."""
     gap = others - begin[:, None]
     square = (offset**2).sum(axis=1)[:, None]
     share = np.clip((gap * offset[:, None]).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)

@@ -1,4 +1,4 @@
-"""Learned policies among walls: robots that see their goals along their shortest free ways."""
+"""Learned policies among walls: robots that see their goals along their shortest paths."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from d4orm_planners.rl.network import Header, Network, load_network
 OWN, NEIGHBOR, OBSTACLE = 11, 9, 5
 
 
-def save_network(path: Path, ways: bool | None = True) -> Network:
+def save_network(path: Path, shortest_paths: bool | None = True) -> Network:
     """A network of sets of random weights, in a file."""
     random = np.random.default_rng(0)
     shapes = {"reward_variance": (), "weight_0": (2, OWN + 2 * 7 + 2 * 3), "bias_0": (2,)}
@@ -29,7 +29,7 @@ def save_network(path: Path, ways: bool | None = True) -> Network:
         shapes |= {f"{kind}_weight_1": (width, width), f"{kind}_bias_1": (width,)}
     header = Header(
         format=1, algorithm="ppo", model="holonomic2d", dimension=2, num_neighbors=4, num_obstacles=4,
-        activation="relu", squashed=False, layers=1, encoder="sets", ways=ways, training={},
+        activation="relu", squashed=False, layers=1, encoder="sets", shortest_paths=shortest_paths, training={},
     )  # fmt: skip
     network = Network(header, {name: random.normal(0, 0.3, shape).astype(np.float32) for name, shape in shapes.items()})
     network.save(path)
@@ -44,7 +44,7 @@ def actions_of(path: Path, env: navigation_v0.parallel_env) -> np.ndarray:
     return np.stack(list(policy.act(observations, env.state()).values()))
 
 
-def test_goals_are_seen_along_the_ways_where_there_are_any() -> None:
+def test_goals_are_seen_along_the_paths_where_there_are_any() -> None:
     features = Features(ObservationSlices(2, 0, 0), turned=True)
     seen = np.zeros((4, 12), np.float32)
     goal = features.slices.own.goal
@@ -55,17 +55,17 @@ def test_goals_are_seen_along_the_ways_where_there_are_any() -> None:
     assert not np.delete(seen, np.arange(12)[goal], axis=1).any()
 
 
-def test_files_say_whether_robots_look_along_ways(tmp_path: Path) -> None:
-    save_network(tmp_path / "ways.safetensors")
-    assert load_network(tmp_path / "ways.safetensors").header.ways
-    straight = save_network(tmp_path / "straight.safetensors", ways=None)
-    assert "ways" not in json.loads(straight.header.text()), "as earlier versions know it"
+def test_files_say_whether_robots_look_along_paths(tmp_path: Path) -> None:
+    save_network(tmp_path / "paths.safetensors")
+    assert load_network(tmp_path / "paths.safetensors").header.shortest_paths
+    straight = save_network(tmp_path / "straight.safetensors", shortest_paths=None)
+    assert "shortest_paths" not in json.loads(straight.header.text()), "as earlier versions know it"
 
 
-def test_a_policy_looks_along_ways_among_walls_and_nowhere_else(tmp_path: Path) -> None:
+def test_a_policy_looks_along_paths_among_walls_and_nowhere_else(tmp_path: Path) -> None:
     along, straight = tmp_path / "along.safetensors", tmp_path / "straight.safetensors"
     save_network(along)
-    save_network(straight, ways=None)
+    save_network(straight, shortest_paths=None)
     for scenario, differ in (("random", False), ("rooms", True)):
         env = navigation_v0.parallel_env(scenario, num_robots=6)
         assert (actions_of(along, env) != actions_of(straight, env)).any() == differ
@@ -77,7 +77,7 @@ def test_a_policy_looks_along_ways_among_walls_and_nowhere_else(tmp_path: Path) 
 def test_a_robot_with_a_new_goal_sees_that_itself(tmp_path: Path) -> None:
     along, straight = tmp_path / "along.safetensors", tmp_path / "straight.safetensors"
     save_network(along)
-    save_network(straight, ways=None)
+    save_network(straight, shortest_paths=None)
     env = navigation_v0.parallel_env("rooms", num_robots=4)
     observations, _ = env.reset(seed=0)
     found = {}
@@ -100,12 +100,12 @@ def test_the_policy_of_the_package_is_that_for_the_world() -> None:
         env = navigation_v0.parallel_env(scenario, num_robots=4)
         env.reset(seed=0)
         policy.reset(env)
-        assert bool(policy._actor.network.header.ways) == along
+        assert bool(policy._actor.network.header.shortest_paths) == along
         assert policy._actor.network.header.num_obstacles == SEEN_OBSTACLES
 
 
 def test_the_policy_of_the_package_goes_through_doors() -> None:
-    """The other one, which knows nothing of ways, drives into the walls."""
+    """The other one, which knows nothing of paths, drives into the walls."""
     # Not all of them, for matrices are multiplied by the processor's own library, and one robot late is one too many.
     for path, expected in ((None, {2, 3}), (SHIPPED / "ppo.safetensors", {0})):
         policy = make_policy("ppo", path=path)
@@ -122,7 +122,7 @@ from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 @pytest.mark.parametrize("scenario", ["rooms", "random", "four_obstacles"])
 def test_training_sees_what_the_policy_sees(scenario: str, tmp_path: Path) -> None:
     network = save_network(tmp_path / "along.safetensors")
-    worlds = RobotVecEnv(1, 6, scenario, ways=True)
+    worlds = RobotVecEnv(1, 6, scenario, shortest_paths=True)
     features = worlds.reset()
     env = navigation_v0.parallel_env(scenario, num_robots=6)
     limits = env.unwrapped.problem.team.control_limits
@@ -140,16 +140,19 @@ def test_training_sees_what_the_policy_sees(scenario: str, tmp_path: Path) -> No
     worlds.close()
 
 
-def test_without_obstacles_ways_change_nothing_in_training() -> None:
-    along, straight = (RobotVecEnv(2, 3, "random", ways=ways, randomize_instance=True) for ways in (True, False))
+def test_without_obstacles_paths_change_nothing_in_training() -> None:
+    along, straight = (
+        RobotVecEnv(2, 3, "random", shortest_paths=shortest_paths, randomize_instance=True)
+        for shortest_paths in (True, False)
+    )
     np.testing.assert_allclose(along.reset(), straight.reset(), atol=1e-6)
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 2)).astype(np.float32)
     for ours, theirs in zip(along.step(actions)[:3], straight.step(actions)[:3]):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
-def test_robots_are_paid_for_the_way_made_along_ways() -> None:
-    env = RobotVecEnv(1, 6, "rooms", ways=True)
+def test_robots_are_paid_for_progress_along_paths() -> None:
+    env = RobotVecEnv(1, 6, "rooms", shortest_paths=True)
     env.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 2)).astype(np.float32)
     controls = env.features.decode(actions, env.frames, env.problem.team.control_limits)
@@ -164,15 +167,24 @@ def test_robots_are_paid_for_the_way_made_along_ways() -> None:
     assert (rewards != paid["straight"]).any()
 
 
-def test_a_training_along_ways_says_so(tmp_path: Path) -> None:
+def test_a_training_along_paths_says_so(tmp_path: Path) -> None:
     settings = TrainingSettings(
-        steps=64, num_envs=4, lessons=1, validation_worlds=2, network="sets", mixture=("rooms 2", "random 2"), ways=True
+        steps=64,
+        num_envs=4,
+        stages=1,
+        validation_worlds=2,
+        network="sets",
+        mixture=("rooms 2", "random 2"),
+        shortest_paths=True,
     )
     network = train(settings, tmp_path).network
-    assert network.header.ways
-    assert network.header.training["ways"] is True
-    with pytest.raises(ValueError, match="whose robots look along their shortest free ways; give --ways"):
-        train(replace(settings, ways=False, start_from=str(tmp_path / "policy.safetensors")), tmp_path / "straight")
+    assert network.header.shortest_paths
+    assert network.header.training["shortest_paths"] is True
+    with pytest.raises(ValueError, match="whose robots look along their shortest paths; give --shortest-paths"):
+        train(
+            replace(settings, shortest_paths=False, start_from=str(tmp_path / "policy.safetensors")),
+            tmp_path / "straight",
+        )
     assert not (tmp_path / "straight").exists()
-    flat = TrainingSettings(steps=64, num_envs=4, lessons=1, validation_worlds=2, scenario="rooms", num_robots=2)
-    assert train(flat, tmp_path / "flat").network.header.ways is None
+    flat = TrainingSettings(steps=64, num_envs=4, stages=1, validation_worlds=2, scenario="rooms", num_robots=2)
+    assert train(flat, tmp_path / "flat").network.header.shortest_paths is None

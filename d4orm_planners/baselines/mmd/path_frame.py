@@ -1,8 +1,8 @@
-"""The frame in which a robot's motion is described: its shortest way, and how much room there is beside it.
+"""The frame in which a robot's motion is described: its shortest path, and how much room there is beside it.
 
-The model never sees a map. It learns how motions differ from the shortest way driven at an even pace, in lengths of
-that way: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and
-directions, and a robot that waits or hurries stays on its way.
+The model never sees a map. It learns how motions differ from the shortest path driven at an even pace, in lengths of
+that path: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and
+directions, and a robot that waits or hurries stays on its path.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from d4orm_env.paths.wavefront import Space, clearance_at, make_space
 POINTS = 64
 """Stretches of equal time that a motion is cut into, as in the publication."""
 MODES = 16
-"""Sines that a difference from the way is made of."""
+"""Sines that a difference from the path is made of."""
 LOOKS = 16
-"""Places along the way at which the model is told of the way and of the room beside it."""
+"""Places along the path at which the model is told of the path and of the room beside it."""
 FEATURES = 5 * LOOKS + 2
 """Numbers that the model is told."""
 _ROUNDING = 2
-"""Points before and after one over which a way's direction is averaged."""
+"""Points before and after one over which a path's direction is averaged."""
 _ANY = 1e6
 """Rate at which robots that take any velocity at once could reach their full speed [1/s]."""
 _FAR = 4.0
 """Largest room that the model is told of, in robots' reach."""
 
 
-class WayFrame(NamedTuple):
-    """A robot's way and the axes in which its motion is described; all float64.
+class PathFrame(NamedTuple):
+    """A robot's path and the axes in which its motion is described; all float64.
 
     Attributes:
-        reference: ``(POINTS + 1, 3)`` places on the shortest way at equal distances, from start to goal [m].
+        reference: ``(POINTS + 1, 3)`` places on the shortest path at equal distances, from start to goal [m].
         tangents: ``(POINTS + 1, 3)`` its direction at each, corners rounded; of at most unit length.
         axes: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four
             across the line from start to goal in space.
-        length: Of the way, at least the goal's radius [m].
+        length: Of the path, at least the goal's radius [m].
         reach: The distance that the robot's centre keeps from obstacles [m].
         speed: Limit of the robot [m/s].
         acceleration: Limit of the robot; for one without inertia, a very large one [m/s^2].
-        quickest: Time that the way takes at full speed from rest [s].
+        quickest: Time that the path takes at full speed from rest [s].
         features: ``(P, FEATURES)`` what the model is told, per axis.
     """
 
@@ -94,8 +94,8 @@ def world_space(problem: Problem) -> Space:
     )
 
 
-def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> WayFrame | None:
-    """The frame of a robot, or ``None`` if it has no way to its goal.
+def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> PathFrame | None:
+    """The frame of a robot, or ``None`` if it has no path to its goal.
 
     Args:
         problem: The team and its world.
@@ -106,10 +106,10 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> WayF
     corners = problem.shortest_paths.path(robot)
     if not len(corners):
         return None
-    way = np.zeros((len(corners), 3))
-    way[:, : problem.dimension] = corners
+    path = np.zeros((len(corners), 3))
+    path[:, : problem.dimension] = corners
     reference = np.empty((POINTS + 1, 3))
-    length = max(resample(way, reference), problem.goal_radius)
+    length = max(resample(path, reference), problem.goal_radius)
     limits, reach = problem.team.limits[robot].astype(np.float64), float(problem.team.radius[robot]) + problem.margin
     speed = float(limits[SPEED])
     acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY * speed
@@ -122,7 +122,7 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> WayF
         describe(space, reference, along, _cross(axis, along), length, reach, own)
         own[-2:] = min(reach / length, _FAR), min(speed * speed / (acceleration * length), _FAR)
     quickest = length / speed + speed / acceleration / 2
-    return WayFrame(reference, tangents, axes, length, reach, speed, acceleration, quickest, features)
+    return PathFrame(reference, tangents, axes, length, reach, speed, acceleration, quickest, features)
 
 
 def _axes(along: Floats, turn: Floats, dimension: int) -> Floats:
@@ -152,33 +152,33 @@ def _unit(vector: Floats, otherwise: Floats, scale: float = 1.0) -> Floats:
 
 
 @cached_kernel(variant="resample", **OPTIONS)
-def resample(way: Floats, reference: Floats) -> float:
-    """Fill ``reference`` ``(N + 1, 3)`` with places equally far apart on the way ``(w, 3)``; its length."""
+def resample(path: Floats, reference: Floats) -> float:
+    """Fill ``reference`` ``(N + 1, 3)`` with places equally far apart on the path ``(w, 3)``; its length."""
     last = reference.shape[0] - 1
     total = 0.0
-    for corner in range(1, way.shape[0]):
-        total += _gap(way, corner)
+    for corner in range(1, path.shape[0]):
+        total += _gap(path, corner)
     corner, passed, own = 0, 0.0, 0.0
     for i in range(last + 1):
         arc = total * i / last
-        while corner < way.shape[0] - 1 and (corner == 0 or passed + own < arc):
+        while corner < path.shape[0] - 1 and (corner == 0 or passed + own < arc):
             passed += own
             corner += 1
-            own = _gap(way, corner)
+            own = _gap(path, corner)
         share = min((arc - passed) / own, 1.0) if own > 0.0 else 1.0
         for axis in range(3):
-            before = way[max(corner - 1, 0), axis]
-            reference[i, axis] = before + share * (way[corner, axis] - before)
+            before = path[max(corner - 1, 0), axis]
+            reference[i, axis] = before + share * (path[corner, axis] - before)
     return total
 
 
 @cached_kernel(variant="tangents", **OPTIONS)
 def round_tangents(reference: Floats, tangents: Floats) -> None:
-    """Fill ``tangents`` ``(N + 1, 3)`` with the mean direction of the way about each point."""
+    """Fill ``tangents`` ``(N + 1, 3)`` with the mean direction of the path about each point."""
     last = reference.shape[0] - 1
     for i in range(last + 1):
         before, after = max(i - _ROUNDING, 0), min(i + _ROUNDING, last)
-        # Its length is of the chord: shorter in corners, zero where the way turns back on itself.
+        # Its length is of the chord: shorter in corners, zero where the path turns back on itself.
         arc = 0.0
         for k in range(before, after):
             arc += _gap(reference, k + 1)
@@ -188,12 +188,12 @@ def round_tangents(reference: Floats, tangents: Floats) -> None:
 
 @compiled
 def locate(
-    frame: WayFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, i: int, spot: Floats
+    frame: PathFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, i: int, spot: Floats
 ) -> None:
     """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its place on the way [m].
 
     Args:
-        frame: The robot's way.
+        frame: The robot's path.
         axis: ``(3,)`` one of the frame's.
         sines: ``(MODES,)`` of the point.
         deviation: ``(2 MODES,)`` of the modes.
@@ -220,7 +220,7 @@ def locate(
 
 @inlined
 def trace(
-    frame: WayFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, spot: Floats, points: Floats
+    frame: PathFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, spot: Floats, points: Floats
 ) -> None:
     """Fill ``points`` ``(N + 1, 3)`` with those of a motion [m]; all else as of :func:`locate`, ``spot`` as scratch."""
     for i in range(points.shape[0]):
@@ -230,11 +230,11 @@ def trace(
 
 
 @compiled
-def _gap(way: Floats, corner: int) -> float:
+def _gap(path: Floats, corner: int) -> float:
     dx, dy, dz = (
-        way[corner, 0] - way[corner - 1, 0],
-        way[corner, 1] - way[corner - 1, 1],
-        way[corner, 2] - way[corner - 1, 2],
+        path[corner, 0] - path[corner - 1, 0],
+        path[corner, 1] - path[corner - 1, 1],
+        path[corner, 2] - path[corner - 1, 2],
     )
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
@@ -243,14 +243,14 @@ def _gap(way: Floats, corner: int) -> float:
 def describe(
     space: Space, reference: Floats, along: Floats, across: Floats, length: float, reach: float, features: FloatArray
 ) -> None:
-    """Fill in where the way leads and how much room is on it and on either side of it.
+    """Fill in where the path leads and how much room is on it and on either side of it.
 
     Args:
         space: The world.
-        reference: ``(N + 1, 3)`` the way [m].
+        reference: ``(N + 1, 3)`` the path [m].
         along: ``(3,)`` first axis.
         across: ``(3,)`` second axis.
-        length: Of the way [m].
+        length: Of the path [m].
         reach: Of the robot [m].
         features: ``(FEATURES,)``, output: five numbers at every look; in the last two nothing is written.
     """

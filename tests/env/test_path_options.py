@@ -1,4 +1,4 @@
-"""Rewards along the shortest free way, and observations of it, in every environment."""
+"""Rewards along the shortest path, and observations of it, in every environment."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_the_way_is_observed_at_the_end(spatial: bool, closed: bool) -> None:
     assert (seen <= layout.high).all()
 
 
-def test_nothing_is_observed_of_the_way_by_default() -> None:
+def test_nothing_is_observed_of_the_path_by_default() -> None:
     slices = ObservationSlices(2, 4, 4)
     assert not slices.observed_path
     assert slices.paths(np.zeros((3, slices.size))).shape == (3, 0)
@@ -151,7 +151,7 @@ def drawn(seed: int, num_robots: int) -> Problem:
     )
 
 
-def test_instances_have_ways_of_their_own() -> None:
+def test_instances_have_paths_of_their_own() -> None:
     options = {"scenario": drawn, "num_robots": 2, "progress": "path", "observed_path": True}
     single = joint(**options)
     batch = gymnasium.make_vec("d4orm/Navigation-v0", num_envs=2, **BATCHED, **options)
@@ -186,7 +186,7 @@ def test_bad_options_are_named() -> None:
         navigation_v0.parallel_env("circle", observed_path=True, lifelong=True)
     cage = [[-2, -2, -1.8, 2], [1.8, -2, 2, 2], [-1.8, -2, 1.8, -1.8], [-1.8, 1.8, 1.8, 2]]
     problem = walled().replace(world=World(boxes=cage), goal=[[1, -0.4], [3, 0.4]])
-    with pytest.raises(ValueError, match="robot_1 has no way from start to goal"):
+    with pytest.raises(ValueError, match="robot_1 has no path from start to goal"):
         navigation_v0.parallel_env(problem=problem, progress="path")
     env = navigation_v0.parallel_env(problem=problem, observed_path=True)
     seen = env.reset(seed=0)[0]["robot_1"]

@@ -1,4 +1,4 @@
-"""Shortest free ways against visibility graphs in the plane and analytic ways in space."""
+"""Shortest free paths against visibility graphs in the plane and analytic paths in space."""
 
 from __future__ import annotations
 
@@ -99,34 +99,34 @@ def around(first: float, second: float, radius: float, angle: float) -> float:
 
 @pytest.mark.parametrize("size", [0.3, 1.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_ways_round_a_sphere(size: float, seed: int) -> None:
+def test_paths_round_a_sphere(size: float, seed: int) -> None:
     random = np.random.default_rng(seed)
     start = random.normal(size=3)
     start *= (size + random.uniform(0.5, 2)) / np.linalg.norm(start)
     goal = -start + 0.3 * random.normal(size=3)
-    ways = problem_in(World(3, spheres=[[0, 0, 0, size]]), start, goal).shortest_paths
+    found = problem_in(World(3, spheres=[[0, 0, 0, size]]), start, goal).shortest_paths
     first, second = float(np.linalg.norm(start)), float(np.linalg.norm(goal))
     expected = around(first, second, size + REACH, math.acos(start @ goal / first / second))
-    assert 0.999 < ways.length[0] / expected < 1.02
+    assert 0.999 < found.length[0] / expected < 1.02
 
 
 @pytest.mark.parametrize("rise", [0.0, 1.0, 4.0])
-def test_ways_round_a_cylinder_climb_evenly(rise: float) -> None:
+def test_paths_round_a_cylinder_climb_evenly(rise: float) -> None:
     world = World(3, cylinders=[[0, 0, 0.5]], spheres=[[0, 0, 20, 0.1]])
-    ways = problem_in(world, [-1.5, 0, 0], [1.2, 0.1, rise]).shortest_paths
+    found = problem_in(world, [-1.5, 0, 0], [1.2, 0.1, rise]).shortest_paths
     flat = around(1.5, math.hypot(1.2, 0.1), 0.5 + REACH, math.pi - math.atan2(0.1, 1.2))
-    assert 0.999 < ways.length[0] / math.hypot(flat, rise) < 1.02
+    assert 0.999 < found.length[0] / math.hypot(flat, rise) < 1.02
 
 
 @pytest.mark.parametrize(("ahead", "aside"), [(1.0, 0.0), (2.0, 1.5), (1.0, 2.5)])
-def test_ways_over_a_wall_unfold(ahead: float, aside: float) -> None:
+def test_paths_over_a_wall_unfold(ahead: float, aside: float) -> None:
     wall = World(3, boxes=[[-0.2, -3, 0, 0.2, 3, 1]], lower=[-4, -3, 0], upper=[4, 3, 4])
-    ways = problem_in(wall, [-ahead, -aside, 0.3], [ahead, aside, 0.3]).shortest_paths
+    found = problem_in(wall, [-ahead, -aside, 0.3], [ahead, aside, 0.3]).shortest_paths
     gap = math.hypot(ahead - 0.2, 0.7)
     # Up to where the string leaves the rounded edge for the top, in the plane across the wall.
     turn = math.atan2(0.7, ahead - 0.2) + math.pi / 2 - math.acos(REACH / gap)
     flat = 2 * (math.sqrt(gap**2 - REACH**2) + REACH * turn) + 0.4
-    assert 0.999 < ways.length[0] / math.hypot(flat, 2 * aside) < 1.02
+    assert 0.999 < found.length[0] / math.hypot(flat, 2 * aside) < 1.02
 
 
 @pytest.mark.parametrize("scenario", ["circle", "sphere"])
@@ -157,20 +157,20 @@ def test_robots_without_a_way_are_named() -> None:
     cage = [[-1, -1, -0.9, 1], [0.9, -1, 1, 1], [-0.9, -1, 0.9, -0.9], [-0.9, 0.9, 0.9, 1]]
     starts, goals = [[0, 0], [3, 0], [0, 3], [0.5, 0.5]], [[2, 0], [3, 1], [0, 0], [-0.5, 0.5]]
     problem = problem_in(World(boxes=cage), starts, goals)
-    with pytest.raises(ValueError, match=r"^robot_0, robot_2 have no way from start to goal that is 0\.2 m clear .*"):
+    with pytest.raises(ValueError, match=r"^robot_0, robot_2 have no path from start to goal that is 0\.2 m clear .*"):
         problem.check_reachable()
     np.testing.assert_array_equal(np.isinf(problem.shortest_paths.length), [True, False, True, False])
     assert problem.shortest_paths.path(0).shape == (0, 2)
     np.testing.assert_array_equal(problem.shortest_paths.direction(problem.start)[[0, 2]], np.zeros((2, 2)))
-    with pytest.raises(ValueError, match=r"^robot_0 has no way .* use a smaller radius or margin$"):
+    with pytest.raises(ValueError, match=r"^robot_0 has no path .* use a smaller radius or margin$"):
         problem.select([0, 1]).check_reachable()
     problem.select([1, 3]).check_reachable()
 
 
-@pytest.mark.parametrize(("spare", "passable"), [(0.02, True), (0.005, True), (-0.001, False)])
+@pytest.mark.parametrize(("slack", "passable"), [(0.02, True), (0.005, True), (-0.001, False)])
 @pytest.mark.parametrize("turn", [0.0, 0.3, 0.785])
-def test_a_gap_is_passed_if_it_is_wide_enough(spare: float, passable: bool, turn: float) -> None:
-    half = REACH + spare / 2
+def test_a_gap_is_passed_if_it_is_wide_enough(slack: float, passable: bool, turn: float) -> None:
+    half = REACH + slack / 2
     turned = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     wall = np.array([[-0.1, half], [0.1, half], [0.1, 20], [-0.1, 20]])
     world = World(polygons=[wall @ turned.T, -wall @ turned.T], lower=[-3, -3], upper=[3, 3])
@@ -187,11 +187,11 @@ def test_places_within_the_margin_are_left_and_reached() -> None:
     assert problem.shortest_paths.length[0] == pytest.approx(1.8, rel=0.04)
     assert problem.shortest_paths.distance([[0.0, 0.05]])[0] == pytest.approx(0.95, abs=0.06)  # in contact
     between = problem_in(World(boxes=[[-1, -1, 1, 0], [-1, 0.36, 1, 1]]), [-1.5, 0.18], [0, 0.18])
-    with pytest.raises(ValueError, match="robot_0 has no way"):
+    with pytest.raises(ValueError, match="robot_0 has no path"):
         between.check_reachable()
 
 
-def test_robots_of_different_size_have_ways_of_their_own() -> None:
+def test_robots_of_different_size_have_paths_of_their_own() -> None:
     world = World(boxes=[[-0.1, 0.25, 0.1, 3], [-0.1, -3, 0.1, -0.25]])
     problem = problem_in(world, [[-2, 0], [-2, 1]], [[2, 0], [2, 1]], radius=np.array([0.15, 0.3]))
     assert problem.shortest_paths.length[0] == pytest.approx(4)
@@ -200,13 +200,13 @@ def test_robots_of_different_size_have_ways_of_their_own() -> None:
 
 def test_a_world_too_large_for_the_grid_gets_a_coarser_one() -> None:
     world = World(boxes=[[400, -300, 410, 300]])
-    ways = problem_in(world, [0, 0], [800, 0]).shortest_paths
-    assert ways._world is not None
-    assert np.diff(ways._world[1].first_anchor).max() <= MAX_NODES
-    assert ways.length[0] == pytest.approx(2 * math.hypot(400, 300) + 10, rel=0.02)
+    found = problem_in(world, [0, 0], [800, 0]).shortest_paths
+    assert found._world is not None
+    assert np.diff(found._world[1].first_anchor).max() <= MAX_NODES
+    assert found.length[0] == pytest.approx(2 * math.hypot(400, 300) + 10, rel=0.02)
 
 
-def test_ways_stay_with_the_problem_and_not_with_its_copies() -> None:
+def test_paths_stay_with_the_problem_and_not_with_its_copies() -> None:
     problem = make_problem("four_obstacles")
     assert problem.shortest_paths is problem.shortest_paths
     moved = problem.replace(goal=problem.start[:, :2], start=problem.start)
@@ -223,7 +223,7 @@ def test_stretch_of_a_straight_drive_is_one() -> None:
     assert mean_stretch(problem, rollout(problem, 0 * controls)) == np.inf
 
 
-def test_stretch_among_obstacles_is_measured_by_the_way_round() -> None:
+def test_stretch_among_obstacles_is_measured_by_the_path_round() -> None:
     problem = problem_in(World(circles=[[0, 0, 0.5]]), [-1.5, 0], [1.5, 0]).replace(horizon=60)
     plan = make_planner("d4orm", num_samples=256).solve(problem, max_iterations=3)
     assert plan.solved
