@@ -38,7 +38,7 @@ class PlainTeam(NamedTuple):
     dt: Array
     margin: Array
     goal_radius: Array
-    goal_speed: Array  # infinite without a limit
+    goal_speed: Array  # (K,) infinite without a limit
     collision_penalty: Array
 
 
@@ -57,7 +57,7 @@ def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
     numbers = (
         problem.start, problem.goal, team.radius, team.max_speed, team.max_acceleration, team.max_turn_rate,
         world.balls, world.cylinders, world.boxes, world.bounds, problem.dt, problem.margin, problem.goal_radius,
-        jnp.inf if problem.goal_speed is None else problem.goal_speed, problem.collision_penalty,
+        problem.goal_speed, problem.collision_penalty,
     )  # fmt: skip
     return models[0], PlainTeam(*(jnp.asarray(number, jnp.float32) for number in numbers))
 

@@ -24,7 +24,14 @@ from d4orm_env.core.arrays import (
     whole_number,
 )
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
-from d4orm_env.core.problem_checks import check_places, check_resolution, check_states, check_turning, unwound_states
+from d4orm_env.core.problem_checks import (
+    check_places,
+    check_resolution,
+    check_states,
+    check_turning,
+    goal_speeds,
+    unwound_states,
+)
 from d4orm_env.core.summary_line import Row, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -77,7 +84,9 @@ class Problem(Frozen):
         horizon: Number of steps ``H``, at most a million.
         margin: Safety margin epsilon [m] that plans keep to everything.
         goal_radius: A robot within it has arrived [m].
-        goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit, as in the paper.
+        goal_speed: ``(K,)`` speed at which each robot may still dock [m/s]; one number is for all. By default what it
+            brakes away in a time step, ``max_acceleration * dt``, and infinite for first-order models. Infinite is the
+            paper's convention: robots stop dead at their goals, as no real one can.
         name: Origin of the problem, for tables and pictures.
         collision_penalty: Taken off a robot's reward per step within the margin of another robot, and of an obstacle
             or a bound; 1 in the paper.
@@ -102,7 +111,7 @@ class Problem(Frozen):
     horizon: int
     margin: float
     goal_radius: float
-    goal_speed: float | None
+    goal_speed: FloatArray
     name: str
     arrival: Arrival
     collision_penalty: float
@@ -117,7 +126,7 @@ class Problem(Frozen):
         horizon: int = 100,
         margin: float = 0.05,
         goal_radius: float = 0.075,
-        goal_speed: float | None = None,
+        goal_speed: ArrayLike | None = None,
         name: str = "custom",
         arrival: Arrival = "dock",
         collision_penalty: float = 1.0,
@@ -125,19 +134,18 @@ class Problem(Frozen):
         world = World(dimension=team.dimension) if world is None else world
         if world.dimension != team.dimension:
             raise ValueError(f"the world has dimension {world.dimension} and the team {team.dimension}; match them")
-        if goal_speed is not None:
-            goal_speed = positive_number(goal_speed, "goal_speed", zero_allowed=True, most=LARGEST)
+        dt = positive_number(dt, "dt", least=MIN_TIME_STEP, most=MAX_TIME_STEP)
         check_arrival(arrival)
         self._set(
             team=team,
             start=frozen_array(start, "start", (team.num_robots, team.state_size), largest=LARGEST),
             goal=frozen_array(goal, "goal", (team.num_robots, team.dimension), largest=LARGEST),
             world=world,
-            dt=positive_number(dt, "dt", least=MIN_TIME_STEP, most=MAX_TIME_STEP),
+            dt=dt,
             horizon=whole_number(horizon, "horizon", 1, MAX_HORIZON),
             margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
             goal_radius=positive_number(goal_radius, "goal_radius", least=SMALLEST, most=LARGEST),
-            goal_speed=goal_speed,
+            goal_speed=goal_speeds(team, dt, goal_speed),
             name=name,
             arrival=arrival,
             collision_penalty=positive_number(collision_penalty, "collision_penalty", most=LARGEST),
@@ -218,7 +226,6 @@ class Problem(Frozen):
     @cached_property
     def arrays(self) -> ProblemArrays:
         """The problem as the engines read it."""
-        goal_speed = np.inf if self.goal_speed is None else self.goal_speed
         arrays = ProblemArrays(
             model_codes=np.array([MODEL_CODES[name] for name in self.team.models], np.int32),
             limits=self.team.limits.copy(),
@@ -235,7 +242,7 @@ class Problem(Frozen):
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
             squared_goal_radius=np.float32(self.goal_radius * self.goal_radius),
-            squared_goal_speed=np.float32(goal_speed * goal_speed),
+            squared_goal_speed=self.goal_speed * self.goal_speed,
             docks=np.bool_(self.docks),
             collision_penalty=np.float32(self.collision_penalty),
         )
@@ -292,7 +299,8 @@ class Problem(Frozen):
             sha.update(array.tobytes())
         if world.origin.any():
             sha.update(b"origin" + world.origin.tobytes())
-        sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {self.goal_speed!r}".encode())
+        goal_speed = None if np.isinf(self.goal_speed).all() else self.goal_speed.tolist()
+        sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {goal_speed!r}".encode())
         if not self.docks:
             sha.update(self.arrival.encode())
         if self.collision_penalty != 1:
@@ -365,7 +373,12 @@ class Problem(Frozen):
         """The problem of these robots only, in the order given."""
         index = list(robots)
         team = self.team.select(index)
-        return self._unchecked(team=team, start=self.start[index, : team.state_size], goal=self.goal[index])
+        return self._unchecked(
+            team=team,
+            start=self.start[index, : team.state_size],
+            goal=self.goal[index],
+            goal_speed=self.goal_speed[index],
+        )
 
     def _unchecked(self, **changes: object) -> Problem:
         copy: Problem = object.__new__(Problem)

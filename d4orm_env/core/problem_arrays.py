@@ -28,7 +28,7 @@ class ProblemArrays(NamedTuple):
         time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
         margin: ``()``.
         squared_goal_radius: ``()``.
-        squared_goal_speed: ``()``, infinite without a limit.
+        squared_goal_speed: ``(K,)``, infinite without a limit.
         docks: ``()`` bool: a robot that has arrived stays there for good.
         collision_penalty: ``()``.
     """
@@ -46,9 +46,14 @@ class ProblemArrays(NamedTuple):
     time_step: FloatArray
     margin: np.float32
     squared_goal_radius: np.float32
-    squared_goal_speed: np.float32
+    squared_goal_speed: FloatArray
     docks: np.bool_
     collision_penalty: np.float32
+
+    @property
+    def docking(self) -> FloatArray:
+        """``(K, 2)`` squares of the goal radius and of the goal speeds."""
+        return np.stack(np.broadcast_arrays(self.squared_goal_radius, self.squared_goal_speed), axis=1)
 
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, Floats, IntArray
+from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, IntArray, as_float32, shown
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
@@ -19,6 +20,27 @@ STEP_RESOLUTION = 10
 """A robot at its speed limit moves at least so many times that in one step."""
 INTEGRATION_ERROR = 2 / 15
 """Most that one step of RK4 may be off where a robot turns at its limits, as a share of the goal radius."""
+
+
+def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
+    """``(K,)`` speeds at which robots may dock [m/s], given or what each brakes away in a time step ``dt`` [s]."""
+    if given is None:
+        first_order = np.array([model.first_order for model in team.robot_models])
+        return np.where(first_order, np.float32(np.inf), team.max_acceleration * np.float32(dt))
+    try:
+        speeds = as_float32(given)
+        speeds = np.repeat(speeds, team.num_robots) if speeds.ndim == 0 else speeds
+    except ValueError as error:
+        raise ValueError(f"goal_speed must be a number or one per robot, not {shown(given)}; {error}") from error
+    if speeds.shape != (team.num_robots,):
+        raise ValueError(f"goal_speed has shape {speeds.shape}; expected one number, or ({team.num_robots},)")
+    wrong = ~((speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf)))
+    if wrong.any():
+        robot = int(np.argmax(wrong))
+        raise ValueError(
+            f"goal_speed of robot_{robot} is {speeds[robot]:g}; it must be from 0 to {LARGEST:g}, or inf for no limit"
+        )
+    return speeds
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start") -> None:

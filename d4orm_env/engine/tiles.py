@@ -84,7 +84,7 @@ def robot_mover(names: tuple[str, ...]) -> RobotMover:
     @inlined
     def move_robot(arrays: ProblemArrays, k: int, w: FloatArray) -> None:
         h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
-        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, arrays.docks)
+        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed[k], arrays.docks)
         move(arrays.model_codes[k], arrays.limits[k], h, docking, w[k * STRIDE : (k + 1) * STRIDE])
 
     return move_robot

@@ -38,7 +38,7 @@ def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, control
     """
     offsets = arrays.goal - states[:, : arrays.goal.shape[1]]
     squared_speed = np.zeros(len(states), np.float32)
-    if np.isfinite(arrays.squared_goal_speed):
+    if np.isfinite(arrays.squared_goal_speed).any():
         for robot, model in enumerate(team.robot_models):
             velocity = model.functions.velocity(states[robot], controls[robot], arrays.limits[robot], NUMPY_OPS)
             squared_speed[robot] = sum(component * component for component in velocity)

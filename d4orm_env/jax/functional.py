@@ -183,9 +183,8 @@ def observe(problem: Problem, state: State, layout: ObservationLayout, max_cycle
 def _arrays(problem: Problem) -> ProblemArrays:
     """:attr:`Problem.arrays` for a problem whose numbers may be traced."""
     team, world = problem.team, problem.world
-    fastest = jnp.inf if problem.goal_speed is None else problem.goal_speed
     # Rounded before they are computed with, whatever precision JAX has by default.
-    numbers = (problem.dt, problem.margin, problem.goal_radius, fastest, problem.collision_penalty)
+    numbers = (problem.dt, problem.margin, problem.goal_radius, problem.goal_speed, problem.collision_penalty)
     start, goal, dt, margin, goal_radius, goal_speed, penalty = (
         jnp.asarray(value, jnp.float32) for value in (problem.start, problem.goal, *numbers)
     )

@@ -80,7 +80,8 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
         y = transition.advance(functions, x, u, limits, h, OPS)
         gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
         speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
-        arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, arrays.squared_goal_speed)
+        slow2 = arrays.squared_goal_speed[robots][:, None]
+        arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, slow2)
         standing = transition.stands(worlds.docked[robots], arrays.docks)
         docks = transition.stands(arrives, arrays.docks)
         zero = jnp.zeros_like(gap2)

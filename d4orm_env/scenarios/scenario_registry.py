@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
+
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import Registry
@@ -36,8 +38,10 @@ def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
 
 
 _in_space = partial(BuiltIn, model="holonomic3d")
-_paper = partial(BuiltIn, horizon=100)
-_amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05)
+# Instances of others, who let robots stop dead at their goals.
+_paper = partial(BuiltIn, horizon=100, goal_speed=np.inf)
+_amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05, goal_speed=np.inf)
+_mmd = partial(BuiltIn, draws=True, goal_speed=np.inf)
 
 for _scenario in (
     BuiltIn(generators.circle),
@@ -62,9 +66,9 @@ for _scenario in (
     BuiltIn(forest.forest, draws=True),
     BuiltIn(corridors.corridor, draws=True),
     BuiltIn(corridors.doorway, draws=True),
-    BuiltIn(mmd_maps.mmd_conveyor, draws=True),
-    BuiltIn(mmd_maps.mmd_highways, draws=True),
-    BuiltIn(mmd_maps.mmd_drop_region, draws=True),
+    _mmd(mmd_maps.mmd_conveyor),
+    _mmd(mmd_maps.mmd_highways),
+    _mmd(mmd_maps.mmd_drop_region),
     BuiltIn(maps.map),
 ):
     register_scenario(_scenario.__name__, _scenario)

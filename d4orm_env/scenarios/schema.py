@@ -161,7 +161,7 @@ class ProblemFile(Entry):
     horizon: int = 100
     margin: Squared = 0.05
     goal_radius: Squared = 0.075
-    goal_speed: Squared | None = None
+    goal_speed: float | list[float] | None = None
     arrival: Arrival = "dock"
     collision_penalty: Number = 1.0
     robots: list[RobotEntry] = Field(min_length=1)
@@ -271,7 +271,9 @@ def parse(data: object) -> Problem:
 
 def describe(problem: Problem) -> dict[str, object]:
     """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
-    settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius", "goal_speed")}
+    settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius")}
+    speeds = _decimals(problem.goal_speed)
+    settings["goal_speed"] = speeds[0] if len(set(speeds)) == 1 else speeds
     if not problem.docks:
         settings["arrival"] = problem.arrival
     if problem.collision_penalty != 1:

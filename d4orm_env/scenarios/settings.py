@@ -19,7 +19,7 @@ MAX_COUNT = 10_000
 """Most robots or obstacles a generator makes: a slip of the finger must not fill the memory."""
 
 LARGEST = 10_000.0
-"""Largest length [m], time [s] and docking speed [m/s]; beyond it float32 holds no millimetres."""
+"""Largest length [m] and time [s]; beyond it float32 holds no millimetres."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class Settings:
         dt: Time step [s].
         horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
         goal_radius: A robot within it has arrived [m].
-        goal_speed: Speed at which a robot may still dock [m/s]; ``None`` is no limit.
+        goal_speed: Speed at which a robot may still dock [m/s], one or ``K``;
+            see :class:`~d4orm_env.core.problem.Problem`.
         arrival: ``"dock"``: a robot that arrives stays there for good. ``"stay"``: it may be moved again.
         collision_penalty: Taken off the reward per step within the margin of a robot, and of an obstacle.
         max_speed: Speed limit [m/s], one or ``K``.
@@ -64,7 +65,7 @@ class Settings:
     dt: float = 0.1
     horizon: int | None = None
     goal_radius: float = 0.075
-    goal_speed: float | None = None
+    goal_speed: ArrayLike | None = None
     arrival: Arrival = "dock"
     collision_penalty: float = 1.0
     max_speed: ArrayLike = 1.0
@@ -84,8 +85,6 @@ class Settings:
             object.__setattr__(self, name, bounded(getattr(self, name), name))
         object.__setattr__(self, "margin", bounded(self.margin, "margin", zero_allowed=True))
         check_arrival(self.arrival)
-        if self.goal_speed is not None:
-            object.__setattr__(self, "goal_speed", bounded(self.goal_speed, "goal_speed", zero_allowed=True))
 
     @cached_property
     def models(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
-from d4orm_env.verify.docking import Docking, find_docking
+from d4orm_env.verify.docking import SPEED_TOLERANCE, Docking, find_docking
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
@@ -93,6 +93,8 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
         pairs.minimum,
         min((watch.minimum for watch in obstacles), default=np.inf),
         docking.arrival_times,
+        docking.arrival_speeds,
+        not (docking.arrival_speeds > (1 + SPEED_TOLERANCE) * _braked_away(problem)).any(),
         sorted(violations, key=lambda violation: violation.time),
     )
 
@@ -143,7 +145,14 @@ def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
 
 
 def _left_out(problem: Problem, violations: list[Violation]) -> VerificationReport:
-    return VerificationReport(np.nan, np.nan, np.full(len(problem.team.models), np.inf), violations)
+    nobody = np.full(len(problem.team.models), np.inf)
+    return VerificationReport(np.nan, np.nan, nobody, np.full_like(nobody, np.nan), False, violations)
+
+
+def _braked_away(problem: Problem) -> Floats:
+    """``(K,)`` what robots brake away in a step [m/s], infinite for those without inertia."""
+    first_order = np.array([model.first_order for model in problem.team.robot_models])
+    return np.where(first_order, np.inf, problem.team.max_acceleration.astype(np.float64) * problem.dt)
 
 
 def _non_finite(controls: Floats, dt: float) -> list[Violation]:

@@ -51,8 +51,9 @@ def verify_curves(
     violations = [violation for watch in watches for violation in watch.violations()]
     violations += _not_arrived(problem, position, duration)
     nearest = min((watch.minimum for watch in obstacles), default=np.inf)
+    unknown = np.full(len(radius), np.nan)
     return VerificationReport(
-        pairs.minimum, nearest, np.full(len(radius), np.nan), sorted(violations, key=lambda violation: violation.time)
+        pairs.minimum, nearest, unknown, unknown, True, sorted(violations, key=lambda violation: violation.time)
     )
 
 

@@ -39,6 +39,7 @@ class Docking:
         robot: ``(B,)`` whose body it is.
         steps: ``(B,)`` steps after which it docks; more than the horizon where it never does.
         arrival_times: ``(K,)`` of each robot's first reading [s]; infinite where it does not dock in every reading.
+        arrival_speeds: ``(K,)`` speeds then [m/s]; NaN where a robot does not dock, or goals do not absorb.
         last_steps: ``(K,)`` steps of each robot's last reading.
         violations: Robots that do not dock in every reading.
     """
@@ -46,6 +47,7 @@ class Docking:
     robot: NDArray[np.intp]
     steps: NDArray[np.intp]
     arrival_times: Floats
+    arrival_speeds: Floats
     last_steps: NDArray[np.intp]
     violations: list[Violation]
 
@@ -64,7 +66,7 @@ def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
     never = len(distance) + 1
     if problem.arrival == "stay":
         return _staying(problem, motion, distance, certain)
-    robots, steps, times, last, violations = [], [], [], [], []
+    robots, steps, times, speeds, last, violations = [], [], [], [], [], []
     for robot in range(distance.shape[1]):
         sure = np.flatnonzero(certain[:, robot])[:1] + 1
         unsure = np.flatnonzero(possible[:, robot]) + 1
@@ -75,10 +77,11 @@ def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
         steps += readings
         last.append(readings[-1])
         times.append(readings[0] * problem.dt if arrives else np.inf)
+        speeds.append(motion.pace[readings[0] - 1, robot] if arrives else np.nan)
         if not arrives:
-            detail = "".join(_failure(problem, distance[:, robot], motion.pace[:, robot], unsure.tolist()))
+            detail = "".join(_failure(problem, robot, distance[:, robot], motion.pace[:, robot], unsure.tolist()))
             violations.append(Violation("not arrived", (robot,), problem.dt * problem.horizon, detail))
-    return Docking(np.array(robots), np.array(steps), np.array(times), np.array(last), violations)
+    return Docking(np.array(robots), np.array(steps), np.array(times), np.array(speeds), np.array(last), violations)
 
 
 def _staying(problem: Problem, motion: TeamMotion, distance: Floats, certain: NDArray[np.bool_]) -> Docking:
@@ -90,12 +93,12 @@ def _staying(problem: Problem, motion: TeamMotion, distance: Floats, certain: ND
     violations = [
         Violation(
             "not arrived", (robot,), problem.dt * horizon,
-            "".join(_failure(problem, distance[:, robot], motion.pace[:, robot], [])),
+            "".join(_failure(problem, robot, distance[:, robot], motion.pace[:, robot], [])),
         )
         for robot in np.flatnonzero(~certain[-1]).tolist()
     ]  # fmt: skip
     never = np.full(num_robots, horizon + 1)
-    return Docking(np.arange(num_robots), never, times, never, violations)
+    return Docking(np.arange(num_robots), never, times, np.full(num_robots, np.nan), never, violations)
 
 
 def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats) -> tuple[NDArray[np.bool_], ...]:
@@ -104,16 +107,16 @@ def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats)
     doubt = np.maximum(RADIUS_TOLERANCE * problem.goal_radius, ROUNDING * extent) + motion.integration_error
     doubt = np.minimum(doubt, problem.goal_radius / 4)
     speed_doubt = SPEED_TOLERANCE * motion.max_speed
-    goal_speed = np.inf if problem.goal_speed is None else problem.goal_speed
+    goal_speed = problem.goal_speed.astype(np.float64)
     slow = (motion.pace <= goal_speed - speed_doubt) | (motion.pace == 0)
     possible = (distance <= problem.goal_radius + doubt) & (motion.pace <= goal_speed + speed_doubt)
     return possible, (distance <= problem.goal_radius - doubt) & slow
 
 
-def _failure(problem: Problem, distance: Floats, pace: Floats, unsure: list[int]) -> Iterator[str]:
+def _failure(problem: Problem, robot: int, distance: Floats, pace: Floats, unsure: list[int]) -> Iterator[str]:
     yield f"{distance[-1]:.4g} m from its goal (goal radius {problem.goal_radius:g} m) at the horizon"
-    if problem.goal_speed is not None:
-        yield f", at {pace[-1]:.4g} m/s (goal speed {problem.goal_speed:g} m/s)"
+    if np.isfinite(problem.goal_speed[robot]):
+        yield f", at {pace[-1]:.4g} m/s (goal speed {problem.goal_speed[robot]:g} m/s)"
     if unsure:
         yield (
             f", unless it docks at {unsure[0] * problem.dt:.3f} s, {distance[unsure[0] - 1]:.8g} m from its goal at "

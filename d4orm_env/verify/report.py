@@ -40,6 +40,10 @@ class VerificationReport:
             in an empty open world, NaN for a plan whose motion is not judged.
         arrival_times: ``(K,)`` when each robot docked, in the first reading of its docking [s]; infinite for one that
             does not dock in every reading.
+        arrival_speeds: ``(K,)`` speed at which each robot then docked [m/s]; NaN where it does not dock, or is
+            not stopped.
+        dynamics_ok: Whether each robot that docked could brake away that speed within the step: if so the plan obeys
+            the model to its end. It does not where goals stop robots dead (an infinite goal speed, as in the paper).
         violations: Everything wrong, by time; one entry for each pair, robot and obstacle, robot and side of the
             bounds, or robot and limit.
     """
@@ -47,6 +51,8 @@ class VerificationReport:
     min_separation: float
     min_clearance: float
     arrival_times: Floats
+    arrival_speeds: Floats
+    dynamics_ok: bool
     violations: list[Violation]
 
     @property

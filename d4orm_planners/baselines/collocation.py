@@ -294,13 +294,13 @@ class TeamProgram:
         radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
         for robot, dock in enumerate(docks):
             yield self._squared_goal_distance(robot)[dock - 1] / self.unit**2, -np.inf, (radius / self.unit) ** 2
-            if problem.goal_speed is not None:
+            if np.isfinite(problem.goal_speed[robot]):
                 variables = self.states[robot][:, dock - 1], self.controls[robot][:, dock - 1]
                 x, u = map(self.casadi.vertsplit, variables)
                 limits = self.limits[robot].tolist()
                 velocity = self.models[robot].functions.velocity(x, u, limits, self.ops)
                 pace = sum((part / self.unit) ** 2 for part in velocity)
-                yield pace, -np.inf, (problem.goal_speed / self.unit) ** 2
+                yield pace, -np.inf, (float(problem.goal_speed[robot]) / self.unit) ** 2
 
     def _contact_rows(self, contacts: Contacts, docks: IntArray) -> Iterator[Rows]:
         for (robot, body), steps in contacts.items():

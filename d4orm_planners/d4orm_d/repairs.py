@@ -13,9 +13,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_planners.base.conflict_groups import components, independent_robots
+from d4orm_planners.base.final_approach import approach_goals
 from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.settings import RULES, D4ormDConfig
-from d4orm_planners.tracking.steering import drives
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,25 +120,8 @@ class _Repair:
         return robots, "robot"
 
     def take_over(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
-        """Let robots do as in the trajectory, or turn to their goals in time; those that get worse stay as they were.
-
-        A deformation ends metres from where it was aimed at after a long way: arriving is what sampling does worst, and
-        steering does at once.
-        """
+        """Let robots do as in the trajectory, see :func:`approach_goals`, and count the failures."""
         index = np.array(robots)
-        gap = np.linalg.norm(trajectory.positions - part.goal, axis=2)
-        nearest = np.where(trajectory.arrived.any(axis=0), trajectory.arrived.argmax(axis=0), gap.argmin(axis=0))
-        # In its last step a robot drives nowhere else: the deformation as it is.
-        switch = np.maximum(nearest[:, None] - np.array(RULES.earlier), 0)
-        switch = np.concatenate([np.full((len(index), 1), self.problem.horizon), switch], axis=1)
-        # Some at a time, for all paths of a big team take room.
-        order = np.argsort(-nearest, kind="stable")
-        for some in np.array_split(order, -(-len(order) // RULES.batch)):
-            if self.search.should_stop():
-                break
-            alone = part.select(some.tolist())
-            states = trajectory.states[:, some, : alone.state_size]
-            rollouts = drives(alone, states, trajectory.controls[:, some, : alone.control_size], switch[some])
-            self.team.take_best(index[some], rollouts, or_longer=True)
+        approach_goals(self.team, index, part, trajectory, or_longer=True)
         faults, _ = self.team.faults(index)
         self.failures[index] = np.where(faults > 0, self.failures[index] + 1, 0)

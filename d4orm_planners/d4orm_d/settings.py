@@ -60,8 +60,6 @@ class RepairRules:
         joint_failures: ... if so many repairs in a row failed for each of them ...
         joint_robots: ... and they are so few: robots that only together can get out of each other's way.
         shortenings: Number of times in turn that robots look for shorter final approaches.
-        earlier: Steps before a robot's arrival, or its nearest approach, at which it may turn straight to its goal.
-        batch: Robots that look for paths home at the same time: all paths of a big team take room.
     """
 
     noise_factors: tuple[float, ...] = (1.0, 2.0)
@@ -73,8 +71,6 @@ class RepairRules:
     joint_failures: int = 2
     joint_robots: int = 3
     shortenings: int = 2
-    earlier: tuple[int, ...] = (0, 8, 16, 32, 64)
-    batch: int = 64
 
 
 RULES = RepairRules()

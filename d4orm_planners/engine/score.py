@@ -219,7 +219,7 @@ def _score_tile(
     codes, all_limits, goals, inverse = arrays.model_codes, arrays.limits, arrays.goal, arrays.inverse_initial_distance
     h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
     docks, dimension = arrays.docks, goals.shape[1]
-    docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, docks)
+    goal_radius2, goal_speed2 = arrays.squared_goal_radius, arrays.squared_goal_speed
     radius, margin = arrays.radius, arrays.margin
     standing[:] = False
     _begin_tile(arrays, scoring.docked, w)
@@ -237,7 +237,7 @@ def _score_tile(
                 enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
                 continue
             goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
-            last = first + count
+            last, docking = first + count, (goal_radius2, goal_speed2[k], docks)
             run_robot(
                 codes[k], all_limits[k], h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k],
                 draws, controls, moved, own_places, robot,

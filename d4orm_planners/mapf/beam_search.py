@@ -249,7 +249,6 @@ def search_kernel(name: str) -> Search:
     ) -> None:  # fmt: skip
         dt, closed = arrays.time_step, is_closed(arrays)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
-        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed, arrays.docks)
         goal_radius = np.sqrt(arrays.squared_goal_radius)
         num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
         last_busy = min(num_blocks - 1, table.moving[0] + 1)
@@ -261,6 +260,7 @@ def search_kernel(name: str) -> Search:
         for r in range(part[0], part[1]):
             robot, begin = queries.robots[r], queries.blocks[r]
             goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
+            docking = (arrays.squared_goal_radius, arrays.squared_goal_speed[robot], arrays.docks)
             at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
             for i in range(n):
                 beam.states[0, i] = queries.states[r, i]

@@ -17,8 +17,10 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.team import Team
 from d4orm_planners.base.conflict_groups import Groups, components, conflicts
+from d4orm_planners.base.final_approach import approach_goals
 from d4orm_planners.base.planner import Iteration, Planner, State
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.sampling.schedule import alpha_bar
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
@@ -82,7 +84,17 @@ class SamplingPlanner(Planner):
             mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
         controls = np.zeros_like(base)
         controls[:horizon] = task.base + mean
+        if self.config.final_approach and np.isfinite(search.problem.goal_speed).any():
+            controls = with_final_approaches(search, controls)
         return Iteration(controls, num_steps, excluded)
+
+
+def with_final_approaches(search: SolveRun, controls: FloatArray) -> FloatArray:
+    """``(H, K, m)`` controls with which robots turn straight to their goals, where that is no worse."""
+    trajectory = search.engine.rollout(search.problem, controls)
+    team = WorkingPlan(search, trajectory)
+    approach_goals(team, np.arange(search.problem.num_robots), search.problem, trajectory)
+    return team.controls
 
 
 def conflict_groups(search: SolveRun) -> Groups:

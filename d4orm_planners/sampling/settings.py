@@ -23,6 +23,7 @@ PAPER = {
     "weight_cutoff": 0.0,
     "clip_between_iterations": False,
     "short_paths": False,
+    "final_approach": False,
 }
 """Settings that the paper's experiments share (section IV-B)."""
 
@@ -43,6 +44,9 @@ class SamplingConfig(PlannerConfig):
         short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
             each other takes, by rewards that make up for the shortness (:mod:`d4orm_planners.sampling.short_paths`).
             The paper always samples all steps.
+        final_approach: Whether robots that must slow down to dock (:attr:`Problem.goal_speed`) turn straight to their
+            goals after an iteration, and brake there, where that makes nothing worse. Samples hardly ever stop
+            anywhere. The paper's robots need not.
     """
 
     num_samples: Samples = 1024
@@ -50,6 +54,7 @@ class SamplingConfig(PlannerConfig):
     credit: Credit = "team"
     penalty: Positive = 1.0
     short_paths: bool = True
+    final_approach: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

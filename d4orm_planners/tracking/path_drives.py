@@ -62,17 +62,17 @@ class Part(NamedTuple):
 
     Attributes:
         time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
-        docking: ``(2,)`` squares of the goal radius and of the goal speed.
         docks: Whether a robot that has arrived stays there for good.
         robots: ``(B,)`` int64.
+        docking: ``(B, 2)`` squares of the goal radius and of the goal speed.
         limits: ``(B, L)``.
         goals: ``(B, d)`` [m].
     """
 
     time_step: FloatArray
-    docking: FloatArray
     docks: np.bool_
     robots: IntArray
+    docking: FloatArray
     limits: FloatArray
     goals: FloatArray
 
@@ -164,9 +164,9 @@ def drive_kernel(name: str) -> Drive:
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive(part: Part, progress: Progress, states: FloatArray, docked: BoolArray, controls: FloatArray) -> None:
         h = transition.TimeStep(part.time_step[0], part.time_step[1], part.time_step[2], part.time_step[3])
-        docks, rules = part.docks, (part.docking[0], part.docking[1], part.docks)
+        docks = part.docks
         for b in range(part.robots.shape[0]):
-            k = part.robots[b]
+            k, rules = part.robots[b], (part.docking[b, 0], part.docking[b, 1], docks)
             own, goal = to_fixed_tuple(part.limits[b], num_limits), to_fixed_tuple(part.goals[b], d)
             state, target = to_fixed_tuple(states[k], n), to_fixed_tuple(progress.targets[k], d)
             standing = transition.stands(docked[k], docks)
@@ -220,7 +220,7 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
 
 def beyond_goal(problem: Problem) -> float:
     """Return the distance beyond their goals that robots plan to drive, if these stop them [m]."""
-    if not problem.docks or problem.goal_speed is not None:
+    if not problem.docks or np.isfinite(problem.goal_speed).any():
         return 0.0
     speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))
     return float((BEYOND * speed**2 / (2 * acceleration)).max())
@@ -229,10 +229,10 @@ def beyond_goal(problem: Problem) -> float:
 def _parts(problem: Problem) -> list[tuple[Drive, Part]]:
     """The robots by model, with what drives them."""
     arrays, models, parts = problem.arrays, np.array(problem.team.models), []
-    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
     for name in dict.fromkeys(problem.team.models):
         robots = np.flatnonzero(models == name)
-        part = Part(arrays.time_step, docking, arrays.docks, robots, arrays.limits[robots], problem.goal[robots])
+        docking = arrays.docking[robots]
+        part = Part(arrays.time_step, arrays.docks, robots, docking, arrays.limits[robots], problem.goal[robots])
         parts.append((drive_kernel(name), part))
     return parts
 

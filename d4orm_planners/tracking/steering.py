@@ -185,11 +185,12 @@ def drives(
     u = np.zeros((*switch.shape, num_steps, problem.control_size), np.float32)
     x = np.zeros((*switch.shape, num_steps + 1, problem.state_size), np.float32)
     arrived = np.zeros(switch.shape, bool)
-    docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
     near = NEAR_VIA * problem.team.largest_radius
-    rules = DriveRules(arrays.time_step, docking, arrays.docks, np.float32(near * near))
+    rules = DriveRules(arrays.time_step, arrays.docks, np.float32(near * near))
     given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
-    inputs = DriveInputs(arrays.limits, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points))
+    inputs = DriveInputs(
+        arrays.limits, arrays.docking, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points)
+    )
     threads = Threads(available_cores())
     for model, robots in by_model(problem):
         kernel, index = drive_kernel(model.name), np.array(robots)

@@ -24,13 +24,11 @@ class DriveRules(NamedTuple):
 
     Attributes:
         time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
-        docking: ``(2,)`` squares of the goal radius and of the goal speed.
         docks: Whether a robot that has arrived stays there for good.
         near2: Square of how near to a point is near [m^2].
     """
 
     time_step: FloatArray
-    docking: FloatArray
     docks: np.bool_
     near2: np.float32
 
@@ -39,17 +37,17 @@ class RobotSpec(NamedTuple):
     """A robot that drives as if alone.
 
     Attributes:
-        time_step: As of :class:`DriveRules`, like the next two.
-        docking: ``(2,)``.
+        time_step: As of :class:`DriveRules`, like the next one.
         docks: Whether it stays for good where it has arrived.
+        docking: ``(2,)`` squares of the goal radius and of the goal speed.
         limits: ``(L,)``.
         goal: ``(d,)`` [m].
         start: ``(n,)``.
     """
 
     time_step: FloatArray
-    docking: FloatArray
     docks: np.bool_
+    docking: FloatArray
     limits: FloatArray
     goal: FloatArray
     start: FloatArray
@@ -58,8 +56,7 @@ class RobotSpec(NamedTuple):
     def of(cls, problem: Problem, robot: int) -> RobotSpec:
         """A robot of a team."""
         arrays, goal, start = problem.arrays, problem.goal[robot], problem.start[robot]
-        docking = np.array([arrays.squared_goal_radius, arrays.squared_goal_speed])
-        return cls(arrays.time_step, docking, arrays.docks, arrays.limits[robot], goal, start)
+        return cls(arrays.time_step, arrays.docks, arrays.docking[robot], arrays.limits[robot], goal, start)
 
 
 class DriveInputs(NamedTuple):
@@ -67,6 +64,7 @@ class DriveInputs(NamedTuple):
 
     Attributes:
         limits: ``(R, L)`` of the robots.
+        docking: ``(R, 2)`` squares of the goal radius and of their goal speeds.
         goals: ``(R, d)``.
         states: ``(R, H+1, n)`` as given.
         controls: ``(R, H, m)`` as given, inside the limits, zero for docked robots.
@@ -75,6 +73,7 @@ class DriveInputs(NamedTuple):
     """
 
     limits: FloatArray
+    docking: FloatArray
     goals: FloatArray
     states: FloatArray
     controls: FloatArray
@@ -99,10 +98,11 @@ def drive_kernel(name: str) -> Kernel[[DriveRules, DriveInputs, IntArray, FloatA
     def drive(
         rules: DriveRules, given: DriveInputs, robots: IntArray, u: FloatArray, x: FloatArray, arrived: BoolArray
     ) -> None:
-        dt, docking = rules.time_step, (rules.docking[0], rules.docking[1], rules.docks)
+        dt = rules.time_step
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
         num_paths, horizon, num_vias = given.switch.shape[1], given.controls.shape[1], given.vias.shape[2]
         for r in robots:
+            docking = (given.docking[r, 0], given.docking[r, 1], rules.docks)
             own_limits, goal = to_fixed_tuple(given.limits[r], num_limits), to_fixed_tuple(given.goals[r], d)
             for v in range(num_paths):
                 first, at_goal, passed = given.switch[r, v], False, 0
