@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.envs.joint_state import split_state
+from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
-from d4orm_planners.tracking.steering import goals_along_paths
+from d4orm_planners.tracking.steering import drive_to_goal, goals_along_paths, must_brake
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -118,7 +118,14 @@ class LearnedPolicy(Policy):
         if among_obstacles and isinstance(self._actor, _NetworkActor) and self._actor.network.header.shortest_paths:
             self._look_along_paths(self._actor.network, robots, seen, state)
         controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
+        if isinstance(self._actor, _NetworkActor) and not self._actor.network.header.brakes:
+            controls = self._braking(robots, controls, split_state(self.problem, state))
         return within_limits(self.problem, dict(zip(observations, controls)))
+
+    def _braking(self, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
+        """``(N, m)`` the controls, but of robots that must brake now to dock those of go-to-goal."""
+        braking = must_brake(self.problem, joint.states, joint.controls, joint.goals)[robots, None]
+        return np.where(braking, drive_to_goal(self.problem, joint.states, joint.goals)[robots], controls)
 
     def _look_along_paths(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
         """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that all have.

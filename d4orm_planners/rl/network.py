@@ -48,6 +48,7 @@ class Header(BaseModel):
             a policy acts for any number of observed robots.
         frame: Direction of the first axis of a robot's frame; ``None`` is to the goal.
         shortest_paths: Whether it heads along the shortest paths, see :meth:`Features.along`; ``None`` is straight.
+        brakes: Whether it has learned to slow down for its goals; ``None`` is not, and go-to-goal brakes for it.
         training: The command and its settings, for people, and the ``training_time`` [s].
     """
 
@@ -65,11 +66,12 @@ class Header(BaseModel):
     encoder: Literal["sets"] | None = None
     frame: Literal["heading"] | None = None
     shortest_paths: Literal[True] | None = None
+    brakes: Literal[True] | None = None
     training: dict[str, object]
 
     def text(self) -> str:
         """Return it as JSON, which earlier versions read where it says nothing that they do not know."""
-        unsaid = {name for name in ("encoder", "frame", "shortest_paths") if getattr(self, name) is None}
+        unsaid = {name for name in ("encoder", "frame", "shortest_paths", "brakes") if getattr(self, name) is None}
         return self.model_dump_json(exclude=unsaid)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
 from d4orm_env.core.problem import Problem
@@ -97,5 +98,6 @@ class TrainConfig(CheckedSettings):
             "num_obstacles": slices.num_obstacles,
             "frame": None if frame == "goal" else frame,
             "shortest_paths": worlds.shortest_paths or None,
+            "brakes": bool(np.isfinite(worlds.problem.goal_speed).any()) or None,
             "training": {**training, **asdict(self)},
         }

@@ -132,6 +132,21 @@ def present_velocities(problem: Problem, states: FloatArray, controls: FloatArra
     return velocities
 
 
+def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals: FloatArray) -> BoolArray:
+    """``(K,)`` robots as near to their goals as they need for braking to dock, where they must slow down for that.
+
+    Args:
+        problem: Problem of the robots.
+        states: ``(K, n)``.
+        controls: ``(K, m)`` executed last.
+        goals: ``(K, d)`` [m].
+    """
+    speed = np.linalg.norm(present_velocities(problem, states, controls), axis=1)
+    gap = np.linalg.norm(goals - states[:, : problem.dimension], axis=1) - problem.goal_radius
+    braking = speed * (speed / (2 * problem.team.max_acceleration) + np.float32(problem.dt))
+    return np.isfinite(problem.goal_speed) & (gap <= braking)
+
+
 def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
     """The models of the team, each with its robots."""
     models = problem.team.models
