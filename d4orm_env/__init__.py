@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_types import make_team
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
@@ -24,8 +25,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Problem", "Team", "Trajectory", "VerificationReport", "World", "functional", "list_scenarios", "load_map",
-    "load_problem", "make_problem", "navigation_v0", "register_model", "register_scenario", "rollout", "save_problem",
-    "verify",
+    "load_problem", "make_problem", "make_team", "navigation_v0", "register_model", "register_scenario", "rollout",
+    "save_problem", "verify",
 ]  # fmt: skip
 
 register_environments()

@@ -59,5 +59,5 @@ def scaled(problem: Problem, factor: float) -> Problem:
         world=scaled_world(problem.world, factor),
         margin=problem.margin * factor,
         goal_radius=problem.goal_radius * factor,
-        goal_speed=None if problem.goal_speed is None else problem.goal_speed * factor,
+        goal_speed=problem.goal_speed * np.float32(factor),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,6 +50,8 @@ def build(settings: Settings, layout: Layout) -> Problem:
         ValueError: If bounds or random obstacles do not fit, or a start or goal does not keep the margin.
     """
     team = settings.team
+    if settings.height is not None:
+        layout = _lifted(layout, settings.height)
     places = np.vstack([layout.starts, layout.goals])
     horizon = settings.horizon
     world = with_bounds(settings, layout.world, layout.area)
@@ -71,6 +73,26 @@ def build(settings: Settings, layout: Layout) -> Problem:
         arrival=settings.arrival,
         collision_penalty=settings.collision_penalty,
     )
+
+
+def _lifted(layout: Layout, height: float) -> Layout:
+    """The layout with its lowest start or goal at that height [m]; obstacles of scenarios reach through all heights.
+
+    Raises:
+        ValueError: If it is planar.
+    """
+    places = np.vstack([layout.starts, layout.goals])
+    if places.shape[1] != 3:
+        raise ValueError(
+            f"height is {height:g} and the robots move in the plane; use model='holonomic3d', or leave it out"
+        )
+    lift = np.array([0.0, 0.0, height - places[:, 2].min()])
+    area, world = layout.area, layout.world
+    if area is not None:
+        area = area._replace(centre=area.centre + lift)
+    if world.lower is not None:
+        world = world.replace(lower=world.lower + lift, upper=world.upper + lift)
+    return replace(layout, starts=layout.starts + lift, goals=layout.goals + lift, world=world, area=area)
 
 
 def default_horizon(team: Team, dt: float, distance: float) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 from d4orm_env.core.arrays import shown, whole_number
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.robot_types import find_robot
 from d4orm_env.scenarios.settings import Settings
 
 DEFAULT_ROBOTS = 8
@@ -36,12 +37,14 @@ class BuiltIn:
         self._function, self._defaults = function, defaults
         self.draws = draws
         self._own = tuple(inspect.signature(function).parameters)[1:]
-        self.arguments = self._own + COMMON_ARGUMENTS
+        self.arguments = (*self._own, *COMMON_ARGUMENTS, "robot")
 
     def __call__(self, seed: int = 0, num_robots: int | None = None, **settings: Any) -> Problem:
         own = {name: settings.pop(name) for name in self._own if name in settings}
         size = {} if num_robots is None else {"num_robots": num_robots}
-        common = {**self._defaults, **size, **settings}
+        robot = settings.pop("robot", None)
+        team = {} if robot is None else find_robot(robot).settings
+        common = {**self._defaults, **team, **size, **settings}
         # A value too large for float32 becomes infinite, and is then refused by name.
         with np.errstate(over="ignore"):
             return self._function(Settings(scenario=self.__name__, seed=seed, **common), **own)

@@ -39,6 +39,7 @@ class Settings:
         margin: Safety margin [m].
         dt: Time step [s].
         horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
+        height: Of the lowest start or goal above zero [m]; only in space. By default scenarios are about the origin.
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s], one or ``K``;
             see :class:`~d4orm_env.core.problem.Problem`.
@@ -64,6 +65,7 @@ class Settings:
     margin: float = 0.05
     dt: float = 0.1
     horizon: int | None = None
+    height: float | None = None
     goal_radius: float = 0.075
     goal_speed: ArrayLike | None = None
     arrival: Arrival = "dock"
@@ -84,6 +86,8 @@ class Settings:
         for name in ("dt", "goal_radius", "obstacle_radius", "collision_penalty"):
             object.__setattr__(self, name, bounded(getattr(self, name), name))
         object.__setattr__(self, "margin", bounded(self.margin, "margin", zero_allowed=True))
+        if self.height is not None:
+            object.__setattr__(self, "height", bounded(self.height, "height", zero_allowed=True))
         check_arrival(self.arrival)
 
     @cached_property

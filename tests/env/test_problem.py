@@ -150,8 +150,11 @@ def test_bad_worlds_are_refused(arguments: dict[str, Any], message: str) -> None
         ({"margin": -0.01}, "margin is -0.01; it must be zero or more and finite"),
         ({"margin": INF}, "margin is inf; it must be zero or more and finite"),
         ({"goal_radius": 0}, "goal_radius is 0; it must be positive and finite"),
-        ({"goal_speed": -1}, "goal_speed is -1; it must be zero or more and finite"),
-        ({"goal_speed": 1e200}, r"goal_speed is 1e\+200; it must be at most 1e\+06"),
+        ({"goal_speed": -1}, r"goal_speed of robot_0 is -1; it must be from 0 to 1e\+06, or inf for no limit"),
+        ({"goal_speed": [0.1, 2e6]}, r"goal_speed of robot_1 is 2e\+06; it must be from 0 to 1e\+06"),
+        ({"goal_speed": np.nan}, "goal_speed of robot_0 is nan"),
+        ({"goal_speed": [0.1] * 3}, r"goal_speed has shape \(3,\); expected one number, or \(2,\)"),
+        ({"goal_speed": "slow"}, "goal_speed must be a number or one per robot, not 'slow'"),
         ({"world": World(3)}, "the world has dimension 3 and the team 2; match them"),
         (
             {"start": [[-1, 0, 0, 0], [-0.6, 0.25, 0, 0]]},  # 0.4717 m apart, radii 0.2 and 0.3
@@ -324,12 +327,23 @@ def test_the_arrays_that_engines_read() -> None:
     assert arrays.boxes[0].tolist() == [0, 1, 0, 1, 0.25]
     assert arrays.docks
     assert arrays.bounds.tolist() == [[-4, -4], [4, 4]]
-    assert (arrays.margin, arrays.squared_goal_radius, arrays.squared_goal_speed) == (0.125, 0.25, 0.0625)
-    assert two_robots().arrays.squared_goal_speed == np.inf
+    assert (arrays.margin, arrays.squared_goal_radius) == (0.125, 0.25)
+    assert arrays.squared_goal_speed.tolist() == [0.0625, 0.0625]
     open_world = two_robots(world=None).arrays
     assert open_world.bounds.tolist() == [[-np.inf] * 2, [np.inf] * 2]
     assert spatial().arrays.boxes[0].tolist() == [0, 0, 1, 0, 0, 1, 0.5]
     assert not two_robots(arrival="stay").arrays.docks
+
+
+def test_robots_arrive_at_what_they_brake_away_in_a_step() -> None:
+    team = Team(("holonomic2d", "velocity2d", "differential_drive", "car"), max_acceleration=[1, 1, 2, 0.5])
+    start = np.zeros((4, team.state_size))
+    start[:, 0] = np.arange(4)
+    problem = Problem(team, start, start[:, :2] + [0, 2], dt=0.2)
+    np.testing.assert_allclose(problem.goal_speed, [0.2, np.inf, 0.4, 0.1], rtol=1e-6)
+    assert problem.select([2, 0]).goal_speed.tolist() == problem.goal_speed[[2, 0]].tolist()
+    assert problem.replace(goal_speed=np.inf).goal_speed.tolist() == [np.inf] * 4
+    assert problem.replace(goal_speed=[0, 1, 2, np.inf]).goal_speed.tolist() == [0, 1, 2, np.inf]
 
 
 CHANGES: list[dict[str, Any]] = [

@@ -101,6 +101,7 @@ def problems(draw: st.DrawFn) -> Problem:
     places[:, :, 0] += 2 * np.arange(count)
     start = np.zeros((count, team.state_size), np.float32)
     start[:, :dimension] = places[0]
+    speeds = st.floats(0, 1e6)
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is not None:
             start[robot, model.heading_index] = draw(st.floats(-1000, 1000, width=32))
@@ -115,7 +116,7 @@ def problems(draw: st.DrawFn) -> Problem:
         horizon=draw(st.integers(1, 10**6)),
         margin=draw(st.floats(0, 10)),
         goal_radius=draw(st.floats(1e-3, 10)),
-        goal_speed=draw(st.none() | st.floats(0, 1e6)),
+        goal_speed=draw(st.none() | speeds | st.just(np.inf) | st.lists(speeds, min_size=count, max_size=count)),
         collision_penalty=draw(st.floats(1e-3, 1e3)),
         name=draw(st.text(st.characters(exclude_categories=["Cs"]))),
     )
@@ -126,7 +127,7 @@ def test_any_problem_comes_back_to_the_bit(problem: Problem) -> None:
     again = saved_and_loaded(problem)
     assert again == problem
     assert again.name == problem.name
-    for name in ("start", "goal", "origin"):
+    for name in ("start", "goal", "goal_speed", "origin"):
         assert getattr(again, name).tobytes() == getattr(problem, name).tobytes()
 
 
@@ -194,7 +195,7 @@ def test_the_example_is_what_it_says() -> None:
     problem = load_problem(str(EXAMPLE))
     assert problem.name == "mixed_team"
     assert problem.team.models == (*["differential_drive"] * 3, "holonomic2d", "velocity2d")
-    assert (problem.horizon, problem.goal_speed) == (120, None)
+    assert problem.horizon == 120
     np.testing.assert_allclose(problem.team.radius, [0.15, 0.15, 0.2, 0.15, 0.1])
     np.testing.assert_allclose(problem.start[:4, 2], [0, 0, np.arctan2(-4, -5), -0.5], rtol=1e-6)
     assert (len(problem.world.circles), len(problem.world.boxes)) == (2, 1)

@@ -448,11 +448,11 @@ def test_control_noise_changes_the_outcome(make_env: Any, plan: Plan) -> None:
         ("differential_drive", [0, 0, -7.0, 1.0]),
     ],
 )
-@pytest.mark.parametrize("goal_speed", [None, 0.3])
-def test_driving_to_the_goal_reaches_it_alone(model: str, start: list[float], goal_speed: float | None) -> None:
+@pytest.mark.parametrize("goal_speed", [np.inf, 0.3])
+def test_driving_to_the_goal_reaches_it_alone(model: str, start: list[float], goal_speed: float) -> None:
     goal = [2.0, 1.0, 1.5] if model == "holonomic3d" else [2.0, 1.0]
     # A first-order robot has no speed but the one it is told, and is told to stop at the goal, not before it.
-    goal_speed = None if model == "velocity2d" else goal_speed
+    goal_speed = np.inf if model == "velocity2d" else goal_speed
     problem = Problem(Team((model,), max_speed=1.0), [start], [goal], goal_speed=goal_speed)
     episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("go-to-goal"))
     assert episode.metrics["success"] == 1

@@ -275,7 +275,7 @@ def test_the_reference_tells_contacts_and_docking_apart() -> None:
     assert moving + 0.02 < crowded
     assert crowded + 0.02 < free
     assert mean_reward(TASKS["moving, no collisions"]()) == free
-    anyhow = replace(TASKS["docking"](), problem=TASKS["docking"]().problem.replace(goal_speed=None))
+    anyhow = replace(TASKS["docking"](), problem=TASKS["docking"]().problem.replace(goal_speed=np.inf))
     assert (
         len({round(reward, 2) for reward in map(mean_reward, (TASKS["docking"](), anyhow, TASKS["holonomic2d"]()))})
         == 3

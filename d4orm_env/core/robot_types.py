@@ -1,0 +1,158 @@
+"""Robots by name: what a planner must know of them, and where each number comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from d4orm_env.core.arrays import shown, whole_number
+from d4orm_env.core.team import Team
+
+_BITCRAZE = "data sheet: 92 mm between motors, 47 mm propellers"
+_MEASURED = "flown in crazyflow 0.4.0 with the Mellinger controller: largest tracking error 0.07 m, 0.12 m with gusts"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotType:
+    """A robot that can be bought. Numbers are what it reaches in a team's everyday, not its records.
+
+    Attributes:
+        model: Name of its model.
+        radius: Of the circle (sphere) around it [m].
+        max_speed: [m/s].
+        max_acceleration: [m/s^2]; of no use to first-order models.
+        max_turn_rate: [rad/s]; of no use to models without a heading.
+        margin: Distance for what tracking is off [m].
+        lag: Time constant of its actuators [s], for :class:`~d4orm_planners.Controller`.
+        sources: Where the numbers come from, by attribute.
+    """
+
+    model: str
+    radius: float
+    max_speed: float
+    max_acceleration: float = 1.0
+    max_turn_rate: float = 1.0
+    margin: float
+    lag: float
+    sources: Mapping[str, str]
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """Arguments of scenarios for a team of these."""
+        limits = {name: getattr(self, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
+        return {"model": self.model, "radius": self.radius, "margin": self.margin, **limits}
+
+
+ROBOTS: Mapping[str, RobotType] = MappingProxyType(
+    {
+        "crazyflie": RobotType(
+            model="holonomic3d",
+            radius=0.07,
+            max_speed=1.0,
+            max_acceleration=2.0,
+            margin=0.1,
+            lag=0.1,
+            sources={
+                "radius": f"Crazyflie 2.1+ {_BITCRAZE}; the air below it needs more",
+                "max_speed": "ours, for indoor flight by motion capture",
+                "max_acceleration": "ours: a tilt of 11 degrees, which leaves thrust for the height with a low battery",
+                "margin": _MEASURED,
+                "lag": "ours: the attitude loop follows in about 0.1 s",
+            },
+        ),
+        "crazyflie_brushless": RobotType(
+            model="holonomic3d",
+            radius=0.08,
+            max_speed=1.5,
+            max_acceleration=3.0,
+            margin=0.1,
+            lag=0.08,
+            sources={
+                "radius": "ours: about 50 mm to the motors, 55 mm propellers; measure yours",
+                "max_speed": "ours, for indoor flight by motion capture",
+                "max_acceleration": "ours: a tilt of 17 degrees",
+                "margin": "as crazyflie, not measured",
+                "lag": "ours, not measured",
+            },
+        ),
+        "turtlebot3_burger": RobotType(
+            model="differential_drive",
+            radius=0.105,
+            max_speed=0.22,
+            max_acceleration=0.5,
+            max_turn_rate=1.8,
+            margin=0.05,
+            lag=0.15,
+            sources={
+                "radius": "turtlebot3_navigation2: robot_radius 0.105 (138 x 178 mm, turning about the wheels' axle)",
+                "max_speed": "ROBOTIS e-Manual, specifications: 0.22 m/s",
+                "max_acceleration": "ours; turtlebot3_navigation allows 2.5",
+                "max_turn_rate": "ours; the e-Manual has 2.84 rad/s at most",
+                "margin": "ours, not measured",
+                "lag": "ours: a loop at 10 Hz over ROS 2",
+            },
+        ),
+        "robomaster": RobotType(
+            model="holonomic2d",
+            radius=0.2,
+            max_speed=1.0,
+            max_acceleration=1.0,
+            margin=0.05,
+            lag=0.1,
+            sources={
+                "radius": "DJI RoboMaster S1/EP: 320 x 240 mm, half of the diagonal",
+                "max_speed": "ours; DJI: 3.5 m/s forwards, 2.8 m/s sideways",
+                "max_acceleration": "ours, for mecanum wheels without slip",
+                "margin": "ours, not measured",
+                "lag": "ours, not measured",
+            },
+        ),
+        "jackal": RobotType(
+            model="differential_drive",
+            radius=0.333,
+            max_speed=1.5,
+            max_acceleration=1.0,
+            max_turn_rate=1.5,
+            margin=0.1,
+            lag=0.2,
+            sources={
+                "radius": "Clearpath Jackal: 508 x 430 mm, half of the diagonal",
+                "max_speed": "ours; Clearpath: 2.0 m/s",
+                "max_acceleration": "ours, for skid steering",
+                "max_turn_rate": "ours; jackal_control allows 4 rad/s",
+                "margin": "ours, not measured",
+                "lag": "ours, not measured",
+            },
+        ),
+    }
+)
+"""The robots that are known by name."""
+
+
+def find_robot(name: str) -> RobotType:
+    """The robot of that name.
+
+    Raises:
+        ValueError: If there is none; the message lists those there are.
+    """
+    if not isinstance(name, str) or name not in ROBOTS:
+        raise ValueError(f"robot {shown(name)} is unknown; choose one of {', '.join(ROBOTS)}")
+    return ROBOTS[name]
+
+
+def make_team(name: str, num_robots: int) -> Team:
+    """A team of robots that can be bought, with the radius and the limits that :data:`ROBOTS` has.
+
+    Scenarios take ``robot=name``, which sets the margin too.
+
+    Args:
+        name: ``"crazyflie"``, ``"crazyflie_brushless"``, ``"turtlebot3_burger"``, ``"robomaster"`` or ``"jackal"``.
+        num_robots: ``K``.
+
+    Raises:
+        ValueError: If there is no such robot, or the number is not positive.
+    """
+    settings = find_robot(name).settings
+    models, _ = (settings.pop("model"),) * whole_number(num_robots, "num_robots", 1), settings.pop("margin")
+    return Team(models, **settings)  # type: ignore[arg-type]
