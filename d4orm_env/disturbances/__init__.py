@@ -6,7 +6,7 @@ environments to the bit, and one disturbance draws the same whatever others ther
 :class:`Disturbance`.
 """
 
-from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
+from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.intruder import Intruder
@@ -25,6 +25,7 @@ __all__ = [
     "Dropout",
     "Gain",
     "Intruder",
+    "Lag",
     "LimitMismatch",
     "Observed",
     "Occlusion",

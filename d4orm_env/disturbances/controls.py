@@ -198,6 +198,38 @@ class Delay(Disturbance[Queue]):
 
 
 @dataclass(frozen=True)
+class Lag(Disturbance[Drawn]):
+    """Slow actuators: what a robot does follows what it is told as a first-order system, from rest.
+
+    A time step executes the mean of what happens in it.
+
+    Attributes:
+        time_constant: After it 63% of a change have happened; zero for none [s].
+    """
+
+    time_constant: float
+
+    def __post_init__(self) -> None:
+        constant = positive_number(self.time_constant, "Lag time_constant", zero_allowed=True, most=LARGEST)
+        object.__setattr__(self, "time_constant", constant)
+
+    @property
+    def negligible(self) -> bool:
+        return self.time_constant == 0
+
+    def begin(self, scene: Scene, draws: Draws) -> Drawn:
+        return Drawn(np.zeros_like(scene.controls))
+
+    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+        steps = scene.problem.dt / self.time_constant
+        left = math.exp(-steps)
+        gap = memory.values - controls
+        mean: FloatArray = controls + np.float32((1 - left) / steps) * gap
+        np.add(controls, np.float32(left) * gap, out=memory.values)
+        return mean
+
+
+@dataclass(frozen=True)
 class Dropout(Disturbance[Drawn]):
     """Commands get lost on their way, independently for every robot and step.
 

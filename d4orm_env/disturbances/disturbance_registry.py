@@ -11,7 +11,7 @@ from typing import NamedTuple
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.yaml_text import parse_yaml
-from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Quantisation
+from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
 from d4orm_env.disturbances.intruder import Intruder
 from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
@@ -19,7 +19,7 @@ from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
 _BUILT_IN: tuple[type[AnyDisturbance], ...] = (
     ControlNoise, CorrelatedNoise, Bias, Delay, Dropout, Quantisation, Gain, StateNoise, StateDelay, Occlusion, Push,
-    Stall, Intruder, Drag, LimitMismatch,
+    Stall, Intruder, Drag, LimitMismatch, Lag,
 )  # fmt: skip
 
 

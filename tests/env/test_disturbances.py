@@ -36,6 +36,7 @@ from d4orm_env.disturbances import (
     Dropout,
     Gain,
     Intruder,
+    Lag,
     LimitMismatch,
     Occlusion,
     Push,
@@ -185,7 +186,7 @@ def test_mixed_teams() -> None:
 ZERO: list[Disturbance[Any]] = [
     ControlNoise(0), CorrelatedNoise(0.0, 1.0), Bias((0, 0)), Delay(0), Delay((0, 0)), Dropout(0), Quantisation(0),
     Gain(0), StateNoise(0), StateDelay(0), Occlusion(math.inf), Push(0, 1), Push(1, 0), Stall(0), Stall(1.0, 0),
-    Intruder(0), Drag(0), LimitMismatch(1),
+    Intruder(0), Drag(0), LimitMismatch(1), Lag(0),
 ]  # fmt: skip
 
 
@@ -292,6 +293,15 @@ def test_delay_is_so_many_steps() -> None:
     counts = np.bincount(late.astype(int).ravel(), minlength=5)
     assert counts[[0, 4]].sum() == 0
     assert stats.chisquare(counts[1:4]).pvalue > 1e-3
+
+
+def test_actuators_lag_behind_by_their_time_constant() -> None:
+    executed = commands(Lag(0.2), 30)[:, 0, 0, 0]  # they are told 1, and a step is 0.1 s
+    ends = 1 - np.exp(-0.1 * np.arange(31) / 0.2)
+    # The mean over a step of what rises like that: the velocity gained is that of the command, less what is left.
+    np.testing.assert_allclose(np.cumsum(executed) * 0.1, 0.1 * np.arange(1, 31) - 0.2 * ends[1:], atol=1e-5)
+    assert (np.diff(executed) > 0).all()
+    assert executed[-1] == pytest.approx(1, abs=1e-5)
 
 
 def test_dropout_loses_that_share_and_holds_the_last() -> None:
@@ -606,6 +616,7 @@ def test_an_environment_under_way_can_be_copied_and_sent() -> None:
         (lambda: Delay((3, 1)), "Delay steps is 1; it must be at least 3"),
         (lambda: Delay((1, 2, 3)), r"Delay steps is \(1, 2, 3\)"),
         (lambda: Delay(10**6), "Delay steps is 1000000; it must be at most 1000"),
+        (lambda: Lag(-1), "Lag time_constant is -1"),
         (lambda: Dropout(1.5), "Dropout probability is 1.5; it must be at most 1"),
         (lambda: Dropout(0.5, hold="no"), "Dropout hold is 'no'"),
         (lambda: Quantisation(-1), "Quantisation step is -1"),
