@@ -31,7 +31,6 @@ from d4orm_planners.cli.node_command import node
 from d4orm_planners.cli.outputs import print_table
 from d4orm_planners.cli.plan_command import plan
 from d4orm_planners.cli.play import play
-from d4orm_planners.cli.reproduce import reproduce
 from d4orm_planners.cli.robustness_command import robustness
 from d4orm_planners.cli.run import run
 from d4orm_planners.cli.train import train
@@ -65,7 +64,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-COMMANDS = (demo, plan, run, export, play, evaluate, robustness, reproduce, leaderboard, dataset, train, bench, node)
+COMMANDS = (demo, plan, run, export, play, evaluate, robustness, leaderboard, dataset, train, bench, node)
 for command in COMMANDS:
     app.command()(command)
 

@@ -215,9 +215,6 @@ BAD = [
             ("--policy", "d4orm"), ("--scenario-set", "diameter=6"),
         )
     ),
-    (("reproduce", "--list", "circle"), "figure does not go with the list of figures"),
-    (("reproduce", "--quick"), "--quick does not go with the list of figures"),
-    (("reproduce", "--seeds", "99999999999"), "1000000"),
     (("bench", "--seeds", "99999999999"), "1000000"),
     (("bench", "--num-robots", "4,99999"), "num_robots is 99999; it must be at most 10000"),
     (("run", "--control-noise-std", "-1"), "control_noise_std is -1"),
@@ -232,9 +229,6 @@ BAD = [
     (("evaluate", "--seeds", "9-3"), "--seeds '9-3' names no seed; give a number"),
     (("evaluate", "--disturb", "push.speed=1,,2"), "the list is not YAML"),
     (("robustness", "--workers", "0"), "workers is 0"),
-    (("reproduce", "team-size", "--seeds", "0"), "not '0'"),
-    (("reproduce", "team-size", "--workers", "0"), "not '0'"),
-    (("reproduce", "team-size", "--trials", "missing.parquet"), "missing.parquet"),
     (("leaderboard", "missing", "--out", "a.txt"), "'a.txt' must end in .md"),
     (("leaderboard", "missing", "--out", "a/b.md"), "does not exist; create it"),
     (("nonsense",), "nonsense"),
@@ -286,7 +280,6 @@ def test_a_warning_is_one_line_without_a_place_in_the_program(d4orm, tmp_path: P
         ),
         (("leaderboard", "pipe.parquet"), "pipe.parquet is no Parquet file of trials: is not a file; give the path"),
         (("leaderboard", "pipe.sqlite"), "there is no store of trials at pipe.sqlite"),
-        (("reproduce", "team-size", "--go-on-from", "pipe.parquet"), "is not a file"),
         (("node", "--config", "pipe.yaml"), "pipe.yaml: is not a file"),
     ],
 )
