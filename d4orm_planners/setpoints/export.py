@@ -14,6 +14,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import Floats
 from d4orm_planners.setpoints.polynomials import AXES, PIECE_BYTES, fit_polynomials
+from d4orm_planners.setpoints.rosbag import write_bag
 from d4orm_planners.setpoints.setpoints import Setpoints, sample_motion
 from d4orm_planners.setpoints.smoothing import SmoothMotion
 
@@ -70,8 +71,6 @@ def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, heigh
 
 
 def _bag(storage: str, motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:
-    from d4orm_planners.setpoints.rosbag import write_bag
-
     write_bag(setpoints, folder / "motion", height, storage)
     return None
 

@@ -387,7 +387,7 @@ def test_a_file_that_ends_too_early_is_not_taken_for_ctrl_c(d4orm, monkeypatch: 
     def ended(name: str) -> None:
         raise EOFError("Ran out of input")
 
-    monkeypatch.setattr("d4orm_planners.base.planner_registry.default_settings", ended)
+    monkeypatch.setattr("d4orm_planners.cli.listings.default_settings", ended)
     outcome = d4orm("planners", "d4orm")
     assert outcome.status == 2
     assert outcome.err == "d4orm: something that was read ended too early (Ran out of input)\n"
@@ -439,7 +439,7 @@ def test_a_link_that_leads_to_no_file_is_refused_before_planning(
 def test_warmup_says_beforehand_that_nothing_can_be_kept(
     d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("d4orm_planners.cli.warmup.warm_up", lambda: pytest.fail("it compiles"))
+    monkeypatch.setattr("d4orm_planners.cli.warmup_command.warm_up", lambda: pytest.fail("it compiles"))
     monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
 
     def full(**options: object) -> None:

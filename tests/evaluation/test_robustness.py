@@ -570,7 +570,7 @@ def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypa
     monkeypatch.setitem(sys.modules, "pyrvo", None)
     status, _, err = d4orm("--policies", "go-to-goal,orca")
     assert status == 2
-    assert err == "d4orm: policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"\n"
+    assert err == "d4orm: policy 'orca' needs pyrvo; install it with: pip install 'd4orm-env[orca]'\n"
 
 
 @pytest.mark.parametrize(
