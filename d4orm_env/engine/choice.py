@@ -6,6 +6,7 @@ import sys
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from d4orm_env.core.errors import unknown
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.engine.types import Engine
 
@@ -43,7 +44,7 @@ def resolve_engine(name: str) -> str:
         ValueError: If there is no such engine.
     """
     if name not in ENGINES:
-        raise ValueError(f"engine {name!r} is unknown; choose one of {', '.join(ENGINES)}")
+        raise unknown("engine", name, ENGINES)
     if name == "auto":
         name = "jax" if _accelerator_visible() else "cpu"
     return name

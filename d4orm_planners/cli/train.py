@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_env.core.errors import unknown
 from d4orm_planners.cli.arguments import output_folder, parse_settings, refuse_options
 from d4orm_planners.cli.common_options import Model
 from d4orm_planners.cli.dataclass_options import takes
@@ -128,8 +129,7 @@ def _reinforcement(options: TrainOptions) -> Callable[..., TrainingResult]:
     """The training that was asked for."""
     training = _library("training")
     if options.algorithm not in training.ALGORITHMS:
-        known = ", ".join((*training.ALGORITHMS, IMITATION))
-        raise ValueError(f"algorithm {options.algorithm!r} is unknown; choose one of {known}")
+        raise unknown("algorithm", options.algorithm, (*training.ALGORITHMS, IMITATION))
     refuse_options(options.context, _IMITATION_ONLY, f"is for imitation; use it with 'd4orm train {IMITATION}'")
     steps = options.steps
     if not (math.isfinite(steps) and steps == int(steps) >= 1):

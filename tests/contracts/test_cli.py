@@ -184,7 +184,7 @@ BAD = [
     (("plan", "--set", "num_samples=64", "--set", "num_samples=65"), "--set gives 'num_samples' twice"),
     (("plan", "--planner", "cem", "--set", "temperature=1"), "'temperature' is no setting of planner 'cem'; it takes"),
     (("plan", "--planner", "d4orm-c2f"), "use make_policy('d4orm-c2f'), or d4orm run --policy d4orm-c2f"),
-    (("planners", "d4rom"), "policy 'd4rom' is unknown"),
+    (("planners", "d4rom"), "did you mean 'd4orm'?"),
     (("plan", "--set", "temperature=[1"), "the value is not YAML"),
     (("plan", "--set", "temperature=!!python/name:os.system"), "tags are not supported"),
     (("plan", "--set", "temperature=1e400"), "temperature is inf"),
