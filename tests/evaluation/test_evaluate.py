@@ -25,7 +25,8 @@ from d4orm_planners import IterationRecord, evaluate
 from d4orm_planners.evaluation import tables, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.pool import JobEvent, ProcessPool
+from d4orm_planners.evaluation.pool import JobEvent
+from d4orm_planners.evaluation.process_pool import ProcessPool
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, solved_after, success_by, success_rate, wilson_interval
