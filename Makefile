@@ -6,6 +6,7 @@ EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
 STUDIES := ablation amswarm_gaps contact_penalty credit_by_update disturbance_study fewer_samples gradient_dilution imitate_expert lifelong \
   multimodality multimodality_team paper_differences policy_rates scaling solve_rates tune_learners tuned_rivals warm_start
+DATA := examples/studies/data
 FIGURES := amswarm nodes noise-schedule robustness selections team-size
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
@@ -57,17 +58,17 @@ docs: $(DEV_STAMP) ## Build the documentation into docs/_build/html
 bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 	$(BIN)/d4orm bench --out bench
 
-results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in data/
+results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in examples/studies/data/
 	$(BIN)/python -m examples.studies.one_dimension --out docs/tables
-	$(BIN)/python -m examples.studies.tune_rivals --trials data/tuning.parquet --out docs/tables
+	$(BIN)/python -m examples.studies.tune_rivals --trials $(DATA)/tuning.parquet --out docs/tables
 	for study in $(STUDIES); do \
-	  $(BIN)/python -m examples.studies.$$study --trials data/$$study.parquet --out docs/tables || exit 1; done
-	$(BIN)/python -m examples.studies.training_seeds --curves data/training_curves.csv --out docs/tables
+	  $(BIN)/python -m examples.studies.$$study --trials $(DATA)/$$study.parquet --out docs/tables || exit 1; done
+	$(BIN)/python -m examples.studies.training_seeds --curves $(DATA)/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
-	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --no-times --out docs/tables --quiet || exit 1; done
+	  $(BIN)/python -m examples.studies.paper $$figure --trials $(DATA)/$$figure.parquet --no-times --out docs/tables || exit 1; done
 	for figure in big-teams coarseness ipopt; do \
-	  $(BIN)/d4orm reproduce $$figure --trials data/$$figure.parquet --out docs/tables --quiet || exit 1; done
-	$(BIN)/d4orm leaderboard data/leaderboard.parquet --out docs/tables/leaderboard.md
+	  $(BIN)/python -m examples.studies.paper $$figure --trials $(DATA)/$$figure.parquet --out docs/tables || exit 1; done
+	$(BIN)/d4orm leaderboard $(DATA)/leaderboard.parquet --out docs/tables/leaderboard.md
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .

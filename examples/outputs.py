@@ -54,35 +54,64 @@ def argument_parser(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def trials_argument(parser: argparse.ArgumentParser) -> None:
-    """Let a study make its table and plot of what :func:`measured` wrote before."""
-    parser.add_argument("--trials", type=existing_file, help="run nothing; a Parquet file of trials")
+def study_parser(description: str | None, seeds: int | None = None) -> argparse.ArgumentParser:
+    """A parser for a study: what every script has, and where rows or trials come from.
+
+    Args:
+        description: Docstring of the script.
+        seeds: Default of ``--seeds``; without it there is no such argument.
+    """
+    parser = argument_parser(description)
+    parser.add_argument("--trials", type=existing_file, help="run nothing; a Parquet file that the study wrote")
+    if seeds is not None:
+        parser.add_argument("--seeds", type=count, default=seeds, help="of every row")
+    return parser
 
 
-def go_on_argument(parser: argparse.ArgumentParser) -> None:
-    """Let a study take what :func:`stored` puts into its store."""
+def trials_parser(description: str | None, seeds: int | None = None) -> argparse.ArgumentParser:
+    """:func:`study_parser` of a study that is run by :func:`study_trials`."""
+    parser = study_parser(description, seeds)
     parser.add_argument("--go-on-from", type=existing_file, help="a Parquet file of trials that need not be run again")
+    parser.add_argument(
+        "--workers", type=count, default=1, help="processes of one thread each; 1 is one trial at a time on all cores"
+    )
+    return parser
 
 
-def stored(trials: Path | None, folder: Path) -> None:
-    """Put trials of a Parquet file into the store of a study that runs in ``folder``."""
-    if trials is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        TrialStore(folder / STORE).add(*read_parquet(trials))
+def study_trials(arguments: argparse.Namespace, name: str, studies: Iterable[Study]) -> list[Trial]:
+    """Trials of the file ``--trials``, or of studies, run one after the other and written to ``NAME.parquet``.
+
+    Trials are kept in the folder ``--out`` one by one, so that a call that was broken off goes on from there.
+    """
+    if arguments.trials is not None:
+        return read_parquet(arguments.trials)
+    chosen = list(studies)
+    for study in chosen:  # before the first of them runs for hours
+        study.configurations()
+    keep_known(arguments)
+    out: Path = arguments.out
+    trials = [
+        trial
+        for study in chosen
+        for group in run_study(study, out, workers=arguments.workers, progress=tell)
+        for trial in group.trials
+    ]
+    if write_parquet(path := out / f"{name}.parquet", trials):
+        print(f"wrote {path}")
+    return trials
 
 
-def trials_of(studies: Iterable[Study], out: Path) -> list[Trial]:
-    """Run studies one after the other in this process; their trials are kept in the folder ``out``."""
-    return [trial for study in studies for group in run_study(study, out, workers=1) for trial in group.trials]
+def keep_known(arguments: argparse.Namespace) -> None:
+    """Put the trials of ``--go-on-from`` into the store of a study that runs in ``--out``."""
+    if arguments.go_on_from is not None:
+        known = read_parquet(arguments.go_on_from)
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        TrialStore(arguments.out / STORE).add(*known)
 
 
-def measured_trials(trials: Path | None, measure: Callable[[], list[Trial]], path: Path) -> list[Trial]:
-    """The trials of the Parquet file ``trials``, or without it those of ``measure()``, written to ``path``."""
-    if trials is not None:
-        return read_parquet(trials)
-    found = measure()
-    write_parquet(path, found)
-    return found
+def tell(what: str, done: int, total: int) -> None:
+    """Say how far a study is."""
+    print(f"{done} of {total}: {what}", flush=True)
 
 
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
@@ -110,22 +139,27 @@ def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], refe
 def existing_file(text: str) -> Path:
     """A command-line path of a file of trials."""
     if not Path(text).is_file():
-        raise argparse.ArgumentTypeError(f"{text} is no file; give a Parquet file of trials, such as those in data/")
+        raise argparse.ArgumentTypeError(
+            f"{text} is no file; give a Parquet file of trials, such as those in examples/studies/data/"
+        )
     return Path(text)
 
 
-def measured(trials: Path | None, measure: Callable[[], list[dict[str, Any]]], path: Path) -> list[dict[str, Any]]:
-    """The rows of the file ``trials``, or without it those of ``measure()``, written to ``path`` (``.parquet``).
+def study_rows(
+    arguments: argparse.Namespace, name: str, measure: Callable[[], list[dict[str, Any]]]
+) -> list[dict[str, Any]]:
+    """The rows of the file ``--trials``, or those of ``measure()``, written to ``NAME.parquet``.
 
     Each row is written with the commit and the machine that it was measured with.
     """
     require("evaluate", "pyarrow")
     from pyarrow import Table, parquet
 
-    if trials is not None:
-        return list(parquet.read_table(trials).to_pylist())
+    if arguments.trials is not None:
+        return list(parquet.read_table(arguments.trials).to_pylist())
     source = {"commit": commit(), "machine": json.dumps(describe_machine(), sort_keys=True)}
     rows = measure()
+    path: Path = arguments.out / f"{name}.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     with replaced_when_done(path) as temporary:
         parquet.write_table(Table.from_pylist([{**row, **source} for row in rows]), temporary, compression="zstd")

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+from d4orm_env.core.arrays import shown
+
 
 class UnknownKeywordError(TypeError, ValueError):
     """A keyword or setting that does not exist: a TypeError, as Python raises, and bad input like any other."""
@@ -15,3 +20,23 @@ def first_line(error: BaseException) -> str:
 def describe(error: BaseException) -> str:
     """Kind and message on one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def unknown(what: str, value: object, known: Iterable[str], *others: str) -> ValueError:
+    """The error for a name that is none of those known, with the one that was meant perhaps.
+
+    Args:
+        what: Kind of thing; may be empty.
+        value: What was given.
+        known: Names that there are.
+        others: What else may be given.
+    """
+    names = list(known)
+    remedy = ", or ".join((f"choose one of {', '.join(names)}", *others))
+    return ValueError(f"{what} {shown(value)} is unknown; {remedy}{did_you_mean(value, names)}".lstrip())
+
+
+def did_you_mean(value: object, known: Iterable[str]) -> str:
+    """The end of a message that names the most similar of the known names; empty if none is."""
+    close = get_close_matches(value, known, 1) if isinstance(value, str) and len(value) < 100 else []
+    return f"; did you mean {close[0]!r}?" if close else ""

@@ -9,14 +9,18 @@ has no place that is so clear, and what the other cells do not connect is not co
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import Floats, IntArray
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.dynamics.robot_model import ACCELERATION
+
+ndimage: Any = LazyModule("scipy.ndimage")
 
 ROUNDING = 64 * 2.0**-23
 """Rounding error of float32, as a share of the largest coordinate or of radius and margin."""
@@ -31,7 +35,7 @@ SIMILAR = 1.1
 def prepare_proofs(problem: Problem) -> None:
     """Import what takes longer than the proofs of such a problem."""
     if problem.world.num_obstacles:
-        import scipy.ndimage  # noqa: F401
+        load(ndimage)
 
 
 def prove_infeasible(problem: Problem) -> dict[int, str]:
@@ -95,8 +99,6 @@ def _crowded(problem: Problem, what: str, places: Floats, freedom: Floats, withi
 
 def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -> list[int]:
     """Robots whose goals are not connected with their starts."""
-    from scipy.ndimage import label
-
     d, reach = problem.dimension, problem.team.radius.astype(np.float64) + problem.margin
     travel = _travel(problem, problem.team.max_speed.astype(np.float64))
     for halving in range(1 + HALVINGS):
@@ -109,8 +111,8 @@ def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -
             kept, away = (by_steps, travel[group].max()) if by_steps > body else (body, 0.0)
             # Beyond the cells everything is connected.
             free = np.pad(clearance > kept - half - doubt, 1, constant_values=True)
-            regions, _ = label(free, np.ones((3,) * d))
-            rooms, _ = label(clearance > np.sqrt(reach[group].max() ** 2 + cell * cell / 4))
+            regions, _ = ndimage.label(free, np.ones((3,) * d))
+            rooms, _ = ndimage.label(clearance > np.sqrt(reach[group].max() ** 2 + cell * cell / 4))
             for robot in group.tolist():
                 begin = _near(regions, low - cell, cell, starts[robot], away + half + doubt)
                 end = _near(regions, low - cell, cell, goals[robot], problem.goal_radius + half + doubt)

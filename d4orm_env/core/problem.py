@@ -23,6 +23,7 @@ from d4orm_env.core.arrays import (
     shown,
     whole_number,
 )
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.core.problem_checks import (
     check_places,
@@ -40,7 +41,13 @@ from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from d4orm_env.paths import shortest_paths as paths
     from d4orm_env.paths.shortest_paths import ShortestPaths
+    from d4orm_env.render import notebook, pictures
+else:
+    paths = LazyModule("d4orm_env.paths.shortest_paths")
+    notebook = LazyModule("d4orm_env.render.notebook")
+    pictures = LazyModule("d4orm_env.render.pictures")
 
 Arrival = Literal["dock", "stay"]
 """Effect of arriving: the robot stays at its goal for good, or drives on."""
@@ -260,10 +267,7 @@ class Problem(Frozen):
     @cached_property
     def shortest_paths(self) -> ShortestPaths:
         """The shortest path of every robot; see :func:`d4orm_env.paths.shortest_paths.shortest_paths`."""
-        # The one road up from here: it is compiled.
-        from d4orm_env.paths.shortest_paths import shortest_paths
-
-        return shortest_paths(self)
+        return paths.shortest_paths(self)
 
     def check_reachable(self) -> None:
         """Check that every robot has a path to its goal that keeps its radius and the margin from obstacles and bounds.
@@ -332,9 +336,7 @@ class Problem(Frozen):
         return f"Problem: {self.name}\n  {joined(self.key_figures)}"
 
     def _repr_html_(self) -> str:
-        from d4orm_env.render.notebook import problem_html
-
-        return problem_html(self, f"Problem: {self.name}", self.key_figures)
+        return notebook.problem_html(self, f"Problem: {self.name}", self.key_figures)
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw starts, goals and world with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
@@ -348,9 +350,7 @@ class Problem(Frozen):
         Raises:
             ValueError: If the axes are spatial and the problem is not.
         """
-        from d4orm_env.render.pictures import plot
-
-        return plot(self, None, axes)
+        return pictures.plot(self, None, axes)
 
     def with_state(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:
         """The same team in the same world in other states, for planning on from there.

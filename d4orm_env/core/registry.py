@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from d4orm_env.core.arrays import shown
-from d4orm_env.core.errors import describe
+from d4orm_env.core.errors import describe, unknown
 
 T = TypeVar("T", covariant=True)
 
@@ -101,7 +101,7 @@ class Registry(Mapping[str, T]):
             ValueError: If nothing has, several lay claim to it, or it cannot be loaded.
         """
         if not isinstance(name, str) or name not in self:
-            raise ValueError(f"{self.what} {shown(name)} is unknown; choose one of {', '.join(self)}")
+            raise unknown(self.what, name, self)
         return self[name]
 
     def find(self, text: object) -> T:

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.summary_line import Row, count, joined
+
+if TYPE_CHECKING:
+    from d4orm_env.render import notebook
+else:
+    notebook = LazyModule("d4orm_env.render.notebook")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,6 +57,4 @@ class Trajectory:
         return f"Trajectory: {self.title}\n  {joined(self.key_figures)}"
 
     def _repr_html_(self) -> str:
-        from d4orm_env.render.notebook import paths_html
-
-        return paths_html(self, f"Trajectory: {self.title}", self.key_figures)
+        return notebook.paths_html(self, f"Trajectory: {self.title}", self.key_figures)

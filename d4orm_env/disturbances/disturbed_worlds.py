@@ -7,17 +7,23 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import cache, reduce
-from typing import TypeVar
+from functools import reduce
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, DisturbanceEffect, Memory, Observed, Scene
 from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
+
+if TYPE_CHECKING:
+    from d4orm_env.engine import moving_obstacles
+else:
+    moving_obstacles = LazyModule("d4orm_env.engine.moving_obstacles")
 
 Worlds = NDArray[np.intp]
 
@@ -200,7 +206,9 @@ class DisturbedWorlds:
             Two arrays ``(B, K)`` bool; near is within the margin.
         """
         touched, near = np.empty((2, *states.shape[:2]), np.bool_)
-        _contact_kernel()(states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near)
+        moving_obstacles.meet_bodies(
+            states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near
+        )
         return touched, near
 
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Observed:
@@ -241,15 +249,6 @@ class DisturbedWorlds:
             one.draws[purpose] = draws = Draws(self._keys, scene.steps, one.stream, purpose, self._ahead)
         draws.turn_to(scene.steps)
         return draws
-
-
-@cache
-def _contact_kernel() -> Callable[..., None]:
-    # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.engine.moving_obstacles import meet_bodies
-
-    kernel: Callable[..., None] = meet_bodies
-    return kernel
 
 
 def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.lazy import LazyModule
+
+if TYPE_CHECKING:
+    from d4orm_env.engine import counter_draws
+else:
+    counter_draws = LazyModule("d4orm_env.engine.counter_draws")
 
 Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
-Kernel = Callable[..., None]
 Ahead = dict[tuple[int, int, int, tuple[int, ...]], tuple[int, FloatArray]]
 """Numbers that a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step,
 and rows of numbers, one for each step from there on.
@@ -29,14 +34,6 @@ def episode_keys(seeds: Sequence[int]) -> Keys:
     """``(B, 2)`` keys of episodes, of the 63 bits that each draws from its environment's generator."""
     words = np.array(seeds, np.uint64)
     return np.stack([words & np.uint64(0xFFFFFFFF), words >> np.uint64(32)], axis=1).astype(np.uint32)
-
-
-@cache
-def _kernels() -> tuple[Kernel, Kernel]:
-    # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.engine.counter_draws import draw_normals, draw_uniforms
-
-    return draw_normals, draw_uniforms
 
 
 _NOTHING: FloatArray = np.empty((0,), np.float32)
@@ -102,7 +99,8 @@ class Draws:
         """``(R, *shape)`` numbers, a row for each of the keys ``(R, 2)`` at its step ``(R,)``."""
         rows = len(keys)
         out: FloatArray = np.empty((rows, *shape), np.float32)
-        _kernels()[kind](keys, steps, np.uint32(self._stream), np.uint32(self._call), out.reshape(rows, -1))
+        draw = counter_draws.draw_uniforms if kind else counter_draws.draw_normals
+        draw(keys, steps, np.uint32(self._stream), np.uint32(self._call), out.reshape(rows, -1))
         return out
 
     def _taken(self, kind: int, shape: tuple[int, ...], ahead: Ahead) -> FloatArray:

@@ -4,8 +4,20 @@ from __future__ import annotations
 
 import sys
 from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
+from d4orm_env.core.errors import unknown
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.engine.types import Engine
+
+if TYPE_CHECKING:
+    from d4orm_env.engine import cpu
+    from d4orm_env.jax import jax_engine
+else:
+    cpu = LazyModule("d4orm_env.engine.cpu")
+    jax_engine = LazyModule("d4orm_env.jax.jax_engine")
+
+jax: Any = LazyModule("jax")
 
 ENGINES = ("auto", "cpu", "jax")
 
@@ -21,12 +33,8 @@ def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
         ValueError: If there is no such engine.
     """
     if resolve_engine(name) == "jax":
-        from d4orm_env.jax.jax_engine import JaxEngine
-
-        return JaxEngine()
-    from d4orm_env.engine.cpu import CpuEngine
-
-    return CpuEngine(num_threads)
+        return jax_engine.JaxEngine()
+    return cpu.CpuEngine(num_threads)
 
 
 def resolve_engine(name: str) -> str:
@@ -36,7 +44,7 @@ def resolve_engine(name: str) -> str:
         ValueError: If there is no such engine.
     """
     if name not in ENGINES:
-        raise ValueError(f"engine {name!r} is unknown; choose one of {', '.join(ENGINES)}")
+        raise unknown("engine", name, ENGINES)
     if name == "auto":
         name = "jax" if _accelerator_visible() else "cpu"
     return name
@@ -47,6 +55,4 @@ def _accelerator_visible() -> bool:
     # which would take longer than planning.
     if "jax" not in sys.modules and not any(find_spec(plugin) for plugin in ("jax_plugins", "libtpu")):
         return False
-    import jax
-
     return jax.default_backend() != "cpu"

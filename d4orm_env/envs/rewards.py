@@ -10,7 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, shown
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32
+from d4orm_env.core.errors import unknown
 from d4orm_env.core.team import Team
 
 __all__ = ["RewardFunction", "RewardInput", "TrainingReward"]
@@ -165,9 +166,7 @@ def find_reward(reward: str | RewardFunction) -> RewardFunction | None:
     if callable(reward):
         return reward
     if not isinstance(reward, str) or reward not in REWARDS:
-        raise ValueError(
-            f"reward {shown(reward)} is unknown; choose one of {', '.join(REWARDS)}, or a function of a RewardInput"
-        )
+        raise unknown("reward", reward, REWARDS, "a function of a RewardInput")
     return REWARDS[reward]
 
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, frozen_array, whole_number
 from d4orm_env.core.disturbance_events import DisturbanceEvents
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
@@ -38,6 +40,11 @@ from d4orm_env.envs.rewards import (
 )
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_env.paths.shortest_paths import observe_paths
+
+if TYPE_CHECKING:
+    from d4orm_env.engine import cpu
+else:
+    cpu = LazyModule("d4orm_env.engine.cpu")
 
 _MAX_OBSERVED = 10_000
 _OPEN_WORLD_EXTENT = 1000.0
@@ -77,10 +84,7 @@ class Simulation:
         if self.along_paths:
             self.reward = self.reward or paper_reward
             problem.check_reachable()
-        # Here, because importing the compiler takes longer than importing all the rest of the package.
-        from d4orm_env.engine.cpu import CpuEngine
-
-        self._engine: WorldEngine = CpuEngine()
+        self._engine: WorldEngine = cpu.CpuEngine()
         self._dimension = problem.dimension
         self._places = goal_region(problem)
         if self.redraws and problem.world.lower is None:

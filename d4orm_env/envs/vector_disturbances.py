@@ -12,11 +12,11 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.disturbances.disturbance import Observed, Scene
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
+from d4orm_env.engine.types import ObservationInputs
 from d4orm_env.envs.simulation import Simulation
 
 if TYPE_CHECKING:
     from d4orm_env.engine.episodes import WorldBatch
-    from d4orm_env.engine.types import ObservationInputs
 
 Worlds = NDArray[np.intp]
 
@@ -90,8 +90,6 @@ class DisturbedBatch:
 
     def look(self, worlds: Worlds) -> ObservationInputs:
         """Return the inputs to the observations of these worlds now, true or believed."""
-        from d4orm_env.engine.types import ObservationInputs
-
         batch = self._worlds
         rows: Worlds | slice = slice(None) if len(worlds) == len(batch.steps) else worlds
         seen = self._disturbed.see(self._scene, None if isinstance(rows, slice) else worlds)

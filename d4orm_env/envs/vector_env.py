@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, whole_number
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.envs.episode_record import EpisodeCounts, episode_metrics
@@ -29,8 +30,12 @@ from d4orm_env.paths.shortest_paths import ahead_in_each, observe_paths
 from d4orm_env.scenarios.problems import ScenarioLike
 
 if TYPE_CHECKING:
+    from d4orm_env.engine import cpu, episodes
     from d4orm_env.engine.episodes import WorldBatch
     from d4orm_env.engine.types import WorldEngine
+else:
+    cpu = LazyModule("d4orm_env.engine.cpu")
+    episodes = LazyModule("d4orm_env.engine.episodes")
 
 __all__ = ["NavigationVectorEnv"]
 
@@ -112,15 +117,11 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._make_worlds(num_threads)
 
     def _make_worlds(self, num_threads: int | None) -> None:
-        # Here, because importing the compiler takes longer than importing all the rest of the package.
-        from d4orm_env.engine.cpu import CpuEngine
-        from d4orm_env.engine.episodes import WorldBatch
-
         problem, count = self.problem, self.num_envs
         threads = None if num_threads is None else whole_number(num_threads, "num_threads", 1)
-        self._engine: WorldEngine = CpuEngine(threads)
+        self._engine: WorldEngine = cpu.CpuEngine(threads)
         start, goal, inverse = (np.repeat(getattr(problem.arrays, name)[None], count, axis=0) for name in OWN_ARRAYS)
-        self._worlds = WorldBatch.of(start, goal, inverse, problem.control_size)
+        self._worlds = episodes.WorldBatch.of(start, goal, inverse, problem.control_size)
         self._disturbances = DisturbedBatch(self._template, self._worlds)
         self._arrays: list[ProblemArrays] = [problem.arrays_to_observe(self._template.layout.num_obstacles)] * count
         self._problems = [problem] * count
@@ -170,8 +171,6 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 empty, or an option is unknown.
             RuntimeError: If the first reset leaves worlds out.
         """
-        from d4orm_env.engine.episodes import LOOK, RESET
-
         mask = reset_mask(options, self._running)
         seeds = world_seeds(seed, self.num_envs)
         super().reset(seed=seeds[0] if isinstance(seed, (int, np.integer)) else None)
@@ -182,7 +181,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._begin(np.flatnonzero(mask))
         for term in self._terms.values():
             term[mask] = 0
-        observations = self._advance(np.where(mask, RESET, LOOK))
+        observations = self._advance(np.where(mask, episodes.RESET, episodes.LOOK))
         self._running[mask] = True
         return observations, self._infos(mask)
 
@@ -199,8 +198,6 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             RuntimeError: Before the first reset, or, without auto-reset, if an episode is over.
             ValueError: If the actions have another shape, or a value that is not finite or beyond 1e15.
         """
-        from d4orm_env.engine.episodes import RESET, SKIP, STEP
-
         self._require_episodes()
         controls = joint_controls(actions, self._action_shape, self.problem.num_robots)
         ended = self._ended
@@ -208,7 +205,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         np.copyto(worlds.control, self._disturbances.act(controls))
         if ended.any():
             self._begin(np.flatnonzero(ended))
-        observations = self._advance(np.where(ended, RESET, STEP))
+        observations = self._advance(np.where(ended, episodes.RESET, episodes.STEP))
         self._reward(before, length, ~ended)
         ended = self._ended
         rewards, terminated, truncated = worlds.reward.copy(), worlds.terminated.copy(), worlds.truncated.copy()
@@ -218,7 +215,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             if self._mode is AutoresetMode.SAME_STEP:
                 final = final_infos(observations, infos, ended)
                 self._begin(np.flatnonzero(ended))
-                self._advance(np.where(ended, RESET, SKIP), observations)
+                self._advance(np.where(ended, episodes.RESET, episodes.SKIP), observations)
                 infos = self._infos() | final
         return observations, rewards, terminated, truncated, infos
 
@@ -235,13 +232,11 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             RuntimeError: Before the first reset.
             ValueError: If a state is none that the robot may be in; the message names it.
         """
-        from d4orm_env.engine.episodes import LOOK
-
         self._require_reset()
         worlds, bounds = self._worlds, self._template.state_bounds
         docked = worlds.docked & ~self._ended[:, None]
         np.copyto(worlds.state, checked_states(self.problem, states, docked, bounds, worlds.state.shape))
-        observations = self._advance(np.full(self.num_envs, LOOK))
+        observations = self._advance(np.full(self.num_envs, episodes.LOOK))
         self._terms = no_terms(self._template.reward, worlds.docked.shape)
         return observations, self._infos()
 
@@ -288,22 +283,20 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     def _advance(self, orders: NDArray[np.uint8], observations: FloatArray | None = None) -> FloatArray:
         """Carry out ``orders`` ``(B,)``, and return what is seen ``(B, K * D)``, in ``observations`` if given."""
-        from d4orm_env.engine.episodes import SKIP, STEP, WorldBatch
-
         if observations is None:
             observations = np.empty_like(self._observations) if self._copy else self._observations
         out = observations.reshape(self._observations.shape)
         advance, layout, cycles = self._engine.advance, self.layout, self.max_cycles
         made, true = out[:0] if self._disturbances.alters_sight else out, self._disturbances.true
-        going = np.flatnonzero(orders != SKIP)
+        going = np.flatnonzero(orders != episodes.SKIP)
         if not self._apart:
             advance(true(self._arrays[0]), layout, cycles, orders, self._worlds, made)
         else:
             for world in going.tolist():
                 one = slice(world, world + 1)
-                part = WorldBatch._make(values[one] for values in self._worlds)
+                part = episodes.WorldBatch._make(values[one] for values in self._worlds)
                 advance(true(self._arrays[world]), layout, cycles, orders[one], part, made[one])
-        self._disturbances.meet(orders == STEP)
+        self._disturbances.meet(orders == episodes.STEP)
         altered = self._disturbances.alters_sight
         if self._template.along_paths or (layout.observed_path and not altered):
             self._path_direction[going], self._path_length[going] = self._ahead(going, self._worlds.state[going])

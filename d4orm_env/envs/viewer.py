@@ -8,11 +8,15 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.simulation import Simulation
 
 if TYPE_CHECKING:
+    from d4orm_env.render import frames
     from d4orm_env.render.frames import FrameRenderer, WindowRenderer
+else:
+    frames = LazyModule("d4orm_env.render.frames")
 
 Frame: TypeAlias = NDArray[np.uint8]
 """``(height, width, 3)``."""
@@ -67,6 +71,4 @@ class Viewer:
         self._renderer = self._problem = None
 
     def _open(self, problem: Problem) -> FrameRenderer | WindowRenderer:
-        from d4orm_env.render import frames
-
         return frames.FrameRenderer(problem) if self._mode == "rgb_array" else frames.WindowRenderer(problem)

@@ -6,7 +6,7 @@ E. Todorov, T. Erez and Y. Tassa, "MuJoCo: A physics engine for model-based cont
 from importlib.util import find_spec
 
 if find_spec("mujoco") is None:
-    raise ImportError('rigid bodies need MuJoCo; install it with pip install "d4orm-env[mujoco]"')
+    raise ImportError("rigid bodies need MuJoCo; install it with: pip install 'd4orm-env[mujoco]'")
 
 from d4orm_env.mujoco.environment import env, parallel_env, raw_env
 from d4orm_env.mujoco.physics import Physics

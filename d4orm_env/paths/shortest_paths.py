@@ -11,13 +11,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 
 if TYPE_CHECKING:
+    from d4orm_env.paths import wavefront
     from d4orm_env.paths.wavefront import Fields, Front, Lattice, Space
+else:
+    wavefront = LazyModule("d4orm_env.paths.wavefront")
 
 
 MAX_NODES, MAX_NODES_IN_ALL = 2**21, 2**24
@@ -107,11 +111,9 @@ class ShortestPaths:
 
 def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
     """Return next positions for robots from this number on at ``(R, Q, 3)``, the whole distances, and their anchors."""
-    from d4orm_env.paths.wavefront import look
-
     shape = places.shape[:2]
     target, length, anchor = np.empty(places.shape), np.empty(shape), np.empty(shape, np.int32)
-    look(*world, robot, places, target, length, anchor)
+    wavefront.look(*world, robot, places, target, length, anchor)
     return target, length, anchor
 
 
@@ -127,10 +129,7 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
     start = problem.start[:, : problem.dimension].astype(np.float64)
     if not problem.world.num_obstacles:
         return ShortestPaths(problem, np.linalg.norm(problem.goal - start, axis=1), None)
-    # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.paths.wavefront import gather, make_space, spread
-
-    space, starts = make_space(problem), in_space(start)[:, None]
+    space, starts = wavefront.make_space(problem), in_space(start)[:, None]
     reaches = np.asarray(problem.team.radius, np.float64) + problem.margin
     lattices: dict[tuple[float, int], Lattice] = {}
     chosen: list[tuple[float, int]] = []
@@ -142,14 +141,14 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
                     problem, space, reach, lattices.get((reach, refinement - 1))
                 )
             lattice = lattices[reach, refinement]
-            front = spread(space, lattice, reach, goal)
-            own = gather(np.array([reach]), [lattice], np.array([0]), [front])
+            front = wavefront.spread(space, lattice, reach, goal)
+            own = wavefront.gather(np.array([reach]), [lattice], np.array([0]), [front])
             if np.isfinite(_find((space, own), 0, place[None])[1]).all():
                 break
         chosen.append((reach, refinement))
         fronts.append(front)
     number = {key: n for n, key in enumerate(lattices)}
-    world = space, gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
+    world = space, wavefront.gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
     length = _find(world, 0, starts)[1][:, 0]
     length.setflags(write=False)
     return ShortestPaths(problem, length, world)
@@ -165,8 +164,6 @@ def _towards(places: Floats, targets: Floats) -> Floats:
 
 def ahead_in_each(paths: Sequence[ShortestPaths], places: FloatArray) -> tuple[Floats, Floats]:
     """:meth:`ShortestPaths.ahead` in ``B`` worlds, each with paths of its own, from places ``(B, K, d)``."""
-    from d4orm_env.paths.wavefront import look
-
     given = places.astype(np.float64)
     target, length = np.empty(given.shape), np.empty(given.shape[:-1])
     # Each robot is one row of one place.
@@ -176,7 +173,7 @@ def ahead_in_each(paths: Sequence[ShortestPaths], places: FloatArray) -> tuple[F
         if own._world is None:
             target[world], length[world] = own._look(given[world])
         else:
-            look(*own._world, 0, spatial[world], found[world], lengths[world], anchors[world])
+            wavefront.look(*own._world, 0, spatial[world], found[world], lengths[world], anchors[world])
             target[world] = found[world, :, 0, : given.shape[-1]]
     return _towards(given, target), length
 
@@ -245,15 +242,12 @@ def _extent(problem: Problem, space: Space | None, pad: float) -> tuple[Floats, 
     return np.maximum(places.min(axis=0) - pad, bounds[0]), np.minimum(places.max(axis=0) + pad, bounds[1])
 
 
-def _empty_lattice(low: Floats, high: Floats, step: float, most: int) -> Lattice:
+def _empty_lattice(low: Floats, high: Floats, step: float, most: int) -> wavefront.Lattice:
     """The points of a lattice in the middle between two corners, and room for so many nodes."""
-    # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.paths.wavefront import Lattice
-
     d = len(low)
     size, flat = np.floor((high - low) / step).astype(np.int64) + 1, [0] * (3 - d)
     count = min(int(size.prod()), most)
-    return Lattice(
+    return wavefront.Lattice(
         low=np.append((low + high - (size - 1) * step) / 2, flat).astype(np.float64),
         step=step,
         size=np.append(size, [1] * (3 - d)).astype(np.int64),
@@ -266,10 +260,8 @@ def _empty_lattice(low: Floats, high: Floats, step: float, most: int) -> Lattice
 
 def _fill(lattice: Lattice, world: World, space: Space | None, reach: float) -> int:
     """Find the nodes of a lattice, and write as many as there is room for; how many there are."""
-    from d4orm_env.paths.wavefront import settle_nodes
-
     if space is not None:
-        return settle_nodes(space, lattice, reach)
+        return wavefront.settle_nodes(space, lattice, reach)
     bounds, d = world.bounds.astype(np.float64), world.dimension
     lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * lattice.step
     free = ((lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)).all(axis=1)

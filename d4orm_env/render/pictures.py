@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +13,7 @@ from matplotlib.lines import Line2D
 
 from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
@@ -30,6 +32,8 @@ from d4orm_env.render.panels import (
     view_limits,
 )
 from d4orm_env.render.style import own_style
+
+pyplot: Any = LazyModule("matplotlib.pyplot")
 
 PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -153,8 +157,6 @@ def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | No
     if trajectory is not None:
         checked_trajectory(problem, trajectory)
     if axes is None:
-        from matplotlib import pyplot
-
         with own_style():
             figure = pyplot.figure(layout="constrained")
             axes = make_axes(figure, 111, "space" if problem.dimension == 3 else "plane")

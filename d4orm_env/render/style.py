@@ -8,6 +8,11 @@ from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any
 
+from d4orm_env.core.lazy import LazyModule
+
+mpl: Any = LazyModule("matplotlib")
+style: Any = LazyModule("matplotlib.style")
+
 _NOTHING: Mapping[Any, Any] = MappingProxyType({})
 _DRAWING = threading.RLock()
 """rcParams are the process's: of two threads that change them for a while, one would restore what the other had set."""
@@ -19,9 +24,6 @@ def own_style(changes: Mapping[Any, Any] = _NOTHING) -> Iterator[None]:
 
     What is read only when a figure is drawn or saved, such as fonts, needs the context then too.
     """
-    import matplotlib as mpl
-    from matplotlib import style
-
     with _DRAWING, mpl.rc_context():
         style.use("default")
         mpl.rcParams.update(changes)

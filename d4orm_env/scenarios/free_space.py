@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.placement import Points
+
+ndimage: Any = LazyModule("scipy.ndimage")
 
 Mask = NDArray[np.bool_]
 
@@ -91,8 +95,6 @@ def free_space(world: World, reach: float, step: float) -> FreeSpace:
     Raises:
         ValueError: If the lattice gets too large.
     """
-    from scipy.ndimage import label
-
     low, high = world.bounds.astype(np.float64)
     shape = ((high - low) / step + 1).astype(int)
     if np.prod(shape, dtype=np.float64) > MAX_POINTS:
@@ -110,5 +112,5 @@ def free_space(world: World, reach: float, step: float) -> FreeSpace:
         indices = np.moveaxis(np.indices(part.shape), 0, -1)
         indices[..., 0] += begin
         part[...] = world.is_clear(space.points(indices), needed)
-    regions, count = label(free)
+    regions, count = ndimage.label(free)
     return replace(space, inside=regions == 1 + np.argmax(np.bincount(regions.ravel())[1:])) if count else space

@@ -20,6 +20,7 @@ from d4orm_env.scenarios.free_space import FreeSpace, free_space
 from d4orm_env.scenarios.grid_map import MAX_BYTES, GridMap
 from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.movingai import parse_map, parse_scenario
+from d4orm_env.scenarios.occupancy_image import read_occupancy_image
 from d4orm_env.scenarios.placement import Points
 from d4orm_env.scenarios.settings import Settings, bounded, require_plane
 from d4orm_env.scenarios.well_formed import populate, reach_of, with_obstacles
@@ -52,8 +53,6 @@ def read_map(path: PathLike, cell: float = 0.6) -> GridMap:
     file = Path(path)
     with _named(file):
         if is_yaml_path(file):
-            from d4orm_env.scenarios.occupancy_image import read_occupancy_image
-
             return read_occupancy_image(file)
         return _parse(read_limited(file, "a map", MAX_BYTES), cell)
 

@@ -13,9 +13,12 @@ import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, shown
 from d4orm_env.core.files import read_limited
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.yaml_text import read_yaml
 from d4orm_env.scenarios.free_space import Mask
 from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, float32_resolves
+
+Image: Any = LazyModule("PIL.Image")
 
 Mode: TypeAlias = Literal["trinary", "scale", "raw"]
 
@@ -85,8 +88,6 @@ def _occupancy(content: bytes, mode: Mode, negate: bool) -> Floats:
 
 def _pixels(content: bytes) -> tuple[Floats, Floats]:
     """Brightness and opacity of each pixel, from 0 to 1, ``(rows, columns)`` each."""
-    from PIL import Image, UnidentifiedImageError
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -103,7 +104,7 @@ def _pixels(content: bytes) -> tuple[Floats, Floats]:
                 pixels = np.asarray(image.convert("RGBA"))
     except (Image.DecompressionBombWarning, Image.DecompressionBombError):
         raise ValueError(f"its image is too large; at most {MAX_CELLS} cells are read") from None
-    except UnidentifiedImageError:
+    except Image.UnidentifiedImageError:
         raise ValueError("its image is no image that can be read; save it as .png or .pgm") from None
     except (OSError, SyntaxError) as error:
         raise ValueError(f"its image is broken ({error}); save it again") from None

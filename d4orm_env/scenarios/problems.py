@@ -5,12 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import is_yaml_path
 from d4orm_env.scenarios.scenario import Scenario, complain
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
+
+if TYPE_CHECKING:
+    from d4orm_env.scenarios import problem_files
+else:
+    problem_files = LazyModule("d4orm_env.scenarios.problem_files")
 
 ScenarioLike: TypeAlias = str | os.PathLike[str] | Callable[..., Problem] | Scenario
 """A name, a YAML file, a callable, or where one is, ``"package.module:function"`` or ``"folder/file.py:function"``."""
@@ -23,9 +29,7 @@ class _File:
         self._path = path
 
     def __call__(self, seed: int = 0, num_robots: int | None = None) -> Problem:
-        from d4orm_env.scenarios.problem_files import load_problem
-
-        return load_problem(self._path)
+        return problem_files.load_problem(self._path)
 
 
 def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:

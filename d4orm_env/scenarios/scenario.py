@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import shown, whole_number
-from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.errors import UnknownKeywordError, did_you_mean
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_types import find_robot
 from d4orm_env.scenarios.settings import Settings
@@ -156,7 +155,5 @@ def complain(owner: str, known: Iterable[str], names: Iterable[str]) -> str:
     known = sorted(known)
     for name in names:
         if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
-            return f"{owner} takes no argument {name!r}; it takes {', '.join(known)}{hint}"
+            return f"{owner} takes no argument {name!r}; it takes {', '.join(known)}{did_you_mean(name, known)}"
     return ""

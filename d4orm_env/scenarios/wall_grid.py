@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.free_space import Mask
+
+sparse: Any = LazyModule("scipy.sparse")
+csgraph: Any = LazyModule("scipy.sparse.csgraph")
 
 WALL = 0.1
 """Thickness of a wall [m]."""
@@ -56,24 +60,21 @@ def _usual_longest(columns: int, rows: int, share: float) -> int:
 
 
 def _draw(random: np.random.Generator, columns: int, rows: int, share: float) -> Openings:
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import minimum_spanning_tree, shortest_path
-
     squares = np.arange(rows * columns).reshape(rows, columns)
     first = np.concatenate([squares[:, :-1].ravel(), squares[:-1].ravel()])
     second = np.concatenate([squares[:, 1:].ravel(), squares[1:].ravel()])
     # The tree takes what is smallest, and the extra openings are the smallest of what is left.
     weight = 1 + random.random(len(first))
-    graph = coo_array((weight, (first, second)), shape=(squares.size, squares.size))
-    is_open = np.isin(weight, minimum_spanning_tree(graph.tocsr()).data)
+    graph = sparse.coo_array((weight, (first, second)), shape=(squares.size, squares.size))
+    is_open = np.isin(weight, csgraph.minimum_spanning_tree(graph.tocsr()).data)
     others = np.sort(weight[~is_open])
     extra = round(share * len(others))
     if extra:
         is_open |= weight <= others[extra - 1]
-    opened = coo_array((np.ones(is_open.sum()), (first[is_open], second[is_open])), shape=graph.shape).tocsr()
+    opened = sparse.coo_array((np.ones(is_open.sum()), (first[is_open], second[is_open])), shape=graph.shape).tocsr()
     longest, begin = 0, 0
     for _ in range(2):  # from anywhere to the square furthest off, and from there to the one furthest off
-        hops = shortest_path(opened, directed=False, unweighted=True, indices=begin)
+        hops = csgraph.shortest_path(opened, directed=False, unweighted=True, indices=begin)
         longest, begin = int(hops.max()), int(np.argmax(hops))
     right, above = np.split(is_open, [rows * (columns - 1)])
     return Openings(right.reshape(rows, columns - 1), above.reshape(rows - 1, columns), longest)

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
@@ -20,6 +22,8 @@ from d4orm_env.scenarios.free_space import FreeSpace, Mask, free_space
 from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.placement import Area, Points, round_up, with_random_obstacles
 from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
+
+ndimage: Any = LazyModule("scipy.ndimage")
 
 RESERVE = 1 / 150
 """More than float32 rounds away over a map, and left free beside the margin, in radii of the largest robot."""
@@ -44,9 +48,7 @@ class _Placing:
     """
 
     def __init__(self, inside: Mask, separation: float, most: int) -> None:
-        from scipy.ndimage import binary_dilation, label
-
-        self._label, self._dilation = label, binary_dilation
+        self._label, self._dilation = ndimage.label, ndimage.binary_dilation
         self.places, self.count = np.empty((most, inside.ndim), np.int64), 0
         # Whoever goes round a place finds a path within the wide window about it, or is held to find none.
         self._narrow = 2 * int(separation) + 1

@@ -14,10 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, as_float32
+from d4orm_env.core.lazy import LazyModule
 from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
+
+tensordict: Any = LazyModule("tensordict")
+tensordict_nn: Any = LazyModule("tensordict.nn")
+torch: Any = LazyModule("torch")
 
 __all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torchrl"]
 
@@ -99,18 +104,12 @@ def _ask_sb3(model: Model, deterministic: bool, observations: FloatArray) -> Arr
 
 
 def _ask_torchrl(module: Model, observation_key: Key, action_key: Key, observations: FloatArray) -> ArrayLike:
-    import torch
-    from tensordict import TensorDict
-    from tensordict.nn import InteractionType, set_interaction_type
-
-    asked = TensorDict({observation_key: torch.as_tensor(observations)}, batch_size=[len(observations)])
-    with torch.no_grad(), set_interaction_type(InteractionType.DETERMINISTIC):
+    asked = tensordict.TensorDict({observation_key: torch.as_tensor(observations)}, batch_size=[len(observations)])
+    with torch.no_grad(), tensordict_nn.set_interaction_type(tensordict_nn.InteractionType.DETERMINISTIC):
         return module(asked)[action_key].cpu().numpy()
 
 
 def _ask_rllib(module: Model, observations: FloatArray) -> ArrayLike:
-    import torch
-
     with torch.no_grad():
         answer = module.forward_inference({"obs": torch.as_tensor(observations)})
         if "actions" in answer:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.lazy import LazyModule
+
+if TYPE_CHECKING:
+    from d4orm_planners.engine import path_index
+else:
+    path_index = LazyModule("d4orm_planners.engine.path_index")
 
 Graph: TypeAlias = tuple[frozenset[int], ...]
 """The robots that each robot is in conflict with."""
@@ -23,10 +29,7 @@ def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
         radius: ``(K,)`` [m].
         margin: [m].
     """
-    # Here, because importing numba takes long.
-    from d4orm_planners.engine.path_index import PathIndex
-
-    return graph_of(positions.shape[1], PathIndex(positions, radius, margin).pairs())
+    return graph_of(positions.shape[1], path_index.PathIndex(positions, radius, margin).pairs())
 
 
 def graph_of(num_robots: int, pairs: IntArray) -> Graph:

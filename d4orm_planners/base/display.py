@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row, joined
 from d4orm_env.core.trajectory import Trajectory
@@ -12,8 +13,13 @@ from d4orm_env.core.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from d4orm_env.render import notebook, pictures, replay
     from d4orm_env.render.denoising_frames import Denoising
     from d4orm_env.render.replay import Replay, ReplayMotion
+else:
+    notebook = LazyModule("d4orm_env.render.notebook")
+    pictures = LazyModule("d4orm_env.render.pictures")
+    replay = LazyModule("d4orm_env.render.replay")
 
 
 class _HasMotion(Protocol):
@@ -36,9 +42,7 @@ class DisplayMixin:
         return f"{type(self).__name__}: {self.title}\n  {joined(self.key_figures)}"
 
     def _repr_html_(self: _HasMotion) -> str:
-        from d4orm_env.render.notebook import motion_html
-
-        return motion_html(self.problem, self.trajectory, self.title, self.key_figures)
+        return notebook.motion_html(self.problem, self.trajectory, self.title, self.key_figures)
 
     def plot(self: _HasMotion, axes: Axes | None = None) -> Axes:
         """Draw the motion with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
@@ -52,9 +56,7 @@ class DisplayMixin:
         Raises:
             ValueError: If the axes are spatial and the problem is not.
         """
-        from d4orm_env.render.pictures import plot
-
-        return plot(self.problem, self.trajectory, axes)
+        return pictures.plot(self.problem, self.trajectory, axes)
 
     def motion(self: _HasMotion, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion:
         """Return the motion of a replay; :class:`d4orm_env.render.replay.Replay` puts several side by side.
@@ -63,19 +65,17 @@ class DisplayMixin:
             title: Its title there; by default its own.
             denoising: Denoising of the plan, shown before the motion; see :mod:`d4orm_planners.sampling.denoising`.
         """
-        from d4orm_env.render.replay import motion
-
         title = self.title if title is None else title
         goals, marks = getattr(self, "goals", None), getattr(self, "marks", None)
         bodies = None if marks is None else marks.bodies
         figures = joined(self.key_figures)
-        return motion(self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising, bodies=bodies)
+        return replay.motion(
+            self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising, bodies=bodies
+        )
 
     def animate(self: _HasMotion) -> Replay:
         """A replay that notebooks show where it is the last value of a cell."""
-        from d4orm_env.render.replay import Replay
-
-        return Replay(self.title, (self.motion(),))
+        return replay.Replay(self.title, (self.motion(),))
 
     def to_html(self: _HasMotion, path: str | Path) -> Path:
         """Write a replay to play, pause and scrub in any browser: one file that loads nothing from a network.

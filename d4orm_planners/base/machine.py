@@ -8,6 +8,13 @@ import platform
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+from d4orm_env.core.lazy import LazyModule
+from d4orm_env.engine.threads import available_cores
+
+llvm: Any = LazyModule("llvmlite.binding")
+numba_config: Any = LazyModule("numba.core")
 
 
 def describe_machine() -> dict[str, object]:
@@ -15,12 +22,7 @@ def describe_machine() -> dict[str, object]:
 
     A virtual processor may hide its model, so LLVM's name of what kernels are compiled for stands behind it.
     """
-    from llvmlite.binding import get_host_cpu_name
-    from numba.core import config
-
-    from d4orm_env.engine.threads import available_cores
-
-    target = getattr(config, "CPU_NAME", None) or get_host_cpu_name()
+    target = getattr(numba_config.config, "CPU_NAME", None) or llvm.get_host_cpu_name()
     return {
         "processor": f"{_processor()} ({target})",
         "cores": os.cpu_count(),

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.infeasibility import prove_infeasible
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.metrics import mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import Row, count, outcome_rows
@@ -23,9 +24,17 @@ from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.provenance import Provenance
 
 if TYPE_CHECKING:
+    from d4orm_planners.base import plan_file
+    from d4orm_planners.setpoints import export as exports
+    from d4orm_planners.setpoints import setpoints, smoothing
     from d4orm_planners.setpoints.export import ExportReport
     from d4orm_planners.setpoints.setpoints import Setpoints
     from d4orm_planners.setpoints.smoothing import SmoothMotion
+else:
+    plan_file = LazyModule("d4orm_planners.base.plan_file")
+    exports = LazyModule("d4orm_planners.setpoints.export")
+    setpoints = LazyModule("d4orm_planners.setpoints.setpoints")
+    smoothing = LazyModule("d4orm_planners.setpoints.smoothing")
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
 """End of a search; see :class:`Plan`."""
@@ -197,9 +206,7 @@ class Plan(DisplayMixin):
             ValueError: If the plan is not solved, or the smoothed motion touches something or takes more than four
                 times as long; the message has the number that fails.
         """
-        from d4orm_planners.setpoints.setpoints import sample_motion
-
-        return sample_motion(self._smooth(max_acceleration, max_jerk), rate)
+        return setpoints.sample_motion(self._smooth(max_acceleration, max_jerk), rate)
 
     def export(
         self,
@@ -227,18 +234,14 @@ class Plan(DisplayMixin):
             ModuleNotFoundError: If the format needs a library that is missing.
             OSError: If the files cannot be written.
         """
-        from d4orm_planners.setpoints.export import export_motion
-
-        return export_motion(self._smooth(max_acceleration, max_jerk), format, Path(path), rate, height)
+        return exports.export_motion(self._smooth(max_acceleration, max_jerk), format, Path(path), rate, height)
 
     def _smooth(self, max_acceleration: ArrayLike | None, max_jerk: ArrayLike | None) -> SmoothMotion:
-        from d4orm_planners.setpoints.smoothing import MotionLimits, smooth_motion
-
-        limits = MotionLimits.of(self.problem, max_acceleration, max_jerk)
+        limits = smoothing.MotionLimits.of(self.problem, max_acceleration, max_jerk)
         if not self.solved:
             reasons = "; ".join(f"{robot} {reason}" for robot, reason in self.failures.items())
             raise ValueError(f"the plan is not solved, and robots do not execute it: {reasons}")
-        return smooth_motion(self.problem, self.trajectory, limits)
+        return smoothing.smooth_motion(self.problem, self.trajectory, limits)
 
     @property
     def title(self) -> str:
@@ -259,9 +262,7 @@ class Plan(DisplayMixin):
             ValueError: If the path does not end in ``.npz``.
             OSError: If it cannot be written; nothing is left behind then.
         """
-        from d4orm_planners.base.plan_file import save_plan
-
-        save_plan(self, path)
+        plan_file.save_plan(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:
@@ -274,9 +275,7 @@ class Plan(DisplayMixin):
             FileNotFoundError: If there is no such file.
             ValueError: If the file is damaged or is not a plan.
         """
-        from d4orm_planners.base.plan_file import read_plan
-
-        return read_plan(path)
+        return plan_file.read_plan(path)
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:

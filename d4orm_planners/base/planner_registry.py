@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias, TypeGuard, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, shown
-from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, unknown
 from d4orm_env.core.registry import load_reference
 from d4orm_planners.base.import_paths import source_digest, written
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
-from d4orm_planners.base.policy import OpenLoop, Policy, RobotFunction, TeamFunction, plain_attributes
+from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy, plain_attributes
 from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
 RECOMMENDED = "hybrid"
@@ -90,11 +90,11 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
         return OpenLoop(make_planner(name if isinstance(name, str) else kind, **config), time_limit=time_limit)
     if not makes_policy(kind):
         _refuse_settings(config, owner)
-        return _as_policy(kind, owner)
+        return as_policy(kind, owner)
     if (config_class := getattr(kind, "config_class", None)) is not None:
-        return _as_policy(kind(_policy_config(kind, config_class, config, owner)), owner)
+        return as_policy(kind(_policy_config(kind, config_class, config, owner)), owner)
     _check_keywords(kind, config, owner)
-    return _as_policy(kind(**config), owner)
+    return as_policy(kind(**config), owner)
 
 
 def find_policy(policy: object) -> object:
@@ -113,15 +113,12 @@ def find_policy(policy: object) -> object:
                 return table[policy]
         if ":" in policy:
             return load_reference(policy)
-    raise ValueError(
-        f"policy {shown(policy)} is unknown; choose one of {', '.join(list_policies())}, or give a Policy, a function, "
-        "or package.module:Name of one"
-    )
+    raise unknown("policy", policy, list_policies(), "give a Policy, a function, or package.module:Name of one")
 
 
 def is_brought(policy: object) -> bool:
     """Check whether a policy is given itself, rather than by name or import path."""
-    return callable(policy) or isinstance(policy, Planner) or _acts(policy)
+    return callable(policy) or isinstance(policy, Planner) or acts(policy)
 
 
 def origin(policy: object) -> object:
@@ -136,11 +133,6 @@ def is_planned(policy: object) -> bool:
     """Check whether a policy is a planner, whose plan is executed open loop."""
     kind = find_policy(policy)
     return is_planner_class(kind) or isinstance(kind, Planner)
-
-
-def makes_policy(kind: object) -> TypeGuard[Callable[..., object]]:
-    """Check whether something from :func:`find_policy` takes settings and makes a policy, rather than acts itself."""
-    return isinstance(kind, type) or (not _acts(kind) and callable(kind) and _required(kind) == 0)
 
 
 def setting_names(policy: object, given: Mapping[str, object] = NOTHING) -> tuple[str, ...]:
@@ -185,7 +177,7 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
         settings = {**planner.config.keywords(), "time_limit": time_limit}
     elif not makes_policy(kind):
         _refuse_settings(config, owner)
-        policy = _as_policy(kind, owner)
+        policy = as_policy(kind, owner)
         settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
     elif (config_class := getattr(kind, "config_class", None)) is not None:
         checked = _policy_config(kind, config_class, config, owner)
@@ -225,7 +217,7 @@ def _configured(
     """
     if preset is not None and not (isinstance(preset, str) and preset in presets):
         remedy = f"choose one of {', '.join(presets)}" if presets else "it has none, so leave it out"
-        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; {remedy}")
+        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; {remedy}{did_you_mean(preset, presets)}")
     settings = NOTHING if preset is None else presets[preset]
     known = config_class.setting_names({**settings, **config})
     applying = {name: value for name, value in settings.items() if name in known}
@@ -233,58 +225,15 @@ def _configured(
 
 
 def _planner_class(name: object) -> type[Planner]:
-    kind = name
-    if isinstance(name, str) and (name in PLANNERS or ":" in name):
-        kind = PLANNERS[name] if name in PLANNERS else load_reference(name)
-    if not is_planner_class(kind):
-        if kind is not name:
-            raise ValueError(f"planner {name!r} is {shown(kind)}; it must be a subclass of d4orm_planners.Planner")
-        if isinstance(name, str) and name in POLICIES:
-            raise ValueError(
-                f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r}), or "
-                f"d4orm run --policy {name}"
-            )
-        raise ValueError(f"planner {shown(name)} is unknown; choose one of {', '.join(PLANNERS)}")
+    if isinstance(name, str) and name in POLICIES and name not in PLANNERS:
+        raise ValueError(
+            f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r}), or "
+            f"d4orm run --policy {name}"
+        )
+    kind = name if is_planner_class(name) else PLANNERS.find(name)
     if inspect.isabstract(kind):
         raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")
     return kind
-
-
-def _acts(thing: object) -> TypeGuard[Policy]:
-    return callable(getattr(thing, "reset", None)) and callable(getattr(thing, "act", None))
-
-
-def _as_policy(thing: Any, owner: str) -> Policy:
-    """Wrap what acts itself as a policy.
-
-    Raises:
-        ValueError: If it does not.
-    """
-    if isinstance(thing, Planner):
-        return OpenLoop(thing)
-    if _acts(thing) and not isinstance(thing, type):
-        return thing
-    count = _required(thing) if callable(thing) and not isinstance(thing, type) else 0
-    if count not in (1, 2):
-        raise ValueError(
-            f"{owner} is {shown(thing)}, which does not act; it must have reset and act, or be a function of "
-            "(observations, state) or of one robot's observation, distinguished by their required positional parameters"
-        )
-    return TeamFunction(thing) if count == 2 else RobotFunction(thing)
-
-
-def _required(function: Callable[..., object]) -> int | None:
-    """Return the number of positional parameters that a function requires; ``None`` if that says nothing about it."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return None
-    count = sum(
-        parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-        and parameter.default is parameter.empty
-        for parameter in parameters
-    )
-    return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
 
 
 def _check_keywords(kind: Callable[..., object], config: Mapping[str, object], owner: str) -> None:

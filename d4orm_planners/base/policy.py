@@ -7,11 +7,11 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, as_float32
+from d4orm_env.core.arrays import FloatArray, as_float32, shown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.inputs import usable
@@ -241,3 +241,46 @@ class RandomControls(StatePolicy):
     def _controls(self, joint: JointState) -> FloatArray:
         limit = self.problem.team.control_limits
         return self._generator.uniform(-limit, limit).astype(np.float32)
+
+
+def makes_policy(kind: object) -> TypeGuard[Callable[..., object]]:
+    """Check whether something takes settings and makes a policy, rather than acts itself."""
+    return isinstance(kind, type) or (not acts(kind) and callable(kind) and required_parameters(kind) == 0)
+
+
+def acts(thing: object) -> TypeGuard[Policy]:
+    """Check whether a thing has what a policy must have."""
+    return callable(getattr(thing, "reset", None)) and callable(getattr(thing, "act", None))
+
+
+def as_policy(thing: Any, owner: str) -> Policy:
+    """Wrap what acts itself as a policy.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    if isinstance(thing, Planner):
+        return OpenLoop(thing)
+    if acts(thing) and not isinstance(thing, type):
+        return thing
+    count = required_parameters(thing) if callable(thing) and not isinstance(thing, type) else 0
+    if count not in (1, 2):
+        raise ValueError(
+            f"{owner} is {shown(thing)}, which does not act; it must have reset and act, or be a function of "
+            "(observations, state) or of one robot's observation, distinguished by their required positional parameters"
+        )
+    return TeamFunction(thing) if count == 2 else RobotFunction(thing)
+
+
+def required_parameters(function: Callable[..., object]) -> int | None:
+    """Return the number of positional parameters that a function requires; ``None`` if that says nothing about it."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    count = sum(
+        parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        and parameter.default is parameter.empty
+        for parameter in parameters
+    )
+    return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
 from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, shown
-from d4orm_env.core.errors import UnknownKeywordError
+from d4orm_env.core.errors import UnknownKeywordError, unknown
 from d4orm_env.engine.choice import ENGINES
 
 
@@ -63,7 +63,7 @@ def one_of(choices: Iterable[str]) -> AfterValidator:
 
     def check(value: str) -> str:
         if value not in known:
-            raise ValueError(f"{value!r} is unknown; choose one of {', '.join(known)}")
+            raise unknown("", value, known)
         return value
 
     return AfterValidator(check)

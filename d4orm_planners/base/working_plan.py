@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.conflict_groups import Graph, graph_of
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.tracking.steering import Rollouts
+
+if TYPE_CHECKING:
+    from d4orm_planners.engine import path_index
+else:
+    path_index = LazyModule("d4orm_planners.engine.path_index")
 
 MISSING = 5
 """Robots that a robot may meet rather than never arrive, or touch an obstacle."""
@@ -36,9 +44,6 @@ class WorkingPlan:
     """
 
     def __init__(self, search: SolveRun, trajectory: Trajectory, report: VerificationReport | None = None) -> None:
-        # Here, because importing numba takes long.
-        from d4orm_planners.engine.path_index import PathIndex
-
         self.search, self.problem = search, search.problem
         self.controls, self.states = trajectory.controls.copy(), trajectory.states.copy()
         self.arrived: BoolArray = trajectory.arrived[-1].copy()
@@ -51,12 +56,14 @@ class WorkingPlan:
             self.refused[robots] = np.minimum(self.refused[robots], step)
         # The engine, in float32, must not find near what this has found clear.
         margin = self.problem.margin + self.problem.rounding
-        self.index = PathIndex(trajectory.positions, self.problem.team.radius, margin)
+        self.index = path_index.PathIndex(trajectory.positions, self.problem.team.radius, margin)
         self._interval = search.check_interval
         # Who fails is looked for at some steps only, paths around others are at all of them.
         self._checked = self.index
         if self._interval > 1:
-            self._checked = PathIndex(trajectory.positions[:: self._interval], self.problem.team.radius, margin)
+            self._checked = path_index.PathIndex(
+                trajectory.positions[:: self._interval], self.problem.team.radius, margin
+            )
 
     @property
     def positions(self) -> FloatArray:
@@ -117,14 +124,12 @@ class WorkingPlan:
         """``(R, V)`` faults of paths, plus the share of the horizon that they take, less than one; and the step of the
         first fault.
         """
-        from d4orm_planners.engine.path_index import check_alone
-
         paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
         checked = paths[:, :, :: self._interval]
         met, meeting = self._checked.count_meetings(robots, checked)
-        touching, moves, unsure = check_alone(self.problem.arrays, robots, paths)
+        touching, moves, unsure = path_index.check_alone(self.problem.arrays, robots, paths)
         if self._interval > 1:
-            touching = check_alone(self.problem.arrays, robots, checked)[0] * self._interval
+            touching = path_index.check_alone(self.problem.arrays, robots, checked)[0] * self._interval
             # What there is none of comes after the last step.
             meeting = np.minimum(meeting * self._interval, horizon + 1)
         faults = met + (unsure <= horizon) + MISSING * (~arrived | (touching <= horizon))

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
-from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import Floats, IntArray
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.team import DEFAULT_RADIUS
@@ -23,6 +23,8 @@ from d4orm_env.dynamics.collision import axis_gap
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, Ops
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_planners.baselines.abandoning import run_or_abandon
+
+casadi: Any = LazyModule("casadi", "planner 'ipopt'", "ipopt")
 
 OBJECTIVE_SCALE = 10.0
 """Scale of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
@@ -80,7 +82,7 @@ class TeamProgram:
     """
 
     def __init__(self, problem: Problem, clearance: float) -> None:
-        self.casadi = ca = load_casadi()
+        self.casadi = ca = load(casadi)
         self.problem, self.clearance = problem, clearance
         self.ops = Ops(ca.cos, ca.sin, ca.sqrt, ca.fmin, ca.fmax, ca.atan2, ca.if_else)
         self.models = problem.team.robot_models
@@ -371,12 +373,3 @@ def _stopper(
             return [int(ends())]
 
     return Stopper()
-
-
-def load_casadi() -> ModuleType:
-    """The library, or an ``ImportError`` that says how to install it."""
-    try:
-        import casadi
-    except ImportError as error:
-        raise ImportError("planner 'ipopt' needs casadi; install it with pip install \"d4orm-env[ipopt]\"") from error
-    return casadi

@@ -8,12 +8,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
+from d4orm_env.core.lazy import load
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Positive
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, TeamProgram, load_casadi
+from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, TeamProgram, casadi
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -92,7 +93,7 @@ class Ipopt(Planner):
 
     def __init__(self, config: IpoptConfig) -> None:
         super().__init__(config)
-        load_casadi()
+        load(casadi)
 
     def init(self, search: SolveRun) -> WarmStart:
         """See :meth:`Planner.init`."""

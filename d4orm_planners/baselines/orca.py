@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.core.team import DEFAULT_RADIUS
@@ -29,6 +29,8 @@ from d4orm_planners.tracking.steering import (
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
+
+pyrvo: Any = LazyModule("pyrvo", "policy 'orca'", "orca")
 
 CORNERS = 16
 """Corners of the polygons that stand for round obstacles and docked robots."""
@@ -78,7 +80,7 @@ class Orca(StatePolicy):
 
     def __init__(self, config: OrcaConfig | None = None) -> None:
         self.config = config or OrcaConfig()
-        self._rvo = _load_pyrvo()
+        self._rvo = load(pyrvo)
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         problem = self.problem
@@ -135,14 +137,6 @@ class Orca(StatePolicy):
         for agent, robot in enumerate(moving):
             avoiding[robot] = simulator.get_agent_velocity(agent).to_tuple()
         return avoiding * unit
-
-
-def _load_pyrvo() -> ModuleType:
-    try:
-        import pyrvo
-    except ImportError as error:
-        raise ImportError("policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"") from error
-    return pyrvo
 
 
 def _walls(problem: Problem) -> Iterator[FloatArray]:

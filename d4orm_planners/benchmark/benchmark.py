@@ -14,6 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.scenarios import make_problem
+from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.benchmark.env_steps import (
@@ -169,8 +170,6 @@ def _engine_run(
 
 
 def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Run:
-    from d4orm_planners import reference as plain
-
     planner = _d4orm(preset="paper")
     temperature = float(planner.config.temperature)
     return lambda noise_scale, collisions: plain.denoise_around_rest(

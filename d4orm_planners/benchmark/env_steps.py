@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 
+from d4orm_env import navigation_v0
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.disturbances import Delay, Dropout, StateNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.scenarios import make_problem
@@ -18,6 +21,13 @@ from d4orm_planners.benchmark.walls import boxed_problem
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
+    from d4orm_env.jax import functional_env
+else:
+    functional_env = LazyModule("d4orm_env.jax.functional_env")
+
+jax: Any = LazyModule("jax")
+jnp: Any = LazyModule("jax.numpy")
+
 DISTURBANCES: tuple[AnyDisturbance, ...] = (Delay(2), Dropout(0.3), StateNoise(0.02, 0.05))
 """Disturbances of environments that are stepped beside those that nothing disturbs."""
 
@@ -27,8 +37,6 @@ RIGID = ("holonomic2d", "differential_drive")
 
 def measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
-    from d4orm_env import navigation_v0
-
     env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"), disturbances=disturbances)
     return _rate("parallel_env", 1, num_boxes, disturbances, _measure_steps(settings, env, settings.env_steps))
 
@@ -79,8 +87,6 @@ def measure_rooms(settings: BenchmarkSettings) -> Row:
 
 def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Spread:
     """Seconds per step of a world of the batched environment, of ``size`` worlds."""
-    import gymnasium
-
     env = gymnasium.make_vec("d4orm/Navigation-v0", num_envs=size, vectorization_mode="vector_entry_point", **options)
     env.reset(seed=0)
     space = env.single_action_space
@@ -101,16 +107,13 @@ def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Sp
 
 def measure_functional(settings: BenchmarkSettings) -> Row:
     """Worlds of 8 robots as pure functions of JAX, all in one program: random controls, observations, auto-reset."""
-    import jax
-    import jax.numpy as jnp
-
-    from d4orm_env.jax.functional_env import EnvState, FunctionalEnv
-
     size, calls = settings.num_worlds, max(1, settings.env_steps // 10)
-    env = FunctionalEnv(problem=boxed_problem(0, "near"))
+    env = functional_env.FunctionalEnv(problem=boxed_problem(0, "near"))
     limits, begin = env.action_limits, jax.jit(jax.vmap(env.reset))
 
-    def move(carry: tuple[EnvState, Any], key: jax.Array) -> tuple[tuple[EnvState, Any], None]:
+    def move(
+        carry: tuple[functional_env.EnvState, Any], key: jax.Array
+    ) -> tuple[tuple[functional_env.EnvState, Any], None]:
         (state, total), keys = carry, jax.random.split(key, 1 + size)
         controls = jax.random.uniform(keys[0], (size, *limits.shape), jnp.float32, minval=-limits, maxval=limits)
         state, transition = jax.vmap(env.step)(keys[1:], state, controls)
@@ -118,7 +121,7 @@ def measure_functional(settings: BenchmarkSettings) -> Row:
         return (state, total + transition.rewards.sum() + transition.observations.sum()), None
 
     @jax.jit
-    def steps(state: EnvState, key: jax.Array) -> tuple[EnvState, jax.Array]:
+    def steps(state: functional_env.EnvState, key: jax.Array) -> tuple[functional_env.EnvState, jax.Array]:
         return jax.lax.scan(move, (state, jnp.float32(0)), jax.random.split(key, calls))[0]
 
     state, _ = begin(jax.random.split(jax.random.key(0), size))

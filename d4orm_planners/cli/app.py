@@ -1,7 +1,7 @@
 """The command ``d4orm``.
 
 Exit status 0: done; 1: no solution found in the budget; 2: bad input, with one line on stderr that says what to change.
-Heavy imports happen inside the commands, so that ``--help`` is quick.
+A command's module is imported when it is run, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -12,29 +12,15 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from d4orm_planners.base.escaping import one_line
-from d4orm_planners.cli.bench import bench
-from d4orm_planners.cli.common_options import Quiet
-from d4orm_planners.cli.dataset_command import dataset
-from d4orm_planners.cli.demo import demo
-from d4orm_planners.cli.evaluate_command import evaluate
-from d4orm_planners.cli.export_command import export
-from d4orm_planners.cli.leaderboard_command import leaderboard
-from d4orm_planners.cli.node_command import node
-from d4orm_planners.cli.outputs import print_table
-from d4orm_planners.cli.plan_command import plan
-from d4orm_planners.cli.play import play
-from d4orm_planners.cli.reproduce import reproduce
-from d4orm_planners.cli.robustness_command import robustness
-from d4orm_planners.cli.run import run
-from d4orm_planners.cli.train import train
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -46,8 +32,55 @@ LONGEST = 2000
 """Characters of a complaint at most: a name that was given may have any number."""
 
 
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "demo": ("demo:demo", "Plan, execute, verify and draw a team in a warehouse."),
+    "plan": ("plan_command:plan", "Plan for a team; write plan, picture or animation."),
+    "run": ("run:run", "Run a plan or a policy in the environment."),
+    "export": ("export_command:export", "Write a plan as setpoints for robots to execute."),
+    "play": ("play:play", "Look at a team live in a browser, and meddle with it."),
+    "evaluate": ("evaluate_command:evaluate", "Compare policies on scenarios, seeds and disturbances."),
+    "robustness": ("robustness_command:robustness", "Measure success when something goes wrong."),
+    "leaderboard": ("leaderboard_command:leaderboard", "Write a page with the results of stored trials."),
+    "dataset": ("dataset_command:dataset", "Record demonstrations as a Minari dataset."),
+    "train": ("train:train", "Train a policy by reinforcement or imitation."),
+    "bench": ("bench:bench", "Measure the speed of this machine."),
+    "node": ("node_command:node", "Plan as one node of several on a network."),
+    "warmup": ("warmup_command:warmup", "Compile ahead, so that the next start is quick."),
+    "scenarios": ("listings:scenarios", "List the scenarios."),
+    "planners": ("listings:planners", "List planners and policies, or the settings of one."),
+}
+"""Module and function of each command, and its line in the help."""
+
+
+class LazyCommands(Mapping[str, Any]):
+    """The commands by name, each imported when it is looked up: help needs none of them."""
+
+    def __getitem__(self, name: str) -> Any:
+        module, _, function = COMMANDS[name][0].partition(":")
+        alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+        alone.command(name)(getattr(import_module(f"d4orm_planners.cli.{module}"), function))
+        return typer.main.get_command(alone)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+
 class Commands(TyperGroup):
     """The commands. A file that ends too early is not taken for the end of what somebody types, which Typer does."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = LazyCommands()
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(COMMANDS)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, help_) for name, (_, help_) in COMMANDS.items()])
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was chosen."""
@@ -64,10 +97,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-
-COMMANDS = (demo, plan, run, export, play, evaluate, robustness, reproduce, leaderboard, dataset, train, bench, node)
-for command in COMMANDS:
-    app.command()(command)
 
 
 def _tell_version(wanted: bool) -> None:
@@ -86,62 +115,6 @@ def options(
     """Plan and run teams of robots that cross each other's way without touching."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
-
-
-@app.command()
-def warmup(quiet: Quiet = False) -> None:
-    """Compile ahead what planning and the environments need, so that the next start is quick."""
-    from d4orm_env.engine.caching import check_can_be_kept
-    from d4orm_planners.cli.warmup import warm_up
-
-    check_can_be_kept()
-    report = warm_up()
-    if not quiet:
-        typer.echo(
-            f"{len(report.compiled)} kernels compiled, {len(report.loaded)} found in the cache, {report.seconds:.1f} s"
-        )
-        for folder in report.folders:
-            typer.echo(f"cache {folder}")
-    if report.lost:
-        raise OSError(f"{len(report.lost)} kernels could not be kept; free some space, or set NUMBA_CACHE_DIR")
-
-
-@app.command()
-def scenarios() -> None:
-    """List the scenarios."""
-    from d4orm_env.scenarios import describe_scenario, list_scenarios
-
-    def described(name: str) -> str:
-        try:
-            return describe_scenario(name)
-        except ValueError as error:  # an installed package offers it and cannot be imported
-            return str(error)
-
-    print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
-
-
-@app.command()
-def planners(
-    name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
-) -> None:
-    """List the planners and policies, or what --set can set of one."""
-    from d4orm_planners.base.names import PLANNERS, POLICIES
-    from d4orm_planners.base.planner_registry import default_settings, describe_planner, describe_policy
-
-    if name is not None:
-        settings = default_settings(name).items()
-        print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
-        return
-    for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
-        print_table(title, [(name, _or_error(describe, name)) for name in table])
-
-
-def _or_error(describe: Callable[[str], str], name: str) -> str:
-    """A description, or why there is none: what another package brings may be broken."""
-    try:
-        return describe(name)
-    except ValueError as error:
-        return f"unusable: {error}"
 
 
 class _Pipe(io.FileIO):

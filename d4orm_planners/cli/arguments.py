@@ -11,6 +11,9 @@ from typing import Any, TypeVar
 
 import typer
 
+from d4orm_env.core.files import target_of
+from d4orm_env.core.yaml_text import parse_yaml
+
 N = TypeVar("N", int, float)
 
 MOST_SEEDS = 1_000_000
@@ -71,8 +74,6 @@ def single_levels(texts: list[str] | None) -> dict[str, object]:
 
 def _add(values: dict[str, object], name: str, text: str, option: str, what: str) -> None:
     """Add a value read as YAML under a new name."""
-    from d4orm_env.core.yaml_text import parse_yaml
-
     if name in values:
         raise ValueError(f"{option} gives {name!r} twice; give it once")
     try:
@@ -191,8 +192,6 @@ def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
     """
     if path is None:
         return
-    from d4orm_env.core.files import target_of
-
     if path.suffix not in suffixes:
         raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
     check_writable(target_of(path).parent)

@@ -8,8 +8,12 @@ from typing import Annotated
 
 import typer
 
+from d4orm_planners.benchmark.bench_report import circumstances, write_report
+from d4orm_planners.benchmark.benchmark import parts, run_parts
+from d4orm_planners.benchmark.settings import QUICK, BenchmarkSettings
 from d4orm_planners.cli.arguments import MOST_SEEDS, names, numbers, output_folder
 from d4orm_planners.cli.common_options import Quiet
+from d4orm_planners.cli.progress import parts_progress
 
 
 def bench(
@@ -28,11 +32,6 @@ def bench(
     quiet: Quiet = False,
 ) -> None:
     """Measure the engines, the environments and the planner on this machine."""
-    from d4orm_planners.benchmark.bench_report import circumstances, write_report
-    from d4orm_planners.benchmark.benchmark import parts, run_parts
-    from d4orm_planners.benchmark.settings import QUICK, BenchmarkSettings
-    from d4orm_planners.cli.progress import parts_progress
-
     given = {
         "num_robots": numbers("--num-robots", num_robots),
         "models": names(models),

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_env.render import save_animation, save_picture
+from d4orm_env.scenarios import load_problem, make_problem
+from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
 
 if TYPE_CHECKING:
@@ -58,9 +61,6 @@ class ProblemOptions:
         Raises:
             ValueError: For an option that makes no sense, or does not go with a scenario file.
         """
-        from d4orm_env.scenarios import load_problem, make_problem
-        from d4orm_env.scenarios.problems import is_scenario_file
-
         common = ("num_robots", "model", "num_obstacles")
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"
@@ -92,8 +92,6 @@ class PictureOptions:
 
     def draw(self, problem: Problem, trajectory: Trajectory, marks: DisturbanceEvents | None = None) -> None:
         """Write the pictures that were asked for."""
-        from d4orm_env.render import save_animation, save_picture
-
         if self.picture is not None:
             save_picture(problem, trajectory, self.picture, marks=marks)
         if self.animation is not None:

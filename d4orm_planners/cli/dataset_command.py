@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from d4orm_env.disturbances.disturbance_registry import disturbances_at
+from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.cli.arguments import output_folder, parse_settings, refuse_options, seed_list, single_levels
 from d4orm_planners.cli.common_options import Model, Quiet, ScenarioSettings
 from d4orm_planners.cli.dataclass_options import takes
-
-if TYPE_CHECKING:
-    from d4orm_planners.rl.dataset import Demonstrations
+from d4orm_planners.cli.progress import resumable
+from d4orm_planners.rl.dataset import Demonstrations
+from d4orm_planners.rl.dataset.write import checked_id, dataset_folder, write_dataset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +69,6 @@ class DatasetOptions:
         Raises:
             ValueError: For an option that makes no sense, or does not go with a scenario file.
         """
-        from d4orm_env.disturbances.disturbance_registry import disturbances_at
-        from d4orm_env.scenarios.problems import is_scenario_file
-        from d4orm_planners.rl.dataset import Demonstrations
-
         own = parse_settings(self.scenario_settings, "--scenario-set")
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"
@@ -99,9 +97,6 @@ class DatasetOptions:
 @takes(DatasetOptions)
 def dataset(options: DatasetOptions) -> None:
     """Record demonstrations of a planner or policy as a Minari dataset; goes on where it was stopped."""
-    from d4orm_planners.cli.progress import resumable
-    from d4orm_planners.rl.dataset.write import checked_id, dataset_folder, write_dataset
-
     demonstrations = options.demonstrations()
     name = checked_id(demonstrations.dataset_id if options.dataset_id is None else options.dataset_id)
     folder = options.out or dataset_folder(name)

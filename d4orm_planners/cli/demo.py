@@ -7,10 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_env import make_problem, navigation_v0, verify
+from d4orm_env.render import save_animation, save_picture
+from d4orm_env.render.denoising_frames import save_denoising
+from d4orm_env.render.replay import Replay
+from d4orm_planners.base.episode import run_episode
+from d4orm_planners.base.planner_registry import make_planner
+from d4orm_planners.base.policy import OpenLoop
 from d4orm_planners.cli.arguments import output_folder
 from d4orm_planners.cli.common_options import Engine, Seed
 from d4orm_planners.cli.outputs import episode_rows, print_plan, print_table, require_solved
 from d4orm_planners.cli.plan_command import solving
+from d4orm_planners.sampling.denoising import DenoisingFilm
 
 if TYPE_CHECKING:
     from d4orm_planners.base.episode import Episode
@@ -33,11 +41,6 @@ def demo(
 
 def show_warehouse(out: Path, num_robots: int, seed: int, engine: str) -> None:
     """Plan for a team in a warehouse, execute the plan, verify it, and write the plan, pictures and a replay."""
-    from d4orm_env import make_problem, navigation_v0, verify
-    from d4orm_planners.base.episode import run_episode
-    from d4orm_planners.base.planner_registry import make_planner
-    from d4orm_planners.base.policy import OpenLoop
-
     problem = make_problem("warehouse", num_robots=num_robots, seed=seed)
     planner = make_planner(engine=engine)
     with solving(planner, problem) as callback:
@@ -56,8 +59,6 @@ def show_warehouse(out: Path, num_robots: int, seed: int, engine: str) -> None:
 
 def _write(plan: Plan, episode: Episode, out: Path) -> dict[str, Path]:
     """The plan, and its execution as picture, animation and replay."""
-    from d4orm_env.render import save_animation, save_picture
-
     problem, trajectory = plan.problem, episode.trajectory
     files = {
         "plan": out / "plan.npz",
@@ -75,12 +76,6 @@ def _write(plan: Plan, episode: Episode, out: Path) -> dict[str, Path]:
 
 def show_denoising(out: Path, num_robots: int, seed: int, engine: str) -> None:
     """Watch D4orm plan for a team on a circle, and write a picture and a replay of it."""
-    from d4orm_env import make_problem
-    from d4orm_env.render.denoising_frames import save_denoising
-    from d4orm_env.render.replay import Replay
-    from d4orm_planners.base.planner_registry import make_planner
-    from d4orm_planners.sampling.denoising import DenoisingFilm
-
     problem = make_problem("circle", num_robots=num_robots, seed=seed)
     planner, film = make_planner("d4orm", engine=engine), DenoisingFilm(problem)
     with solving(planner, problem) as callback:

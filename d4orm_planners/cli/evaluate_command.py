@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from d4orm_planners.base.escaping import one_line
+from d4orm_planners.base.planner_registry import list_policies, setting_names
 from d4orm_planners.cli.arguments import (
     decimals,
     names,
@@ -21,6 +22,12 @@ from d4orm_planners.cli.arguments import (
 )
 from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit
 from d4orm_planners.cli.dataclass_options import takes
+from d4orm_planners.cli.progress import resumable, tell_results
+from d4orm_planners.evaluation.evaluate import run_study
+from d4orm_planners.evaluation.robustness import write_disturbances
+from d4orm_planners.evaluation.study import Study
+from d4orm_planners.evaluation.summary import success_rates
+from d4orm_planners.evaluation.tables import PARQUET_HINT, markdown, write_results
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
@@ -90,10 +97,6 @@ class StudyOptions:
         Raises:
             ValueError: For an option that makes no sense. Nothing has run then.
         """
-        from d4orm_planners.cli.progress import resumable
-        from d4orm_planners.evaluation.evaluate import run_study
-        from d4orm_planners.evaluation.study import Study
-
         study = Study(
             policies=_with_settings(_policies(self.policies or ["d4orm,go-to-goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
@@ -118,8 +121,6 @@ class StudyOptions:
 @takes(StudyOptions)
 def evaluate(options: StudyOptions) -> None:
     """Compare policies on scenarios, team sizes, seeds, noise and disturbances; goes on where it was stopped."""
-    from d4orm_planners.evaluation.tables import PARQUET_HINT, write_results
-
     rates, written = report(options, write_results)
     if options.out / "trials.parquet" not in written:
         typer.echo(PARQUET_HINT, err=True)
@@ -130,11 +131,6 @@ def report(
     options: StudyOptions, write: Callable[[Path, list[SuccessRate]], list[Path]]
 ) -> tuple[list[SuccessRate], list[Path]]:
     """Run the trials and write what they came to; the success rates and what was written."""
-    from d4orm_planners.cli.progress import tell_results
-    from d4orm_planners.evaluation.robustness import write_disturbances
-    from d4orm_planners.evaluation.summary import success_rates
-    from d4orm_planners.evaluation.tables import markdown
-
     groups = options.run()
     rates = success_rates(groups)
     written = write(options.out, rates)
@@ -155,8 +151,6 @@ def require_trials(rates: list[SuccessRate]) -> None:
 
 def _policies(texts: list[str]) -> dict[str, dict[str, object]]:
     """Settings by label: a name stands for itself, and a configuration is called what was typed."""
-    from d4orm_planners.base.planner_registry import list_policies
-
     chosen: dict[str, dict[str, object]] = {}
     for text in texts:
         # The name ends where the first setting begins, for an import path has a colon too.
@@ -172,8 +166,6 @@ def _policies(texts: list[str]) -> dict[str, dict[str, object]]:
 
 def _with_settings(chosen: dict[str, dict[str, object]], settings: dict[str, object]) -> dict[str, dict[str, object]]:
     """Add what ``--set`` says: ``orca.time_horizon`` to one policy, ``num_samples`` to all that have it."""
-    from d4orm_planners.base.planner_registry import setting_names
-
     policies = {label: str(given.get("policy", label)) for label, given in chosen.items()}
     known = {
         label: setting_names(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from d4orm_planners.base.plan import Plan
 from d4orm_planners.cli.arguments import output_folder
 from d4orm_planners.cli.outputs import print_table
 
@@ -28,8 +29,6 @@ def export(
     ] = None,
 ) -> None:
     """Smooth a plan, verify it again, and write setpoints for robots to execute."""
-    from d4orm_planners.base.plan import Plan
-
     plan = Plan.load(plan_file)
     with output_folder(out):
         report = plan.export(

@@ -8,6 +8,9 @@ from typing import Annotated
 import typer
 
 from d4orm_planners.cli.arguments import check_target, decimals
+from d4orm_planners.evaluation.leaderboard import leaderboard as page
+from d4orm_planners.evaluation.store import TrialStore
+from d4orm_planners.evaluation.tables import read_parquet, target
 
 
 def leaderboard(
@@ -22,10 +25,6 @@ def leaderboard(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing.")] = False,
 ) -> None:
     """Write a page with the results of all trials in a store, or in several."""
-    from d4orm_planners.evaluation.leaderboard import leaderboard as page
-    from d4orm_planners.evaluation.store import TrialStore
-    from d4orm_planners.evaluation.tables import read_parquet, target
-
     check_target(out, (".md",))
     limits = () if deadlines is None else decimals("--deadlines", deadlines)
     trials = [

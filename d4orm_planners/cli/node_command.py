@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from d4orm_planners.cli.arguments import check_target
+from d4orm_planners.cli.node_file import load_node
 
 if TYPE_CHECKING:
     from d4orm_planners.base.plan import IterationRecord
@@ -22,8 +23,6 @@ def node(
     config: Annotated[Path, typer.Option("--config", "-c", help="YAML file that says what the node has to do.")],
 ) -> None:
     """Plan as one node of several on a network: exchange candidates, end with the best one known, write it."""
-    from d4orm_planners.cli.node_file import load_node
-
     task = load_node(config)
     check_target(task.out, (".npz",))
     number = task.planner.config.node

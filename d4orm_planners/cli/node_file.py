@@ -8,9 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from d4orm_env.core.arrays import duration, whole_number
+from d4orm_env.core.yaml_text import read_yaml
+from d4orm_env.scenarios import load_problem
+from d4orm_env.scenarios.schema import VERSION, parse
+from d4orm_planners.base.planner_registry import make_planner
+from d4orm_planners.d_d4orm.planner import DD4orm
+
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
-    from d4orm_planners.d_d4orm.planner import DD4orm
 
 REQUIRED = ("node", "nodes", "problem", "time_limit", "out")
 OPTIONAL = ("seed", "settings", "zenoh")
@@ -47,8 +53,6 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
         ValueError: If it cannot be read, or something in it is missing, unknown or makes no sense; one line that names
             the file and the field.
     """
-    from d4orm_env.core.yaml_text import read_yaml
-
     try:
         return _task(read_yaml(path), Path(path).parent)
     except ValueError as error:
@@ -56,10 +60,6 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
 
 
 def _task(content: object, folder: Path) -> NodeTask:
-    from d4orm_env.core.arrays import duration, whole_number
-    from d4orm_planners.base.planner_registry import make_planner
-    from d4orm_planners.d_d4orm.planner import DD4orm
-
     fields = _mapping("the file", content)
     for name in fields:
         if name not in REQUIRED + OPTIONAL:
@@ -96,9 +96,6 @@ def _task(content: object, folder: Path) -> NodeTask:
 
 
 def _problem(content: object, folder: Path) -> Problem:
-    from d4orm_env.scenarios import load_problem
-    from d4orm_env.scenarios.schema import VERSION, parse
-
     if isinstance(content, str):
         return load_problem(folder / content)
     if not isinstance(content, dict):

@@ -6,7 +6,11 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
+from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_planners.base.escaping import one_line
 
 if TYPE_CHECKING:
@@ -48,10 +52,6 @@ def print_plan(plan: Plan) -> None:
 
 def print_table(title: str, rows: list[tuple[str, str]]) -> None:
     """Rows without a header."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     table = Table(title=Text(one_line(title)), title_justify="left", show_header=False)
     for row in rows:
         table.add_row(*(Text(one_line(cell)) for cell in row))
@@ -68,8 +68,6 @@ def require_solved(plan: Plan) -> None:
 
 def require_success(episode: Episode, problem: Problem) -> None:
     """End with status 1 if an episode is none, and say so if nothing solves the problem."""
-    from d4orm_env.core.infeasibility import prove_infeasible
-
     if not episode.metrics["success"]:
         if proofs := prove_infeasible(problem):
             _tell_reasons("there is no solution", {f"robot_{robot}": proof for robot, proof in sorted(proofs.items())})

@@ -9,10 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
 from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
 from d4orm_planners.cli.common_options import Engine, PictureOptions, ProblemOptions, TimeLimit
 from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.outputs import print_plan, require_solved
+from d4orm_planners.cli.progress import solve_progress
+from d4orm_planners.cli.warmup import compile_for_planning
+from d4orm_planners.engine.select import get_sampling_engine
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -47,8 +51,6 @@ class PlanOptions(PictureOptions, ProblemOptions):
 @takes(PlanOptions)
 def plan(options: PlanOptions) -> None:
     """Plan for a team; write the plan, a picture or an animation."""
-    from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
-
     check_target(options.out, (".npz", ".html"))
     options.check_pictures()
     chosen = parse_settings(options.settings)
@@ -76,10 +78,6 @@ def solving(
     planner: Planner, problem: Problem, max_iterations: int | None = None, quiet: bool = False
 ) -> AbstractContextManager[Callback]:
     """Compile what planning needs, and show a live line meanwhile; gives the callback of the solve."""
-    from d4orm_planners.cli.progress import solve_progress
-    from d4orm_planners.cli.warmup import compile_for_planning
-    from d4orm_planners.engine.select import get_sampling_engine
-
     if get_sampling_engine(planner.config.engine).name == "cpu":
         compile_for_planning(
             problem.team.models,

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
+import rich
 import typer
 
 from d4orm_planners.cli.arguments import names
@@ -75,7 +76,7 @@ def _playground(options: PlayOptions) -> Playground:
     try:
         from d4orm_planners.play.playground import Playground
     except ImportError as error:
-        raise ImportError('d4orm play needs viser; install it with pip install "d4orm-env[viz]"') from error
+        raise ImportError("d4orm play needs viser; install it with: pip install 'd4orm-env[viz]'") from error
 
     quieten_viser()
     typer.echo("getting ready; the first time this compiles for a while ...")
@@ -85,8 +86,6 @@ def _playground(options: PlayOptions) -> Playground:
 
 def quieten_viser() -> None:
     """Keep viser from printing, by rich, a line whenever anybody knocks with another version."""
-    import rich
-
     rich.get_console().quiet = True
 
 

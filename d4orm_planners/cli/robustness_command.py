@@ -7,6 +7,7 @@ from pathlib import Path
 
 from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.evaluate_command import NoiseLevels, Out, StudyOptions, report, require_trials
+from d4orm_planners.evaluation.robustness import write_robustness
 
 STANDARD = (
     "control_noise=0,0.1,0.2,0.3",
@@ -36,8 +37,6 @@ class RobustnessOptions(StudyOptions):
 @takes(RobustnessOptions)
 def robustness(options: RobustnessOptions) -> None:
     """Measure how often policies succeed when something goes wrong: noise, delays, pushes and others."""
-    from d4orm_planners.evaluation.robustness import write_robustness
-
     if options.control_noise_std is None and options.disturb is None:
         options = replace(options, disturb=list(STANDARD))
     rates, _ = report(options, write_robustness)

@@ -9,6 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_env.core.summary_line import count
+from d4orm_env.disturbances.disturbance_registry import disturbances_at
+from d4orm_env.render.replay import Replay
+from d4orm_planners.base.episode import open_env, run_episode
+from d4orm_planners.base.plan import Plan
+from d4orm_planners.base.planner_registry import RECOMMENDED, make_policy
+from d4orm_planners.base.policy import OpenLoop
 from d4orm_planners.cli.arguments import check_target, names, refuse_options, single_levels
 from d4orm_planners.cli.common_options import Physics, PictureOptions, ProblemOptions
 from d4orm_planners.cli.dataclass_options import takes
@@ -57,14 +64,10 @@ class RunOptions(PictureOptions, ProblemOptions):
         Raises:
             ValueError: For an unknown name, or a level that makes no sense.
         """
-        from d4orm_env.disturbances.disturbance_registry import disturbances_at
-
         return disturbances_at(single_levels(self.disturb))
 
     def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[AnyDisturbance]) -> Episode:
         """An episode of a policy on a problem."""
-        from d4orm_planners.base.episode import open_env, run_episode
-
         env = open_env(problem, self.physics, control_noise_std=self.control_noise_std, disturbances=disturbances)
         episode = run_episode(env, policy, seed=self.seed)
         env.close()
@@ -76,10 +79,6 @@ class RunOptions(PictureOptions, ProblemOptions):
         Raises:
             ValueError: For an option that makes no sense, or does not go with a plan file.
         """
-        from d4orm_planners.base.plan import Plan
-        from d4orm_planners.base.planner_registry import RECOMMENDED, make_policy
-        from d4orm_planners.base.policy import OpenLoop
-
         if self.plan_file is None:
             chosen = {} if self.preset is None else {"preset": self.preset}
             return self.problem(), make_policy(RECOMMENDED if self.policy is None else self.policy, **chosen)
@@ -119,10 +118,6 @@ def compare(options: RunOptions, policies: Sequence[str]) -> None:
     Raises:
         ValueError: Without a file to write, or for an option that makes no sense or does not go with it.
     """
-    from d4orm_env.core.summary_line import count
-    from d4orm_env.render.replay import Replay
-    from d4orm_planners.base.planner_registry import make_policy
-
     if options.out is None:
         raise ValueError("--compare needs --out, the replay to write, as --out compare.html")
     alone = {"policy", "preset", "picture", "animation", "plan_file"}

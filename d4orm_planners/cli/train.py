@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_env.core.errors import unknown
 from d4orm_planners.cli.arguments import output_folder, parse_settings, refuse_options
 from d4orm_planners.cli.common_options import Model
 from d4orm_planners.cli.dataclass_options import takes
+from d4orm_planners.cli.progress import resumable, tell_results
 
 if TYPE_CHECKING:
     from d4orm_planners.rl.training import TrainingResult
@@ -109,8 +111,6 @@ def train(options: TrainOptions) -> None:
     """Train a policy that all robots share, by reinforcement or imitation; run again to go on where it stopped."""
     learn = _imitation(options) if options.algorithm == IMITATION else _reinforcement(options)
     folder = options.out or Path("runs") / options.algorithm
-    from d4orm_planners.cli.progress import resumable, tell_results
-
     kept = f"the checkpoints are kept in {folder}"
     with output_folder(folder), resumable(kept, enabled=not options.quiet) as progress:
         result = learn(folder, progress=progress, command=shlex.join(["d4orm", *sys.argv[1:]]))
@@ -129,8 +129,7 @@ def _reinforcement(options: TrainOptions) -> Callable[..., TrainingResult]:
     """The training that was asked for."""
     training = _library("training")
     if options.algorithm not in training.ALGORITHMS:
-        known = ", ".join((*training.ALGORITHMS, IMITATION))
-        raise ValueError(f"algorithm {options.algorithm!r} is unknown; choose one of {known}")
+        raise unknown("algorithm", options.algorithm, (*training.ALGORITHMS, IMITATION))
     refuse_options(options.context, _IMITATION_ONLY, f"is for imitation; use it with 'd4orm train {IMITATION}'")
     steps = options.steps
     if not (math.isfinite(steps) and steps == int(steps) >= 1):

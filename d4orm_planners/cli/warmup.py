@@ -14,25 +14,36 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from gymnasium import make_vec
+from numba.core.dispatcher import Dispatcher
 
+from d4orm_env import engine, navigation_v0, paths
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.caching import Kernel, has_to_be_compiled
+from d4orm_env.engine.threads import Threads
+from d4orm_env.engine.worlds import world_kernels
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
+from d4orm_planners import d4orm_c2f, mapf, tracking
+from d4orm_planners import engine as sampling_engine
+from d4orm_planners.base.names import PLANNERS
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.d4orm_c2f.barrier import safe_velocities
+from d4orm_planners.engine.cpu_sampling import Sampling
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.mapf.beam_search import search_kernel
+from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.weights import SoftmaxWeights
-
-if TYPE_CHECKING:
-    from numba.core.dispatcher import Dispatcher
+from d4orm_planners.tracking.straight_drives import drive_kernel
 
 
 @dataclass(frozen=True)
@@ -70,9 +81,6 @@ def compile_for_planning(
         announce: Called before it begins, if there is anything to do.
         drives: Whether straight drives are needed too.
     """
-    from d4orm_env.engine.worlds import world_kernels
-    from d4orm_planners.engine.score import score_kernel
-
     if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out):
         announce()
         # Should it fail, the kernel is compiled when it is needed, like any other.
@@ -84,7 +92,7 @@ def compile_for_planning(
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     # What ends it, as Ctrl-C, ends this process too, which says so.
     return subprocess.Popen(
-        [sys.executable, "-c", f"from {__name__} import find_ways, roll_out_once, sample_once; {call}"],
+        [sys.executable, "-c", f"from {__name__} import find_paths, roll_out_once, sample_once; {call}"],
         stderr=subprocess.DEVNULL,
     )
 
@@ -95,9 +103,6 @@ def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
     Samples are weighed and averaged here too, and first: the process that scores them, which takes longer, needs that
     last.
     """
-    from d4orm_env.engine.threads import Threads
-    from d4orm_planners.engine.cpu_sampling import Sampling
-
     problem = _smallest_problem(models)
     rewards = np.zeros((1, 2), np.float32)
     run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
@@ -133,7 +138,7 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_ways()")
+    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths()")
     sample_once((TEAMS[0], TEAMS[-1]))
     for models in TEAMS[1:]:
         roll_out_once(models)
@@ -169,9 +174,6 @@ def _no_controls(problem: Problem) -> FloatArray:
 
 
 def _plan() -> None:
-    from d4orm_planners.base.names import PLANNERS
-    from d4orm_planners.sampling.loop import SamplingPlanner
-
     problem = _smallest_problem(TEAMS[0])
     # A planner that does not sample has nothing to compile that the others have not.
     for name in (name for name in PLANNERS.own() if issubclass(PLANNERS[name], SamplingPlanner)):
@@ -180,8 +182,6 @@ def _plan() -> None:
 
 def _evade() -> None:
     """Keep two robots apart, as D4orm-C2F does in the last resort."""
-    from d4orm_planners.d4orm_c2f.barrier import safe_velocities
-
     problem = _smallest_problem(TEAMS[0])
     colliding, everybody = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
     joint = JointState(problem.start, problem.goal, _no_controls(problem)[0], ~everybody, 0)
@@ -189,9 +189,6 @@ def _evade() -> None:
 
 
 def _step_environments() -> None:
-    from d4orm_env import navigation_v0
-    from d4orm_env.disturbances import Dropout, Intruder, StateNoise
-
     disturbances = [Dropout(0.5), StateNoise(0.1), Intruder()]
     for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances}):
         env = navigation_v0.parallel_env(problem=_smallest_problem(TEAMS[0]), **arguments)
@@ -199,8 +196,6 @@ def _step_environments() -> None:
         zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)
         env.step(dict.fromkeys(env.agents, zero))
         env.close()
-
-    from gymnasium import make_vec
 
     vector_env = make_vec("d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point", num_robots=2)
     vector_env.reset(seed=0)
@@ -210,16 +205,6 @@ def _step_environments() -> None:
 
 def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     """The kernels of engines, guided plans and D4orm-C2F that are kept on disk."""
-    from numba.core.dispatcher import Dispatcher
-
-    from d4orm_env import engine, paths
-    from d4orm_env.engine.worlds import world_kernels
-    from d4orm_planners import d4orm_c2f, mapf, tracking
-    from d4orm_planners import engine as sampling_engine
-    from d4orm_planners.engine.score import score_kernel
-    from d4orm_planners.mapf.beam_search import search_kernel
-    from d4orm_planners.tracking.straight_drives import drive_kernel
-
     packages = (engine, paths, sampling_engine, tracking, mapf, d4orm_c2f)
     modules = [import_module(f"{package.__name__}.{module.name}") for package in packages
                for module in pkgutil.iter_modules(package.__path__) if "jax" not in module.name]  # fmt: skip

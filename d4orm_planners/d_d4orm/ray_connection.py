@@ -18,7 +18,7 @@ def import_ray(what: str) -> ModuleType:
     try:
         import ray
     except ImportError as error:
-        raise ImportError(f'{what} needs ray; install it with pip install "d4orm-env[distributed]"') from error
+        raise ImportError(f"{what} needs ray; install it with: pip install 'd4orm-env[distributed]'") from error
     return ray
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import IntArray
+from d4orm_env.core.errors import unknown
 
 SELECTIONS = ("top-k", "max", "k-means")
 
@@ -130,7 +131,7 @@ def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, genera
     elif selection == "k-means":
         among = diverse(rewards, points, k, generator)
     else:
-        raise ValueError(f"selection {selection!r} is unknown; choose one of {', '.join(SELECTIONS)}")
+        raise unknown("selection", selection, SELECTIONS)
     return among[int(generator.integers(len(among)))]
 
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Self, TypeAlias
 from pydantic import Field, InstanceOf, SkipValidation
 
 from d4orm_env.core.arrays import shown
+from d4orm_env.core.errors import unknown
 from d4orm_planners.base.planner import PlannerConfig
 from d4orm_planners.base.settings import NOTHING, Count, Seconds, Whole, one_of
 from d4orm_planners.d4orm_d.planner import D4ormD
@@ -148,5 +149,5 @@ def _node_planner(given: Mapping[str, object]) -> type[NodePlanner]:
     if not isinstance(name, str):
         raise ValueError(f"planner must be text, not {shown(name)}")
     if name not in NODE_PLANNERS:
-        raise ValueError(f"planner {name!r} is unknown; choose one of {', '.join(NODE_PLANNERS)}")
+        raise unknown("planner", name, NODE_PLANNERS)
     return NODE_PLANNERS[name]

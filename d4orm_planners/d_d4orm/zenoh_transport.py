@@ -13,11 +13,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from d4orm_env.core.arrays import duration
 from d4orm_env.core.files import require_file
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_planners.d_d4orm.messages import MAX_BYTES
 from d4orm_planners.d_d4orm.transport import WAITING, Mailbox
+
+_zenoh: Any = LazyModule("zenoh", "transport 'zenoh'", "zenoh")
 
 logger = logging.getLogger(__name__)
 
@@ -125,7 +129,7 @@ class ZenohTransport:
     """
 
     def __init__(self, settings: ZenohSettings) -> None:
-        zenoh = _import_zenoh()
+        zenoh = load(_zenoh)
         zenoh.try_init_log_from_env()
         config = _config(zenoh, settings)
         key = f"{settings.namespace}/candidates"
@@ -185,14 +189,6 @@ class ZenohTransport:
     def has_listeners(self) -> bool:
         """Check whether any node would receive what is published now."""
         return bool(self._publisher.matching_status.matching)
-
-
-def _import_zenoh() -> ModuleType:
-    try:
-        import zenoh
-    except ImportError as error:
-        raise ImportError("transport 'zenoh' needs zenoh; install it with pip install \"d4orm-env[zenoh]\"") from error
-    return zenoh
 
 
 def _config(zenoh: ModuleType, settings: ZenohSettings) -> object:

@@ -7,12 +7,16 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import Floats
+from d4orm_env.core.lazy import LazyModule
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import TrialGroup, wilson_interval
+
+stats: Any = LazyModule("scipy.stats")
 
 _RESAMPLES = 2000
 
@@ -57,8 +61,6 @@ def paired(
     Raises:
         ValueError: If they have none in common.
     """
-    from scipy import stats  # takes a second to import
-
     common = in_common(first, second)
     if not common:
         raise ValueError("the two policies have no problem, seed and noise in common; give trials of the same study")
@@ -93,8 +95,6 @@ def mcnemar(only_first: int, only_second: int) -> float:
         only_first: Trials in which only the first succeeded.
         only_second: Those in which only the second did.
     """
-    from scipy import stats  # takes a second to import
-
     apart = only_first + only_second
     return float(stats.binomtest(only_first, apart).pvalue) if apart else 1.0
 
@@ -195,8 +195,6 @@ def _time(trial: Trial) -> float:
 
 def _bootstrap(differences: Sequence[float] | np.ndarray) -> tuple[float, float]:
     """95% confidence interval of the mean of paired differences."""
-    from scipy import stats
-
     values = np.asarray(differences, float)
     if len(values) < 2 or not np.ptp(values):
         return float(values[0]), float(values[0])

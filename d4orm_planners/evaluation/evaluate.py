@@ -13,7 +13,9 @@ from pathlib import Path
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.import_paths import check_sendable
-from d4orm_planners.evaluation.pool import Pool, ProcessPool, RayPool, run_here, run_jobs
+from d4orm_planners.evaluation.pool import Pool, run_here, run_jobs
+from d4orm_planners.evaluation.process_pool import ProcessPool
+from d4orm_planners.evaluation.ray_pool import RayPool
 from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
 from d4orm_planners.evaluation.study import DisturbanceLevels, Policies, Scenarios, Study

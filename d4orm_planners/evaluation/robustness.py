@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.render.style import own_style
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.summary import THRESHOLD, SuccessRate, Tolerance, TrialGroup, success_rates, tolerances
@@ -20,6 +21,8 @@ from d4orm_planners.evaluation.tables import markdown, panels, table, target, wr
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+figures: Any = LazyModule("matplotlib.figure")
 
 
 def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
@@ -232,11 +235,9 @@ def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
 
 def _figure(count: int, width: float, height: float, across: int = 3) -> tuple[Figure, NDArray[np.object_]]:
     """A figure made without pyplot, which would keep state and want a display, and its axes."""
-    from matplotlib.figure import Figure
-
     columns = min(count, across)
     rows = -(-count // columns)
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    figure = figures.Figure(figsize=(width * columns, height * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax in axes[count:]:
         ax.set_visible(False)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.arrays import positive_number
+from d4orm_env.core.lazy import LazyModule
 from d4orm_planners.evaluation.store import Trial
+
+stats: Any = LazyModule("scipy.stats")
 
 THRESHOLD = 0.9
 """Success rate below which a policy is said to tolerate a disturbance no longer."""
@@ -163,8 +166,6 @@ def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, 
     mean = float(np.mean(values))
     if len(values) == 1:
         return mean, None, None
-    from scipy import stats  # takes a second to import
-
     reach = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
     return mean, mean - reach, mean + reach
 
@@ -181,8 +182,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     Raises:
         ValueError: If there are no trials, more successes than trials, or fewer than none.
     """
-    from scipy import stats
-
     interval = stats.binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 

@@ -8,11 +8,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done, require_file
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_planners.base.escaping import markdown_text, one_line, spreadsheet_cell
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, checked_trial
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
@@ -20,9 +21,12 @@ from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 if TYPE_CHECKING:
     from pyarrow.parquet import ParquetFile
 
+pyarrow: Any = LazyModule("pyarrow", "Parquet", "evaluate")
+parquet: Any = LazyModule("pyarrow.parquet", "Parquet", "evaluate")
+
 MAX_TRIALS, MAX_BYTES = 10**7, 2**32
 """Limits of a Parquet file that is read."""
-PARQUET_HINT = 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"'
+PARQUET_HINT = "trials.parquet is not written, which needs pyarrow; install it with: pip install 'd4orm-env[evaluate]'"
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
           "travel time, s", "stretch", "planning, s", "decision, ms", "training, min",
           "computing per s of motion, s")  # fmt: skip
@@ -77,8 +81,7 @@ def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
         OSError: If the file cannot be written.
     """
     try:
-        import pyarrow
-        from pyarrow import parquet
+        load(pyarrow)
     except ImportError:
         return False
     kinds = {"str": pyarrow.string(), "int": pyarrow.int64(), "float": pyarrow.float64(), "bool": pyarrow.bool_()}
@@ -102,9 +105,6 @@ def read_parquet(path: str | os.PathLike[str]) -> list[Trial]:
             another type.
         OSError: If it cannot be read.
     """
-    import pyarrow
-    from pyarrow import parquet
-
     try:
         require_file(Path(path), "one that d4orm evaluate wrote")
         with parquet.ParquetFile(path) as file:

@@ -16,7 +16,9 @@ from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.planner import D4ormD, straight_start
 from d4orm_planners.d4orm_d.repairs import Repairs
+from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.hybrid.settings import HybridConfig
+from d4orm_planners.mapf.beams import prepare_beams
 from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (
     MAPFConfig,
@@ -55,9 +57,6 @@ class Hybrid(Planner):
         """See :meth:`Planner.init`."""
         state = self.denoiser.init(search)
         if isinstance(state, Repairs) and (self.config.reroute or self.improves_by_lns):
-            # Here, because importing numba takes long.
-            from d4orm_planners.mapf.beams import prepare_beams
-
             with search.watch.paused():
                 prepare_beams(WorkingPlan(search, search.current.trajectory))
         return state
@@ -100,9 +99,6 @@ class Hybrid(Planner):
     def repair(self, team: DeformedPlan, state: Repairs) -> Repairs:
         """Search for paths around others for robots that fail, and deform those that fail nevertheless."""
         if self.config.reroute:
-            # Here, because importing numba takes long.
-            from d4orm_planners.hybrid.rerouting import reroute
-
             reroute(team)
         state = state.repair(team, self.config)
         self.improve_first(team)

@@ -8,6 +8,8 @@ from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
+from d4orm_planners.mapf.beams import prepare_beams
+from d4orm_planners.mapf.lns import improve_paths
 from d4orm_planners.mapf.roundabout import drive_roundabout
 
 ROUNDS = 96
@@ -22,10 +24,6 @@ FIRST_ROBOT_STEPS = 2**19
 
 def improve_by_lns(search: SolveRun) -> Iteration:
     """The best plan so far, or a roundabout if that is better, whose robots have looked for faster paths."""
-    # Here, because importing numba takes long.
-    from d4orm_planners.mapf.beams import prepare_beams
-    from d4orm_planners.mapf.lns import improve_paths
-
     team = WorkingPlan(search, _better_roundabout(search) or search.best.trajectory)
     with search.watch.paused():
         prepare_beams(team)
@@ -47,7 +45,5 @@ def _better_roundabout(search: SolveRun) -> Trajectory | None:
 
 def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
     """Take what faster paths there are at once for a team in which none fails, in so many rounds."""
-    from d4orm_planners.mapf.lns import improve_paths
-
     rounds = min(rounds, FIRST_ROBOT_STEPS // (team.problem.num_robots * team.problem.horizon))
     improve_paths(team, team.search.iteration_seed(Stream.NEIGHBOURHOODS), rounds, temperature=0.0)

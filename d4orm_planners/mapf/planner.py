@@ -14,10 +14,13 @@ from d4orm_env.core.world import World
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
+from d4orm_planners.mapf.pibt import fill_costs
+from d4orm_planners.mapf.roadmap import lay_roadmap
+from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves, is_compiled
 
 if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap import Roadmap
-    from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout
 
 FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
 """Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
@@ -117,9 +120,6 @@ def roadmap_iteration(search: SolveRun, guide: RoadmapSolution) -> Iteration:
 
 def going_on_from_best(search: SolveRun, guide: RoadmapSolution) -> RoadmapSolution:
     """The guide of a team that drives as in the best plan so far."""
-    # Here, because importing numba takes long.
-    from d4orm_planners.mapf.roadmap_team import TeamRollout
-
     return replace(guide, driven=TeamRollout.of(search.best.trajectory))
 
 
@@ -138,10 +138,6 @@ def improve_roadmap_solution(
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
     """Paths for the whole team, or as many robots as possible; why there are none if nothing is found in time."""
-    from d4orm_planners.mapf.lacam import find_moves
-    from d4orm_planners.mapf.roadmap import lay_roadmap
-    from d4orm_planners.mapf.roadmap_team import Replanning, drive_moves
-
     problem, best = search.problem, None
     if problem.num_robots * problem.horizon > MAX_ROBOT_STEPS:
         return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for paths")
@@ -174,8 +170,6 @@ def compile_roadmap(problem: Problem) -> None:
     """Compile what :func:`needs_detour` needs, if it is not yet."""
     if not problem.world.num_obstacles:
         return
-    from d4orm_planners.mapf.pibt import fill_costs
-
     if not fill_costs.signatures:
         needs_detour(_small_problem(problem, 0))
 
@@ -184,9 +178,6 @@ def needs_detour(problem: Problem) -> bool:
     """Check whether obstacles make some robot's shortest path a long detour, so that straight lines are no start."""
     if not problem.world.num_obstacles:
         return False
-    from d4orm_planners.mapf.lacam import TeamOnRoadmap
-    from d4orm_planners.mapf.roadmap import lay_roadmap
-
     roadmap = lay_roadmap(problem)
     straight = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
     paths = TeamOnRoadmap(problem, roadmap).bodies.costs[np.arange(problem.num_robots), roadmap.starts]
@@ -195,10 +186,6 @@ def needs_detour(problem: Problem) -> bool:
 
 def compile_path_finding(problem: Problem) -> None:
     """Compile what path finding for such a team in such a world needs, if it is not yet."""
-    from d4orm_planners.mapf.lacam import find_moves
-    from d4orm_planners.mapf.roadmap import lay_roadmap
-    from d4orm_planners.mapf.roadmap_team import Replanning, drive_moves, is_compiled
-
     if is_compiled(problem):
         return
     for robot in {model: number for number, model in enumerate(problem.team.models)}.values():

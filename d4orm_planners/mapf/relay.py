@@ -6,6 +6,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_planners.mapf.planner import compile_path_finding
 from d4orm_planners.mapf.roadmap import lay_roadmap
 from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout
 
@@ -30,8 +31,6 @@ def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: i
     Returns:
         ``(H + 1, K, d)`` future positions of all robots [m]; ``None`` if no paths were found.
     """
-    from d4orm_planners.mapf.planner import compile_path_finding
-
     compile_path_finding(problem)
     num_robots, d = problem.num_robots, problem.dimension
     dwell = int(np.ceil(DWELL / problem.dt))

@@ -6,16 +6,20 @@ import csv
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.render.style import own_style
 from d4orm_planners.base.escaping import spreadsheet_cell
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
+
+backend_agg: Any = LazyModule("matplotlib.backends.backend_agg")
+figures: Any = LazyModule("matplotlib.figure")
 
 
 class Outcome(NamedTuple):
@@ -98,11 +102,8 @@ def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
 
 @own_style()
 def _draw(path: Path, evaluations: Sequence[Evaluation]) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 3), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figures.Figure(figsize=(7, 3), layout="constrained")
+    backend_agg.FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     steps = [evaluation.steps / 1e6 for evaluation in evaluations]
     left.plot(steps, [100 * evaluation.success_rate for evaluation in evaluations])

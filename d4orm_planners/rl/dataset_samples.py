@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.errors import first_line
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.team import Team
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
@@ -18,6 +19,9 @@ from d4orm_planners.rl.samples import MAX_BYTES, Samples
 if TYPE_CHECKING:
     from minari import MinariDataset
     from pettingzoo import ParallelEnv
+
+h5py: Any = LazyModule("h5py", "a dataset", "dataset")
+minari: Any = LazyModule("minari", "a dataset", "dataset")
 
 
 def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
@@ -53,7 +57,6 @@ def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
 
 def _check_arrays(folder: Path) -> None:
     """Refuse a dataset that does not hold plain numbers of a size that makes sense, before any is read."""
-    import h5py
 
     def look(name: str, thing: object) -> None:
         if isinstance(thing, h5py.Dataset) and (thing.dtype.kind not in "biuf" or thing.nbytes > MAX_BYTES):
@@ -78,10 +81,7 @@ def _episodes(dataset: MinariDataset, team: Team, size: int, together: bool) -> 
 
 
 def _dataset(path: str) -> MinariDataset:
-    try:
-        import minari
-    except ModuleNotFoundError as error:
-        raise ImportError(f"a dataset needs {error.name}; install it with: pip install 'd4orm-env[dataset]'") from None
+    load(minari)
     folders = [folder for folder in (Path(path), Path(path) / "data") if (folder / "main_data.hdf5").is_file()]
     try:
         return minari.MinariDataset(folders[0]) if folders else minari.load_dataset(path)

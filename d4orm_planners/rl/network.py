@@ -12,6 +12,8 @@ from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
@@ -145,8 +147,6 @@ class Network:
             ValueError: If the name does not end in ``.safetensors``.
             OSError: If it cannot be written.
         """
-        from safetensors.numpy import save
-
         with replaced_when_done(Path(path), (SUFFIX,)) as temporary:
             # As bytes, because the library's own files are for the owner's eyes only.
             temporary.write_bytes(save(dict(self.arrays), metadata={"d4orm": self.header.text()}))
@@ -159,8 +159,6 @@ def load_network(path: str | Path) -> Network:
         ValueError: If it is no policy file, too large, of another version, or does not fit together.
         OSError: If it cannot be read.
     """
-    from safetensors import SafetensorError, safe_open
-
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"policy file {path} does not exist; train one with 'd4orm train'")

@@ -9,6 +9,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from d4orm_planners.engine.softmax import softmax_weights
+
 Array: TypeAlias = Any
 """An array of NumPy or JAX, whichever ``xp`` is; the two have no common type."""
 
@@ -33,9 +35,6 @@ class SoftmaxWeights:
         none.
         """
         if xp is np:
-            # Imported here: numba takes longer to import than most commands take.
-            from d4orm_planners.engine.softmax import softmax_weights
-
             return softmax_weights(rewards, self.temperature, self.cutoff, log_ratio)
         usable = rewards > -xp.inf
         count = xp.maximum(usable.sum(-1, keepdims=True), 1).astype(rewards.dtype)

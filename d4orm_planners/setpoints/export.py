@@ -13,7 +13,9 @@ from types import MappingProxyType
 import numpy as np
 
 from d4orm_env.core.arrays import Floats
+from d4orm_env.core.errors import unknown
 from d4orm_planners.setpoints.polynomials import AXES, PIECE_BYTES, fit_polynomials
+from d4orm_planners.setpoints.rosbag import write_bag
 from d4orm_planners.setpoints.setpoints import Setpoints, sample_motion
 from d4orm_planners.setpoints.smoothing import SmoothMotion
 
@@ -70,8 +72,6 @@ def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, heigh
 
 
 def _bag(storage: str, motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:
-    from d4orm_planners.setpoints.rosbag import write_bag
-
     write_bag(setpoints, folder / "motion", height, storage)
     return None
 
@@ -95,7 +95,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         OSError: If it cannot be written; nothing is left behind then.
     """
     if form not in FORMATS:
-        raise ValueError(f"format {form!r} is unknown; choose one of {', '.join(FORMATS)}")
+        raise unknown("format", form, FORMATS)
     if not np.isfinite(height):
         raise ValueError(f"height is {height!r}; it must be finite")
     setpoints = sample_motion(motion, rate)

@@ -12,7 +12,11 @@ from typing import Any, Final
 import numpy as np
 
 from d4orm_env.core.arrays import Floats
+from d4orm_env.core.lazy import LazyModule
 from d4orm_planners.setpoints.setpoints import Setpoints
+
+rosbag2: Any = LazyModule("rosbags.rosbag2", "a ROS bag", "ros")
+typesys: Any = LazyModule("rosbags.typesys", "a ROS bag", "ros")
 
 FRAME = "map"
 BAG_VERSION: Final = 9
@@ -26,9 +30,7 @@ class Messages:
     """
 
     def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        self.store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
     def _make(self, kind: str, *values: Any) -> Any:
         return self.store.types[kind](*values)
@@ -81,10 +83,8 @@ def write_bag(setpoints: Setpoints, folder: Path, height: float, storage: str) -
     Raises:
         ModuleNotFoundError: Without rosbags.
     """
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
     messages = Messages()
-    with Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin[storage]) as bag:
+    with rosbag2.Writer(folder, version=BAG_VERSION, storage_plugin=rosbag2.StoragePlugin[storage]) as bag:
         for robot in range(setpoints.heading.shape[1]):
             for topic, message in (
                 ("path", messages.path(setpoints, robot, height)),

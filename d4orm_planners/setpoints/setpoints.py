@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from d4orm_env.core.arrays import Floats, positive_number
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.setpoints.smoothing import SmoothMotion
 
 if TYPE_CHECKING:
     import pandas as pd
+else:
+    pd = LazyModule("pandas")
 
 MAX_RATE, MAX_SAMPLES = 1e5, 10**8
 
@@ -52,8 +55,6 @@ class Setpoints:
         Raises:
             ModuleNotFoundError: Without pandas.
         """
-        import pandas as pd
-
         times, robots = self.heading.shape
         index = {"time": np.repeat(self.time, robots), "robot": np.tile(np.arange(robots), times)}
         columns = {name: values.ravel() for name, values in self.columns().items()}

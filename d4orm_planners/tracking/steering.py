@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.dynamics.transition import TimeStep
+
+if TYPE_CHECKING:
+    from d4orm_env.engine import threads as thread_counts
+    from d4orm_planners.tracking import straight_drives as drive_kernels
+else:
+    thread_counts = LazyModule("d4orm_env.engine.threads")
+    drive_kernels = LazyModule("d4orm_planners.tracking.straight_drives")
 
 NEAR_VIA = 10 / 3
 """Distance to a point on its way at which a robot turns to its goal, in radii of the largest robot."""
@@ -190,10 +199,6 @@ def drives(
         switch_times: ``(R, V)`` time steps.
         vias: ``(R, V, P, d)`` the points [m]; none by default.
     """
-    # Here, because importing numba takes long.
-    from d4orm_env.engine.threads import Threads, available_cores
-    from d4orm_planners.tracking.straight_drives import DriveInputs, DriveRules, drive_kernel
-
     switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
     num_steps, dimension = problem.horizon, problem.dimension
     points = np.empty((*switch.shape, 0, dimension), np.float32) if vias is None else np.asarray(vias, np.float32)
@@ -201,23 +206,21 @@ def drives(
     x = np.zeros((*switch.shape, num_steps + 1, problem.state_size), np.float32)
     arrived = np.zeros(switch.shape, bool)
     near = NEAR_VIA * problem.team.largest_radius
-    rules = DriveRules(arrays.time_step, arrays.docks, np.float32(near * near))
+    rules = drive_kernels.DriveRules(arrays.time_step, arrays.docks, np.float32(near * near))
     given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
-    inputs = DriveInputs(
+    inputs = drive_kernels.DriveInputs(
         arrays.limits, arrays.docking, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points)
     )
-    threads = Threads(available_cores())
+    threads = thread_counts.Threads(thread_counts.available_cores())
     for model, robots in by_model(problem):
-        kernel, index = drive_kernel(model.name), np.array(robots)
+        kernel, index = drive_kernels.drive_kernel(model.name), np.array(robots)
         threads.over(len(index), lambda part: kernel(rules, inputs, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
     return Rollouts(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
 
 
 def prepare_drives(problem: Problem) -> None:
     """Compile what drives of this team need, if it is not yet."""
-    from d4orm_planners.tracking.straight_drives import drive_kernel
-
-    if not all(drive_kernel(name).signatures for name in set(problem.team.models)):
+    if not all(drive_kernels.drive_kernel(name).signatures for name in set(problem.team.models)):
         straight_drives(problem)
 
 

@@ -5,9 +5,9 @@
 Eight robots on the circle, on random places and in rooms, each measure under the disturbance that it is there for. The
 table has how many trials succeeded and in how many anybody touched anything, with all measures and without, how likely
 it is that both are equally good (McNemar, paired by seed), and how much longer robots travel without where both succeed
-(mean, and Wilcoxon's test). Trials are stored in the folder, and a call that was broken off goes on from there.
+(mean, and Wilcoxon's test).
 `--go-on-from FILE` takes trials from a Parquet file, such as those with all measures in
-`data/disturbance_study.parquet`. `--trials FILE` makes the table of trials that are in such a file.
+`examples/studies/data/disturbance_study.parquet`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, go_on_argument, save_table, stored, trials_argument
+from examples.outputs import save_table, study_trials, trials_parser
 from examples.studies.disturbance_study import (
     DISTURBANCES,
     FIRST_SEED,
@@ -26,14 +26,11 @@ from examples.studies.disturbance_study import (
     SCENARIOS,
     names_by_text,
     successes,
-    tell,
 )
 
 from d4orm_planners.evaluation.comparison import in_common, paired
-from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 ALL, WITHOUT_ALL = "d4orm-c2f", "all of them"
 MEASURES: dict[str, dict[str, Any]] = {
@@ -118,26 +115,11 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
 
 def main() -> int:
     """Run the study and write the table."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=30)
-    parser.add_argument("--workers", type=count, help="processes, by default one per core")
-    go_on_argument(parser)
-    trials_argument(parser)
-    arguments = parser.parse_args()
-    if arguments.trials is not None:
-        trials = read_parquet(arguments.trials)
-    else:
-        scenarios, names, seeds = SCENARIOS, tuple(MEANT_FOR), arguments.seeds
-        if arguments.quick:
-            scenarios, names, seeds = scenarios[:1], names[:1], 1
-        stored(arguments.go_on_from, arguments.out)
-        trials = [
-            trial
-            for study in studies(scenarios, names, seeds)
-            for group in run_study(study, arguments.out, workers=arguments.workers, progress=tell)
-            for trial in group.trials
-        ]
-        write_parquet(arguments.out / "ablation.parquet", trials)
+    arguments = trials_parser(__doc__, seeds=30).parse_args()
+    size = (SCENARIOS, tuple(MEANT_FOR), arguments.seeds)
+    if arguments.quick:
+        size = (SCENARIOS[:1], tuple(MEANT_FOR)[:1], 1)
+    trials = study_trials(arguments, "ablation", studies(*size))
     save_table(rows_of(by_cell(trials)), arguments.out / "ablation.csv")
     return 0
 

@@ -6,8 +6,7 @@ Its cylinders stand a metre apart, so that between their surfaces 0.6 m are left
 0.68 m. The paper does not say where they stand. Variants have the same cylinders further apart, smaller robots, or
 no cylinders on the left, which make a trap of the row that the others are. The paper's preset, 50 iterations at most.
 The table has the gap, what a robot needs, success with its 95% interval (Wilson), the median of iterations, and the
-mean makespan of the solutions. Trials are stored in the folder, and a call that was broken off goes on from there.
-`--trials FILE` makes the table of trials that are in a Parquet file, such as those in `data/`.
+mean makespan of the solutions.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured_trials, save_table, trials_argument, trials_of
+from examples.outputs import save_table, study_trials, trials_parser
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners.evaluation.comparison import is_solved
-from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
 
@@ -66,18 +64,11 @@ def gap(problem: Problem) -> tuple[float, float]:
 
 def main() -> int:
     """Run every variant, and write the table."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=10)
-    trials_argument(parser)
-    arguments = parser.parse_args()
+    arguments = trials_parser(__doc__, seeds=10).parse_args()
     settings, seeds = (TINY, 1) if arguments.quick else (PAPER, arguments.seeds)
     there = problems()
-
-    def run() -> list[Trial]:
-        study = Study(policies={"d4orm-d": settings}, scenarios=tuple(there.values()), seeds=range(seeds))
-        return trials_of((study,), arguments.out)
-
-    trials = measured_trials(arguments.trials, run, arguments.out / "amswarm_gaps.parquet")
+    study = Study(policies={"d4orm-d": settings}, scenarios=tuple(there.values()), seeds=range(seeds))
+    trials = study_trials(arguments, "amswarm_gaps", [study])
     rows: list[dict[str, Any]] = []
     for name, problem in there.items():
         mine = [trial for trial in trials if trial.scenario == name]

@@ -5,26 +5,16 @@
 Four teams of 16, D4orm's defaults but for `credit` and `penalty`, at most 20 iterations. The table has success with its
 95% interval (Wilson), the mean number of denoising steps to the first solution, a trial without one counting twice the
 budget (PAR-2), the mean travel time of the solutions, and how likely it is that a row and the defaults are equally good
-(McNemar on solutions, Wilcoxon on steps, paired by seed). Trials are stored in the folder, and a call that was broken
-off goes on from there. `--trials FILE` makes the table of trials that are in a Parquet file, such as those in `data/`.
+(McNemar on solutions, Wilcoxon on steps, paired by seed).
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-from examples.outputs import (
-    argument_parser,
-    count,
-    first_solutions,
-    measured_trials,
-    save_table,
-    trials_argument,
-    trials_of,
-)
+from examples.outputs import first_solutions, save_table, study_trials, trials_parser
 
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
@@ -51,13 +41,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
 DEFAULT = "group, 2"
 
 
-def run(num_robots: int, seeds: int, own: dict[str, Any], out: Path) -> list[Trial]:
-    """Trials of every setting with every team."""
+def studies(num_robots: int, seeds: int, own: dict[str, Any]) -> list[Study]:
+    """Every setting with every team."""
     policies = {
         label: {"policy": "d4orm", "engine": "cpu", "max_iterations": ITERATIONS, **settings, **own}
         for label, settings in SETTINGS.items()
     }
-    studies = (
+    return [
         Study(
             policies=policies,
             scenarios=(scenario,),
@@ -66,21 +56,15 @@ def run(num_robots: int, seeds: int, own: dict[str, Any], out: Path) -> list[Tri
             **own_model,
         )
         for scenario, own_model in TEAMS
-    )
-    return trials_of(studies, out)
+    ]
 
 
 def main() -> int:
     """Run every setting with every team, and write the table."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=50)
-    trials_argument(parser)
-    arguments = parser.parse_args()
+    arguments = trials_parser(__doc__, seeds=50).parse_args()
     tiny: tuple[Any, ...] = (2, 1, {"max_iterations": 1, "num_steps": 20})
     size = tiny if arguments.quick else (NUM_ROBOTS, arguments.seeds, {})
-    trials = measured_trials(
-        arguments.trials, lambda: run(*size, out=arguments.out), arguments.out / "contact_penalty.parquet"
-    )
+    trials = study_trials(arguments, "contact_penalty", studies(*size))
     teams: dict[str, list[Trial]] = {}
     for trial in trials:
         teams.setdefault(f"{trial.scenario}, {trial.model}", []).append(trial)

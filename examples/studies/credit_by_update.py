@@ -9,8 +9,6 @@ paper's. Every trial has the same budget of denoising steps of 1024 samples, whi
 its credit by groups, or in turn, is credit by robot). The table has success with its 95% interval (Wilson), the mean
 number of steps to the first solution, a trial without one counting twice the budget (PAR-2), and how likely it is that
 the cell and D4orm with the same credit are equally good (McNemar on solutions, Wilcoxon on steps, paired by seed).
-Trials are stored in the folder, and a call that was broken off goes on from there. `--go-on-from FILE` takes trials
-from a Parquet file, such as `data/credit_by_update.parquet`; `--trials FILE` makes the table and the curves of one.
 """
 
 from __future__ import annotations
@@ -21,23 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import (
-    argument_parser,
-    count,
-    go_on_argument,
-    plt,
-    save_figure,
-    save_table,
-    stored,
-    trials_argument,
-    trials_of,
-)
+from examples.outputs import plt, save_figure, save_table, study_trials, trials_parser
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 TEAMS = (("paper_circle", 8), ("paper_circle", 16), ("paper_random", 16), ("paper_heterogeneous", 8))
 CREDITS: dict[str, dict[str, Any]] = {
@@ -74,14 +61,13 @@ def policies(budget: int) -> dict[str, dict[str, Any]]:
     }  # fmt: skip
 
 
-def run(teams: Iterable[tuple[str, int]], seeds: int, budget: int, out: Path) -> list[Trial]:
-    """Trials of every cell on every team."""
+def studies(teams: Iterable[tuple[str, int]], seeds: int, budget: int) -> list[Study]:
+    """Every cell on every team."""
     chosen = policies(budget)
-    studies = (
+    return [
         Study(policies=chosen, scenarios=(scenario,), num_robots=num_robots, seeds=range(seeds))
         for scenario, num_robots in teams
-    )
-    return trials_of(studies, out)
+    ]
 
 
 def by_team(trials: Iterable[Trial]) -> dict[str, Cells]:
@@ -135,19 +121,9 @@ def draw(teams: dict[str, Cells], path: Path) -> None:
 
 def main() -> int:
     """Run every cell on every team, write the table and draw the curves."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=50)
-    go_on_argument(parser)
-    trials_argument(parser)
-    arguments = parser.parse_args()
-    if arguments.trials is None:
-        teams, seeds, budget = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)
-        stored(arguments.go_on_from, arguments.out)
-        trials = run(teams, seeds, budget, arguments.out)
-        write_parquet(arguments.out / "credit_by_update.parquet", trials)
-    else:
-        trials = read_parquet(arguments.trials)
-    found = by_team(trials)
+    arguments = trials_parser(__doc__, seeds=50).parse_args()
+    size = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)
+    found = by_team(study_trials(arguments, "credit_by_update", studies(*size)))
     save_table(
         [row for team, cells in found.items() for row in rows_of(team, cells)], arguments.out / "credit_by_update.csv"
     )

@@ -6,22 +6,22 @@ D4orm-C2F beside a plan of D4orm-D executed open loop, ORCA and PPO, each with t
 places and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all; and on the circle and
 on random places the same robots are rigid bodies in MuJoCo, as pucks and on two wheels, where that is installed.
 Written is for every policy, scenario and disturbance how many trials succeeded, with Wilson's 95% interval, in how many
-somebody touched anything, and how many ended too late; an overview of these, and a heat map. Seeds count once all
-policies have met them. Trials are stored in the folder one by one, and a call that was broken off, or one with more
-seeds or scenarios, goes on from there. `--trials FILE` makes table and heat map of trials that are in a Parquet file,
-such as those in `data/`.
+somebody touched anything, and how many ended too late; an overview of these, and a heat map. Trials are stored in the
+folder one by one, and a call that was broken off, or one with more seeds or scenarios, goes on from there.
+`--trials FILE` makes table and heat map of trials that are in a Parquet file, such as those in `examples/studies/data`.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, plt, save_figure, save_table, trials_argument
+from examples.outputs import plt, save_figure, save_table, study_trials, trials_parser
 
 from d4orm_env.disturbances import (
     Bias,
@@ -36,11 +36,9 @@ from d4orm_env.disturbances import (
     Stall,
     StateNoise,
 )
-from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import wilson_interval
-from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 from d4orm_planners.evaluation.trials import Condition
 
 ROBOTS = 8
@@ -69,28 +67,19 @@ Cells = dict[tuple[str, str, str], list[Trial]]
 """Trials by scenario, policy and disturbance."""
 
 
-def run(
-    scenarios: tuple[str, ...], policies: dict[str, dict[str, Any]], seeds: int, workers: int | None, out: Path
-) -> None:
-    """Trials of every policy under every disturbance and in MuJoCo, into the store."""
-    levels: dict[str, list[list[Disturbance[Any]]]] = {
-        NOTHING: [[]],
-        **{name: [[one]] for name, one in DISTURBANCES.items()},
-    }
-    chosen = range(FIRST_SEED, FIRST_SEED + seeds)
-    study = Study(policies=policies, scenarios=scenarios, num_robots=ROBOTS, seeds=chosen, disturbances=levels)
-    run_study(study, out, workers=workers, progress=tell)
+def studies(scenarios: tuple[str, ...], policies: dict[str, dict[str, Any]], seeds: int) -> list[Study]:
+    """Every policy under every disturbance and in MuJoCo."""
+    study = Study(
+        policies=policies,
+        scenarios=scenarios,
+        num_robots=ROBOTS,
+        seeds=range(FIRST_SEED, FIRST_SEED + seeds),
+        disturbances={NOTHING: [[]], **{name: [[one]] for name, one in DISTURBANCES.items()}},
+    )
     inside = tuple(scenario for scenario in scenarios if scenario != "rooms")
-    for model in BODIES.values() if inside and find_spec("mujoco") else ():
-        study = Study(
-            policies=policies, scenarios=inside, num_robots=ROBOTS, seeds=chosen, model=model, physics="mujoco"
-        )
-        run_study(study, out, workers=workers, progress=tell)
-
-
-def tell(what: str, done: int, total: int) -> None:
-    """Say how far the study is."""
-    print(f"{done} of {total}: {what}", flush=True)
+    models = BODIES.values() if inside and find_spec("mujoco") else ()
+    rigid = [replace(study, scenarios=inside, model=model, physics="mujoco", disturbances=None) for model in models]
+    return [study, *rigid]
 
 
 def names_by_text() -> dict[str, str]:
@@ -140,16 +129,6 @@ def overview(cells: Cells) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def complete(trials: Iterable[Trial]) -> list[Trial]:
-    """Trials of those seeds that all policies in the scenario have met under every disturbance."""
-    found: dict[tuple[str, int], list[Trial]] = {}
-    for trial in trials:
-        found.setdefault((trial.scenario, trial.seed), []).append(trial)
-    order = sorted(found, key=lambda key: (SCENARIOS.index(key[0]), key[1]))
-    all_of = {place: max(len(some) for (where, _), some in found.items() if where == place) for place, _ in order}
-    return [trial for key in order if len(found[key]) == all_of[key[0]] for trial in found[key]]
-
-
 def draw(cells: Cells, path: Path) -> None:
     """Success as a heat map: a panel per scenario, a row per policy, a column per disturbance."""
     scenarios = list(dict.fromkeys(scenario for scenario, _, _ in cells))
@@ -175,22 +154,13 @@ def draw(cells: Cells, path: Path) -> None:
 
 def main() -> int:
     """Run the study, write the table and draw the heat map."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=50)
+    parser = trials_parser(__doc__, seeds=50)
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=SCENARIOS)
-    parser.add_argument("--workers", type=count, help="processes, by default one per core")
-    trials_argument(parser)
     arguments = parser.parse_args()
-    if arguments.trials is not None:
-        trials = read_parquet(arguments.trials)
-    else:
-        chosen = {"orca": {}} if arguments.quick else POLICIES
-        scenarios, seeds = (SCENARIOS[:1], 1) if arguments.quick else (arguments.scenarios, arguments.seeds)
-        run(tuple(scenarios), chosen, seeds, arguments.workers, arguments.out)
-        # With those of calls before.
-        trials = TrialStore(arguments.out / STORE).trials()
-        trials = complete(trials)
-        write_parquet(arguments.out / "disturbance_study.parquet", trials)
+    size = (tuple(arguments.scenarios), POLICIES, arguments.seeds)
+    if arguments.quick:
+        size = (SCENARIOS[:1], {"orca": {}}, 1)
+    trials = study_trials(arguments, "disturbance_study", studies(*size))
     cells = by_cell(trials)
     save_table(overview(cells), arguments.out / "disturbance_overview.csv")
     save_table(rows_of(cells), arguments.out / "disturbance_study.csv")

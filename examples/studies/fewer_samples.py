@@ -4,9 +4,7 @@
 
 8 and 16 robots on the circle, at most 8 iterations. The table has success with its 95% interval (Wilson), the samples
 drawn until the first solution (median and quartiles; a trial without one counts twice the budget), the mean travel time
-of the solutions, and how likely it is that a row and the defaults need equally many (Wilcoxon, paired by seed). Trials
-are stored in the folder, and a call that was broken off goes on from there. `--trials FILE` makes the table of trials
-that are in a Parquet file, such as those in `data/`.
+of the solutions, and how likely it is that a row and the defaults need equally many (Wilcoxon, paired by seed).
 """
 
 from __future__ import annotations
@@ -14,11 +12,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured_trials, save_table, trials_argument, trials_of
+from examples.outputs import save_table, study_trials, trials_parser
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
 from d4orm_planners.evaluation.store import Trial
@@ -73,29 +70,23 @@ def rows_of(num_robots: int, groups: dict[str, list[Trial]]) -> list[dict[str, A
     return rows
 
 
-def run(teams: Sequence[int], seeds: int, own: dict[str, Any], out: Path) -> list[Trial]:
-    """Trials of every setting with every team."""
+def study(teams: Sequence[int], seeds: int, own: dict[str, Any]) -> Study:
+    """Every setting with every team."""
     policies = {
         label: {"policy": "d4orm", "engine": "cpu", "max_iterations": ITERATIONS, **settings, **own}
         for label, settings in SETTINGS.items()
     }
-    study = Study(
+    return Study(
         policies=policies, scenarios=("circle",), num_robots=teams, seeds=range(FIRST_SEED, FIRST_SEED + seeds)
     )
-    return trials_of([study], out)
 
 
 def main() -> int:
     """Run every setting with every team, and write the table."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=50)
-    trials_argument(parser)
-    arguments = parser.parse_args()
+    arguments = trials_parser(__doc__, seeds=50).parse_args()
     tiny: tuple[Any, ...] = ((2,), 1, {"max_iterations": 1})
     size = tiny if arguments.quick else (TEAMS, arguments.seeds, {})
-    trials = measured_trials(
-        arguments.trials, lambda: run(*size, out=arguments.out), arguments.out / "fewer_samples.parquet"
-    )
+    trials = study_trials(arguments, "fewer_samples", [study(*size)])
     rows = []
     for num_robots in sorted({trial.num_robots for trial in trials}):
         team = [trial for trial in trials if trial.num_robots == num_robots]

@@ -22,7 +22,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import COLOURS, argument_parser, count, measured, plt, save_figure, save_table, trials_argument
+from examples.outputs import COLOURS, plt, save_figure, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
@@ -181,14 +181,11 @@ def draw(rows: Rows, out: Any) -> None:
 
 def main() -> None:
     """Run every team size, credit and seed, and write the table and the plot."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=20)
-    trials_argument(parser)
-    arguments = parser.parse_args()
+    arguments = study_parser(__doc__, seeds=20).parse_args()
     settings: tuple[Any, ...] = (SIZES, arguments.seeds, NUM_SAMPLES, NUM_STEPS)
     if arguments.quick:
         settings = ((1, 16), 1, 256, 20)
-    rows = measured(arguments.trials, partial(measure, *settings), arguments.out / "gradient_dilution.parquet")
+    rows = study_rows(arguments, "gradient_dilution", partial(measure, *settings))
     save_table(summary(rows), arguments.out / "gradient_dilution.csv")
     draw(rows, arguments.out)
 

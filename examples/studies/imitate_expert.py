@@ -1,7 +1,7 @@
 """Imitation of a planner: a network learns what D4orm-C2F does, first by cloning, then by DAgger, then by PPO.
 
     python -m examples.studies.imitate_expert --seeds 3
-    python -m examples.studies.imitate_expert --trials data/imitate_expert.parquet
+    python -m examples.studies.imitate_expert --trials examples/studies/data/imitate_expert.parquet
 
 The clone sees what the expert's own drives led to, and on its own comes into places where the expert never was. DAgger
 lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, require, save_table, trials_argument
+from examples.outputs import require, save_table, study_parser, study_rows
 
 require("rl", "stable_baselines3", "tensorboard")
 
@@ -101,12 +101,9 @@ def _point(way: str, point: Rows) -> dict[str, object]:
 
 def main() -> int:
     """Learn, or read curves, and write what came of it."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=3, help="of each way of learning")
-    trials_argument(parser)
-    arguments = parser.parse_args()
+    arguments = study_parser(__doc__, seeds=3).parse_args()
     seeds, quick, out = (1 if arguments.quick else arguments.seeds), arguments.quick, arguments.out / "imitation"
-    rows = measured(arguments.trials, lambda: measure(seeds, out, quick), arguments.out / "imitate_expert.parquet")
+    rows = study_rows(arguments, "imitate_expert", lambda: measure(seeds, out, quick))
     save_table(summary(rows), arguments.out / "imitate_expert.csv")
     return 0
 

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, save_gif, save_table, trials_argument
+from examples.outputs import count, save_gif, save_table, study_parser, study_rows
 from numpy.typing import NDArray
 
 from d4orm_env import Problem, make_problem, navigation_v0
@@ -135,14 +135,13 @@ def summary(drives: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def main() -> None:
     """Run the loop, print the throughput and write the table and the animation of the first seed."""
-    parser = argument_parser(__doc__)
+    parser = study_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=1.0, help="simulated time per seed")
     parser.add_argument("--scenario", default="random")
     parser.add_argument("--num-robots", "--robots", type=count, default=16)
     parser.add_argument("--seed", type=int, default=0, help="the first")
     parser.add_argument("--seeds", type=count, default=1, help="how many, one after the other")
     parser.add_argument("--film", type=float, default=20.0, help="seconds of the animation")
-    trials_argument(parser)
     arguments = parser.parse_args()
     num_robots, minutes, film = arguments.num_robots, arguments.minutes, arguments.film
     if arguments.quick:
@@ -158,7 +157,7 @@ def main() -> None:
                 save_gif(frames, arguments.out / "lifelong.gif", problem.dt)
         return drives
 
-    drives = measured(arguments.trials, measure, arguments.out / "lifelong.parquet")
+    drives = study_rows(arguments, "lifelong", measure)
     save_table([summary(drives)], arguments.out / "lifelong.csv")
 
 

@@ -17,7 +17,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, plt, require, save_figure, save_table, trials_argument
+from examples.outputs import plt, require, save_figure, save_table, study_parser, study_rows
 
 require("ipopt", "casadi")
 from d4orm_env import Problem, World, make_problem, verify
@@ -166,16 +166,12 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Solve with every planner and seed, count the classes, write the table and the plot of D4orm's."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=100)
+    parser = study_parser(__doc__, seeds=100)
     parser.add_argument("--radius", type=float, default=0.5, help="of the obstacle [m]")
-    trials_argument(parser)
     arguments = parser.parse_args()
     seeds = min(arguments.seeds, 8) if arguments.quick else arguments.seeds
     problem = crossing(arguments.radius)
-    rows = measured(
-        arguments.trials, partial(solve, problem, seeds, max_iterations=10), arguments.out / "multimodality.parquet"
-    )
+    rows = study_rows(arguments, "multimodality", partial(solve, problem, seeds, max_iterations=10))
     save_table(summary(rows), arguments.out / "multimodality.csv")
     paths = [path_of(row) for row in solutions(rows, "d4orm")]
     found = {signs: [path for path in paths if signature(path) == signs] for signs in CLASSES}

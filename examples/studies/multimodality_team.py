@@ -17,7 +17,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, plt, save_figure, save_table, trials_argument
+from examples.outputs import count, plt, save_figure, save_table, study_parser, study_rows
 from examples.studies.multimodality import PLANNERS, Row, path_of, principal_components, solutions, solve, winding
 
 from d4orm_env import make_problem
@@ -67,15 +67,13 @@ def draw(rows: Sequence[Row], out: Any) -> None:
 
 def main() -> None:
     """Solve with every planner and seed, count the classes, write the table and the plot."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=30)
+    parser = study_parser(__doc__, seeds=30)
     parser.add_argument("--num-robots", "--robots", type=count, default=8, help="size of the team")
-    trials_argument(parser)
     arguments = parser.parse_args()
     seeds, num_robots = (4, 3) if arguments.quick else (arguments.seeds, arguments.num_robots)
     problem = make_problem("paper_circle", num_robots=num_robots)
     plans = partial(solve, problem, seeds, max_iterations=20, time_limit=120)
-    rows = measured(arguments.trials, plans, arguments.out / "multimodality_team.parquet")
+    rows = study_rows(arguments, "multimodality_team", plans)
     save_table([row_of(label, rows) for label in PLANNERS], arguments.out / "multimodality_team.csv")
     draw(rows, arguments.out)
 

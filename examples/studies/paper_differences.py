@@ -7,28 +7,17 @@ setting of the defaults in turn, or with what the paper leaves open decided othe
 of the preset in turn. The table has success with its 95% interval (Wilson), the mean number of denoising steps to the
 first solution, a trial without one counting twice the budget (PAR-2), the mean travel time of the solutions, and how
 likely it is that a row and the first of its kind are equally good (McNemar on solutions, Wilcoxon on steps, paired by
-seed). Trials are stored in the folder, and a call that was broken off goes on from there. `--trials FILE` makes the
-table of trials that are in a Parquet file, such as those in `data/`.
+seed).
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from examples.outputs import (
-    argument_parser,
-    count,
-    first_solutions,
-    measured_trials,
-    save_table,
-    trials_argument,
-    trials_of,
-)
+from examples.outputs import first_solutions, save_table, study_trials, trials_parser
 
-from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 
 TEAMS: Mapping[str, Sequence[int]] = {"paper_circle": (16,), "paper_obstacles": (12,)}
@@ -58,14 +47,14 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
 """Settings by what they are compared with."""
 
 
-def run(sizes: Mapping[str, Sequence[int]], seeds: int, own: dict[str, Any], out: Path) -> list[Trial]:
-    """Trials of every setting with every team."""
+def studies(sizes: Mapping[str, Sequence[int]], seeds: int, own: dict[str, Any]) -> list[Study]:
+    """Every setting with every team."""
     policies = {
         label: {"policy": "d4orm", "engine": "cpu", "max_iterations": ITERATIONS, **settings, **own}
         for kind in SETTINGS.values()
         for label, settings in kind.items()
     }
-    studies = (
+    return [
         Study(
             policies=policies,
             scenarios=(scenario,),
@@ -73,21 +62,15 @@ def run(sizes: Mapping[str, Sequence[int]], seeds: int, own: dict[str, Any], out
             seeds=range(FIRST_SEED, FIRST_SEED + seeds),
         )
         for scenario, num_robots in sizes.items()
-    )
-    return trials_of(studies, out)
+    ]
 
 
 def main() -> int:
     """Run every setting with every team, and write the table."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=50)
-    trials_argument(parser)
-    arguments = parser.parse_args()
+    arguments = trials_parser(__doc__, seeds=50).parse_args()
     tiny = (dict.fromkeys(TEAMS, (2,)), 1, {"max_iterations": 1, "num_steps": 20})
     size = tiny if arguments.quick else (TEAMS, arguments.seeds, {})
-    trials = measured_trials(
-        arguments.trials, lambda: run(*size, out=arguments.out), arguments.out / "paper_differences.parquet"
-    )
+    trials = study_trials(arguments, "paper_differences", studies(*size))
     rows = []
     for scenario in TEAMS:
         for reference, settings in SETTINGS.items():

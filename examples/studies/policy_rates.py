@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, require, save_table, trials_argument
+from examples.outputs import require, save_table, study_parser, study_rows
 
 require("rl", "stable_baselines3")
 from d4orm_planners.evaluation.summary import wilson_interval
@@ -129,15 +129,13 @@ def table_of(rows: Rows, table: str) -> list[dict[str, str]]:
 
 def main() -> None:
     """Roll out every policy in every case, and write a table for open ground and one for walls."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=100)
+    parser = study_parser(__doc__, seeds=100)
     parser.add_argument("--file", choices=FILES, nargs="+", default=list(FILES), help="only these policy files")
-    trials_argument(parser)
     arguments = parser.parse_args()
     out: Path = arguments.out
     quick = (("ppo-walls",), 1, OBSERVED[:1])
     settings = quick if arguments.quick else (arguments.file, arguments.seeds, OBSERVED)
-    rows = measured(arguments.trials, partial(measure, *settings), out / "policy_rates.parquet")
+    rows = study_rows(arguments, "policy_rates", partial(measure, *settings))
     for table in dict.fromkeys(table for _, table, _ in FILES.values()):
         if lines := table_of(rows, table):
             save_table(lines, out / f"{table}.csv")

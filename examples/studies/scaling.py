@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import COLOURS, argument_parser, count, measured, plt, save_figure, save_table, trials_argument
+from examples.outputs import COLOURS, count, plt, save_figure, save_table, study_parser, study_rows
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -77,15 +77,14 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Plan for every team size, and write the table and the plot."""
-    parser = argument_parser(__doc__)
+    parser = study_parser(__doc__)
     parser.add_argument("--num-robots", "--robots", type=count, nargs="+", default=ROBOTS)
     parser.add_argument("--seeds", type=count, default=3, help="problems per team size")
     parser.add_argument("--time-limit", type=float, default=120.0, help="seconds per plan")
-    trials_argument(parser)
     arguments = parser.parse_args()
     sizes, seeds = ((4, 8), 1) if arguments.quick else (arguments.num_robots, arguments.seeds)
     plans = partial(measure, sizes, seeds, arguments.time_limit)
-    rows = summary(measured(arguments.trials, plans, arguments.out / "scaling.parquet"))
+    rows = summary(study_rows(arguments, "scaling", plans))
     save_table(rows, arguments.out / "scaling.csv")
     draw(rows, arguments.out)
 

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, save_table, trials_argument
+from examples.outputs import save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem, verify
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
@@ -196,13 +196,11 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Plan, and write a table per set of cases, and that of the README."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=20, help="instances per case")
+    parser = study_parser(__doc__, seeds=20)
     parser.add_argument("--sets", nargs="+", choices=SETS, default=[*SETS], help="tables to make")
     parser.add_argument("--planner", nargs="+", help="who plans, in place of those of the tables")
     parser.add_argument("--preset", default=None)
     parser.add_argument("--improve", type=float, default=None, help="seconds in all, solved or not")
-    trials_argument(parser)
     arguments = parser.parse_args()
     chosen, seeds = {name: SETS[name] for name in arguments.sets}, arguments.seeds
     if arguments.planner:
@@ -213,7 +211,7 @@ def main() -> None:
     def plans() -> list[dict[str, Any]]:
         return measure(chosen, seeds, arguments.preset, arguments.improve)
 
-    rows = measured(arguments.trials, plans, arguments.out / "solve_rates.parquet")
+    rows = study_rows(arguments, "solve_rates", plans)
     for name in dict.fromkeys(row["set"] for row in rows):
         save_table(summary([row for row in rows if row["set"] == name]), arguments.out / f"solve_rates_{name}.csv")
     shown = [row for row in rows if row["team"] in README.get(row["set"], ())]

@@ -1,7 +1,7 @@
 """Reinforcement learning with several seeds: curves of PPO and SAC with 95% intervals of the mean (Student's t).
 
     python -m examples.studies.training_seeds --seeds 3
-    python -m examples.studies.training_seeds --curves data/training_curves.csv
+    python -m examples.studies.training_seeds --curves examples/studies/data/training_curves.csv
 
 Trains every learner with every seed, one after another: about three hours of one core. Broken off, it goes on where it
 was. With ``--curves`` it trains nothing, and makes table and picture of a file that it wrote before.

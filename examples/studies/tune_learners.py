@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, save_table, trials_argument
+from examples.outputs import count, save_table, study_parser, study_rows
 from examples.studies.training_seeds import LEARNERS, QUICK
 from examples.studies.tune_rivals import FIRST_SEED, KEPT, Between, OneOf, Settings
 
@@ -100,20 +100,19 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, object]]:
 
 def main() -> int:
     """Tune both, or one, and write what was tried."""
-    parser = argument_parser(__doc__)
+    parser = study_parser(__doc__)
     parser.add_argument("--candidates", type=count, default=7, help="settings tried per learner, its own included")
     parser.add_argument("--learner", action="append", choices=TRAININGS, help="only this one; repeatable")
-    trials_argument(parser)
     arguments = parser.parse_args()
     number = 3 if arguments.quick else arguments.candidates
-    rows = measured(
-        arguments.trials,
+    rows = study_rows(
+        arguments,
+        "tune_learners",
         lambda: [
             row
             for learner in arguments.learner or TRAININGS
             for row in tune(learner, number, arguments.quick, arguments.out)
         ],
-        arguments.out / "tune_learners.parquet",
     )
     save_table(summary(rows), arguments.out / "tune_learners.csv")
     return 0

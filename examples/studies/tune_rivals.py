@@ -8,7 +8,7 @@ K. Jamieson and A. Talwalkar, AISTATS 2016). A trial has a budget of denoising s
 mean number of steps to the first solution, a trial without one counting twice the budget (PAR-2). Seeds are 100 and up:
 evaluations use those below. Trials are stored in the folder, and a call that was broken off goes on from there.
 `--trials FILE` makes the tables, of all settings and of the best, of trials that are in a Parquet file, such as those
-in `data/`.
+in `examples/studies/data/`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import argument_parser, count, save_table, trials_argument
+from examples.outputs import count, save_table, study_parser
 
 from d4orm_planners import make_planner
 from d4orm_planners.evaluation.comparison import is_solved, penalised_steps
@@ -155,11 +155,10 @@ def shortlist(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main() -> int:
     """Tune all methods, or some, and write what was tried."""
-    parser = argument_parser(__doc__)
+    parser = study_parser(__doc__)
     parser.add_argument("--candidates", type=count, default=27, help="settings tried per method, the preset included")
     parser.add_argument("--seeds", type=count, default=4, help="seeds of the first round")
     parser.add_argument("--method", action="append", choices=SPACES, help="only this one; repeatable")
-    trials_argument(parser)
     arguments = parser.parse_args()
     if arguments.trials is None:
         number, seeds, budget = (2, 1, TINY) if arguments.quick else (arguments.candidates, arguments.seeds, BUDGET)

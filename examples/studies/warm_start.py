@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, measured, save_table, trials_argument
+from examples.outputs import save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_planners import make_planner, make_policy, run_episode
@@ -85,14 +85,11 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Plan and drive, and write the table."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=20, help="instances of each case")
-    trials_argument(parser)
-    arguments = parser.parse_args()
+    arguments = study_parser(__doc__, seeds=20).parse_args()
     chosen: tuple[Any, ...] = PLANNERS, CASES, arguments.seeds
     if arguments.quick:
         chosen = ("hybrid", "d4orm-c2f"), (("random", 4),), 2
-    rows = measured(arguments.trials, partial(measure, *chosen), arguments.out / "warm_start.parquet")
+    rows = study_rows(arguments, "warm_start", partial(measure, *chosen))
     save_table(summary(rows), arguments.out / "warm_start.csv")
 
 

@@ -184,7 +184,7 @@ BAD = [
     (("plan", "--set", "num_samples=64", "--set", "num_samples=65"), "--set gives 'num_samples' twice"),
     (("plan", "--planner", "cem", "--set", "temperature=1"), "'temperature' is no setting of planner 'cem'; it takes"),
     (("plan", "--planner", "d4orm-c2f"), "use make_policy('d4orm-c2f'), or d4orm run --policy d4orm-c2f"),
-    (("planners", "d4rom"), "policy 'd4rom' is unknown"),
+    (("planners", "d4rom"), "did you mean 'd4orm'?"),
     (("plan", "--set", "temperature=[1"), "the value is not YAML"),
     (("plan", "--set", "temperature=!!python/name:os.system"), "tags are not supported"),
     (("plan", "--set", "temperature=1e400"), "temperature is inf"),
@@ -215,9 +215,6 @@ BAD = [
             ("--policy", "d4orm"), ("--scenario-set", "diameter=6"),
         )
     ),
-    (("reproduce", "--list", "circle"), "figure does not go with the list of figures"),
-    (("reproduce", "--quick"), "--quick does not go with the list of figures"),
-    (("reproduce", "--seeds", "99999999999"), "1000000"),
     (("bench", "--seeds", "99999999999"), "1000000"),
     (("bench", "--num-robots", "4,99999"), "num_robots is 99999; it must be at most 10000"),
     (("run", "--control-noise-std", "-1"), "control_noise_std is -1"),
@@ -232,9 +229,6 @@ BAD = [
     (("evaluate", "--seeds", "9-3"), "--seeds '9-3' names no seed; give a number"),
     (("evaluate", "--disturb", "push.speed=1,,2"), "the list is not YAML"),
     (("robustness", "--workers", "0"), "workers is 0"),
-    (("reproduce", "team-size", "--seeds", "0"), "not '0'"),
-    (("reproduce", "team-size", "--workers", "0"), "not '0'"),
-    (("reproduce", "team-size", "--trials", "missing.parquet"), "missing.parquet"),
     (("leaderboard", "missing", "--out", "a.txt"), "'a.txt' must end in .md"),
     (("leaderboard", "missing", "--out", "a/b.md"), "does not exist; create it"),
     (("nonsense",), "nonsense"),
@@ -286,7 +280,6 @@ def test_a_warning_is_one_line_without_a_place_in_the_program(d4orm, tmp_path: P
         ),
         (("leaderboard", "pipe.parquet"), "pipe.parquet is no Parquet file of trials: is not a file; give the path"),
         (("leaderboard", "pipe.sqlite"), "there is no store of trials at pipe.sqlite"),
-        (("reproduce", "team-size", "--go-on-from", "pipe.parquet"), "is not a file"),
         (("node", "--config", "pipe.yaml"), "pipe.yaml: is not a file"),
     ],
 )
@@ -394,7 +387,7 @@ def test_a_file_that_ends_too_early_is_not_taken_for_ctrl_c(d4orm, monkeypatch: 
     def ended(name: str) -> None:
         raise EOFError("Ran out of input")
 
-    monkeypatch.setattr("d4orm_planners.base.planner_registry.default_settings", ended)
+    monkeypatch.setattr("d4orm_planners.cli.listings.default_settings", ended)
     outcome = d4orm("planners", "d4orm")
     assert outcome.status == 2
     assert outcome.err == "d4orm: something that was read ended too early (Ran out of input)\n"
@@ -446,7 +439,7 @@ def test_a_link_that_leads_to_no_file_is_refused_before_planning(
 def test_warmup_says_beforehand_that_nothing_can_be_kept(
     d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("d4orm_planners.cli.warmup.warm_up", lambda: pytest.fail("it compiles"))
+    monkeypatch.setattr("d4orm_planners.cli.warmup_command.warm_up", lambda: pytest.fail("it compiles"))
     monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
 
     def full(**options: object) -> None:

@@ -16,7 +16,7 @@ from numba.core import config
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.machine import commit, describe_machine
-from d4orm_planners.benchmark import bench_report, benchmark, timing
+from d4orm_planners.benchmark import bench_report, timing
 from d4orm_planners.benchmark.benchmark import parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
 from d4orm_planners.benchmark.settings import MODELS, QUICK, BenchmarkSettings
@@ -184,7 +184,7 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
         seen.append(settings)
         return [("memory", "one number", lambda: {"num_robots": 1, "imported": 2**20, "peak": 2**21})]
 
-    monkeypatch.setattr(benchmark, "parts", pretend)
+    monkeypatch.setattr("d4orm_planners.cli.bench.parts", pretend)
     options = ("--num-robots", "4,8", "--models", "velocity2d", "--engines", "cpu,jax", "--seeds", "3", "--quick")
     assert call("bench", "--out", str(tmp_path / "new"), *options) == 0
     (settings,) = seen

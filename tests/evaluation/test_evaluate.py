@@ -25,7 +25,8 @@ from d4orm_planners import IterationRecord, evaluate
 from d4orm_planners.evaluation import tables, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.pool import JobEvent, ProcessPool
+from d4orm_planners.evaluation.pool import JobEvent
+from d4orm_planners.evaluation.process_pool import ProcessPool
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, solved_after, success_by, success_rate, wilson_interval
@@ -443,12 +444,13 @@ def test_without_pyarrow_there_is_csv_and_a_word_about_it(
     status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "-j", "1", "-q")
     assert status == 0
     assert (
-        err == 'trials.parquet is not written, which needs pyarrow; install it with pip install "d4orm-env[evaluate]"\n'
+        err
+        == "trials.parquet is not written, which needs pyarrow; install it with: pip install 'd4orm-env[evaluate]'\n"
     )
     written = {path.name for path in (tmp_path / "evaluation").iterdir()}
     assert "trials.csv" in written
     assert "trials.parquet" not in written
-    with pytest.warns(UserWarning, match=r"pip install \"d4orm-env\[evaluate\]\""):
+    with pytest.warns(UserWarning, match=r"pip install 'd4orm-env\[evaluate\]'"):
         evaluate("go-to-goal", out=tmp_path / "evaluation", **TINY)
 
 
@@ -670,7 +672,7 @@ def test_without_ray_the_error_says_what_to_install(d4orm, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "ray", None)
     status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "--ray", "auto")
     assert status == 2
-    assert err == 'd4orm: running on a cluster needs ray; install it with pip install "d4orm-env[distributed]"\n'
+    assert err == "d4orm: running on a cluster needs ray; install it with: pip install 'd4orm-env[distributed]'\n"
 
 
 def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ import pytest
 
 from d4orm_planners import make_policy
 from d4orm_planners.baselines.go_to_goal import GoToGoal
-from d4orm_planners.evaluation import evaluate as evaluate_module
+from d4orm_planners.cli import evaluate_command
 from d4orm_planners.evaluation import pool as pool_module
 from d4orm_planners.evaluation import store as store_module
 from d4orm_planners.evaluation import trials as trials_module
@@ -502,7 +502,7 @@ def test_settings_reach_the_policies_that_have_them(d4orm, monkeypatch: pytest.M
         seen.update((choice.label, choice.settings) for choice in study.configurations())
         raise ValueError("enough")
 
-    monkeypatch.setattr(evaluate_module, "run_study", run)
+    monkeypatch.setattr(evaluate_command, "run_study", run)
     settings = ("--set", "cem.num_samples=32", "--set", "num_samples=64", "--set", "orca.time_horizon=2")
     d4orm("--policies", "d4orm,cem,orca", *settings, "--set", "preset=paper")
     assert seen == {
@@ -570,7 +570,7 @@ def test_a_library_that_is_missing_is_named_before_anything_runs(d4orm, monkeypa
     monkeypatch.setitem(sys.modules, "pyrvo", None)
     status, _, err = d4orm("--policies", "go-to-goal,orca")
     assert status == 2
-    assert err == "d4orm: policy 'orca' needs pyrvo; install it with pip install \"d4orm-env[orca]\"\n"
+    assert err == "d4orm: policy 'orca' needs pyrvo; install it with: pip install 'd4orm-env[orca]'\n"
 
 
 @pytest.mark.parametrize(

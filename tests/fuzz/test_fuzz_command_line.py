@@ -54,14 +54,13 @@ SMALL: dict[str, list[str]] = {
     "demo": ["--out", "taken"],
     "evaluate": ["--out", "taken"],
     "robustness": ["--out", "taken"],
-    "reproduce": ["team-size", "--out", "taken"],
     "bench": ["--out", "taken"],
     "train": ["ppo", "--out", "taken"],
     "dataset": ["--out", "taken"],
 }
 """What keeps a call from taking long, whatever else it is told."""
 
-FOLDER = ("demo", "evaluate", "robustness", "reproduce", "bench", "train", "dataset")
+FOLDER = ("demo", "evaluate", "robustness", "bench", "train", "dataset")
 
 
 def options_of(command: str) -> list[Any]:

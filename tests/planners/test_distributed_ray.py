@@ -74,7 +74,7 @@ def test_without_ray_the_error_says_what_to_install(
         cli.main(["plan", "--planner", "d-d4orm", "--set", "transport=ray"])
     assert exit_.value.code == 2
     assert capsys.readouterr().err == (
-        "d4orm: transport 'ray' of d-d4orm needs ray; install it with pip install \"d4orm-env[distributed]\"\n"
+        "d4orm: transport 'ray' of d-d4orm needs ray; install it with: pip install 'd4orm-env[distributed]'\n"
     )
 
 

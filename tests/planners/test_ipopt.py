@@ -195,7 +195,7 @@ def test_a_plan_with_notes_is_saved_and_loaded(tmp_path: Any) -> None:
 
 def test_without_casadi_the_planner_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(ImportError, match=r'planner \'ipopt\' needs casadi; .*pip install "d4orm-env\[ipopt\]"'):
+    with pytest.raises(ImportError, match=r"planner 'ipopt' needs casadi; .*pip install 'd4orm-env\[ipopt\]'"):
         make_planner("ipopt")
 
 

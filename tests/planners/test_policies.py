@@ -409,7 +409,7 @@ def test_orca_refuses_a_problem_in_space() -> None:
 
 def test_without_pyrvo_orca_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrvo", None)
-    with pytest.raises(ImportError, match=r'pip install "d4orm-env\[orca\]"'):
+    with pytest.raises(ImportError, match=r"pip install 'd4orm-env\[orca\]'"):
         make_policy("orca")
 
 

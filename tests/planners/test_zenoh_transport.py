@@ -130,7 +130,7 @@ def test_multicast_finds_others_on_this_machine(join: Join) -> None:
 
 def test_without_zenoh_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zenoh", None)
-    with pytest.raises(ImportError, match=r'needs zenoh; install it with pip install "d4orm-env\[zenoh\]"'):
+    with pytest.raises(ImportError, match=r"needs zenoh; install it with: pip install 'd4orm-env\[zenoh\]'"):
         ZenohTransport(ZenohSettings())
 
 

@@ -497,7 +497,7 @@ def test_without_the_extra_one_line_names_it() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 2
-    assert result.stderr == 'd4orm: d4orm play needs viser; install it with pip install "d4orm-env[viz]"\n'
+    assert result.stderr == "d4orm: d4orm play needs viser; install it with: pip install 'd4orm-env[viz]'\n"
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open

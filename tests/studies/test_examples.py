@@ -328,7 +328,7 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, names: str) -> None:
     data = "tuning" if program == "tune_rivals" else program
-    completed(program, tmp_path / "out", "--trials", str(ROOT / "data" / f"{data}.parquet"))
+    completed(program, tmp_path / "out", "--trials", str(EXAMPLES / "studies" / "data" / f"{data}.parquet"))
     for name in names.split():
         for kind in ("csv", "md"):
             committed = ROOT / "docs" / "tables" / f"{name}.{kind}"

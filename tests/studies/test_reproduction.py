@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import csv
 import json
+from argparse import Namespace
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from examples.outputs import study_trials
+from examples.studies.paper.__main__ import main
+from examples.studies.paper.figure import Figure, Group, Section, grouped
+from examples.studies.paper.figure_report import markdown, write_figure
+from examples.studies.paper.numbers import METRICS, first_solution, measured
+from examples.studies.paper.paper_figures import FIGURES
+from examples.studies.paper.plots import PLOTS, best_reward
 
 from d4orm_planners import list_planners
 from d4orm_planners.evaluation import evaluate
 from d4orm_planners.evaluation.comparison import steps_to_solution
 from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
-from d4orm_planners.reproduction.figure import Figure, Group, Section, regrouped, reproduce
-from d4orm_planners.reproduction.figure_report import markdown, write_reproduction
-from d4orm_planners.reproduction.numbers import METRICS, first_solution, measured
-from d4orm_planners.reproduction.paper_figures import FIGURES, find_figure
-from d4orm_planners.reproduction.plots import PLOTS, best_reward
 
 pytestmark = pytest.mark.studies
 
@@ -49,10 +51,25 @@ def figure(**changes: Any) -> Figure:
     return Figure(**{**values, "metrics": ("success", "runtime"), "plots": ("runtime",), **changes})
 
 
+def run(figure: Figure, out: Path, seeds: int) -> list[Group]:
+    """The groups of a figure whose trials are run in a folder."""
+    arguments = Namespace(trials=None, go_on_from=None, workers=1, out=out)
+    return grouped(figure, study_trials(arguments, figure.name, [study for _, study in figure.studies(seeds)]))
+
+
 @pytest.fixture
-def d4orm(d4orm):
-    """Runs ``d4orm reproduce``."""
-    return partial(d4orm, "reproduce")
+def paper(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Runs ``python -m examples.studies.paper`` inside ``tmp_path``; gives exit status, output and errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        try:
+            status = main(arguments)
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+        return status, *capsys.readouterr()
+
+    return call
 
 
 def available(chosen: Figure) -> bool:
@@ -65,16 +82,16 @@ def available(chosen: Figure) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
-def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(d4orm, tmp_path: Path, name: str) -> None:
+def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(paper, tmp_path: Path, name: str) -> None:
     chosen = FIGURES[name].quick()
     if not available(chosen):
         pytest.skip("there is no planner ipopt")
-    status, out, err = d4orm(name, "--quick")
+    status, out, err = paper(name, "--quick")
     assert status == 0, err
-    folder = tmp_path / "reproduction" / f"{name}-quick"
-    written = {f"{name}.csv", f"{name}.md", f"{name}.png", "trials.csv"}
+    folder = tmp_path / "examples" / "output" / f"{name}-quick"
+    written = {f"{name}.csv", f"{name}.md", f"{name}.png", f"{name}.parquet"}
     assert written <= {path.name for path in folder.iterdir()}
-    assert all(str(Path("reproduction", folder.name, file)) in out for file in written)
+    assert all(str(Path("examples", "output", folder.name, file)) in out for file in written)
     with (folder / f"{name}.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [(row["section"], row["scenario"], row["label"], float(row["control_noise_std"])) for row in rows] == [
@@ -95,7 +112,7 @@ def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(d4
 
     stored = TrialStore.existing(folder).trials()
     assert len(stored) == len(rows)
-    assert d4orm(name, "--quick", "--quiet") == (0, "", "")
+    assert paper(name, "--quick", "--quiet") == (0, "", "")
     assert TrialStore.existing(folder).trials() == stored, "the same command runs nothing again"
 
 
@@ -115,48 +132,45 @@ def test_what_a_figure_names_exists(name: str) -> None:
                 assert len(study.configurations()) == len(section.policies)
 
 
-def test_trials_of_a_file_are_not_run_again(d4orm, tmp_path: Path) -> None:
-    part = ("coarseness", "--quick", "--policy", "f=1, o=1", "--quiet")
-    assert d4orm(*part, "--out", "first")[0] == 0
-    file = str(tmp_path / "first" / "coarseness-quick" / "trials.parquet")
-    assert d4orm(*part, "--out", "second", "--go-on-from", file)[0] == 0
+def test_trials_of_a_file_are_not_run_again(paper, tmp_path: Path) -> None:
+    part = ("coarseness", "--quick", "--policy", "f=1, o=1")
+    assert paper(*part, "--out", "first")[0] == 0
+    file = str(tmp_path / "first" / "coarseness-quick" / "coarseness.parquet")
+    assert paper(*part, "--out", "second", "--go-on-from", file)[0] == 0
     before, after = (TrialStore.existing(tmp_path / name / "coarseness-quick").trials() for name in ("first", "second"))
     assert before == after, "with the times of the first"
-    status, _, error = d4orm("coarseness", "--trials", file, "--go-on-from", file)
-    assert (status, error) == (2, "d4orm: --go-on-from is about running trials; leave it out beside --trials\n")
-    assert d4orm(*part, "--out", "third", "--go-on-from", "no.parquet")[0] == 2
+    assert paper(*part, "--out", "third", "--go-on-from", "no.parquet")[0] == 2
     assert not (tmp_path / "third").exists()
 
 
-def test_a_figure_is_made_of_trials_of_other_times(d4orm, tmp_path: Path) -> None:
+def test_a_figure_is_made_of_trials_of_other_times(paper, tmp_path: Path) -> None:
     part = ("robustness", "--section", "2D Holonomic", "--policy", "hybrid")
-    status, out, err = d4orm(*part, "--seeds", "2", "--workers", "2")
+    status, out, err = paper(*part, "--seeds", "2", "--workers", "2")
     assert status == 0, err
-    folder = tmp_path / "reproduction" / "robustness"
-    kept = folder / "trials.parquet"
-    assert str(Path("reproduction", "robustness", "trials.parquet")) in out
+    folder = tmp_path / "examples" / "output" / "robustness"
+    kept = folder / "robustness.parquet"
+    assert str(Path("examples", "output", "robustness", "robustness.parquet")) in out
     first = {name: (folder / f"robustness.{name}").read_text(encoding="utf-8") for name in ("csv", "md")}
     earlier = read_parquet(kept)
     # Settings that the defaults do not have any more.
     write_parquet(kept, [replace(trial, config='{"num_samples": 3}') for trial in earlier])
-    status, out, err = d4orm("robustness", "--trials", str(kept), "--out", "again")
+    status, out, err = paper("robustness", "--trials", str(kept), "--out", "again")
     assert status == 0, err
     again = tmp_path / "again" / "robustness"
     assert {path.name for path in again.iterdir()} == {f"robustness.{kind}" for kind in ("csv", "md", "png")}
     for name, text in first.items():
         assert (again / f"robustness.{name}").read_text(encoding="utf-8") == text
     few = [trial for trial in earlier if trial.control_noise_std == 0 and trial.seed == 1]
-    (group,) = regrouped(FIGURES["robustness"], few)
+    (group,) = grouped(FIGURES["robustness"], few)
     assert (group.section, group.label, list(group.trials)) == ("2D Holonomic", "hybrid", few)
     for arguments, complaint in (
         (("ipopt", "--trials", str(kept)), "none of the 14 trials is one of the figure 'ipopt'"),
-        (("robustness", "--trials", str(kept), "--seeds", "3"), "--seeds is about running trials"),
         (("robustness", "--trials", str(folder / "robustness.md")), "is no Parquet file of trials"),
         (("robustness", "--trials", "nowhere.parquet"), "nowhere.parquet"),
     ):
-        status, out, err = d4orm(*arguments)
-        assert (status, out, err.count("\n")) == (2, "", 1)
-        assert complaint in err
+        status, out, err = paper(*arguments)
+        assert (status, out) == (2, "")
+        assert complaint in err.splitlines()[-1]
 
 
 def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,8 +188,8 @@ def test_a_call_that_was_broken_off_goes_on(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(evaluate, "run_here", stopping)
     with pytest.raises(KeyboardInterrupt):
-        reproduce(chosen, tmp_path, seeds=1)
-    groups = reproduce(chosen, tmp_path, seeds=1)
+        run(chosen, tmp_path, seeds=1)
+    groups = run(chosen, tmp_path, seeds=1)
     assert sorted(ran) == [("d4orm", 2), ("d4orm", 3), ("mppi", 2), ("mppi", 3)]
     assert [(group.section, group.label) for group in groups] == [
         ("Circle", "d4orm"), ("Circle", "mppi"), ("Others", "d4orm"), ("Others", "mppi"),
@@ -188,7 +202,7 @@ def test_d4orm_solves_no_less_than_mppi_and_cem_with_as_many_samples(tmp_path: P
     spent = {"preset": "paper", "max_iterations": 2}
     policies = {"d4orm": {"max_iterations": 12}, "mppi": spent, "cem": spent}
     section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(8,))
-    rows = [measured(group) for group in reproduce(figure(sections=(section,)), tmp_path, seeds=2)]
+    rows = [measured(group) for group in run(figure(sections=(section,)), tmp_path, seeds=2)]
     solved = {row.label: row.successes for row in rows}
     # Two seeds and 200 steps are too few for medians, and only the defaults are sure to solve both within them.
     assert solved["d4orm"] == 2 >= max(solved.values())
@@ -208,7 +222,7 @@ def test_coarser_guidance_and_other_schedules_solve_as_well(tmp_path: Path) -> N
         circle,
         replace(circle, title="Drives", model="differential_drive"),
     )
-    rows = [measured(group) for group in reproduce(figure(sections=sections), tmp_path, seeds=1)]
+    rows = [measured(group) for group in run(figure(sections=sections), tmp_path, seeds=1)]
     assert [row.successes for row in rows] == [1] * (4 + 2 + 2)
     assert all(4.5 < row.travel_time <= row.makespan < 10 for row in rows)  # type: ignore[operator]
 
@@ -293,13 +307,13 @@ def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> Non
     page = markdown(by_steps, groups)
     assert "the median difference in denoising steps" in page
     assert "| mppi | 8 | 5 | 2 | 0 | 0.5 | -50.00 |" in page
-    assert write_reproduction(tmp_path, by_steps, groups, trials=False)
+    assert write_figure(tmp_path, by_steps, groups)
 
 
 def test_what_is_never_can_be_drawn(tmp_path: Path) -> None:
     solved, never = trial(0, history="[[0.5,1,0.5]]"), trial(1, history="[]", status="time_limit")
     drawn = figure(plots=("runtime", "survival"))
-    paths = write_reproduction(tmp_path, drawn, [Group("Circle", "ipopt", [solved, solved, never])], trials=False)
+    paths = write_figure(tmp_path, drawn, [Group("Circle", "ipopt", [solved, solved, never])])
     assert paths[-1].read_bytes().startswith(PNG)
 
 
@@ -308,7 +322,7 @@ def test_every_policy_is_run_with_every_number_of_nodes(tmp_path: Path) -> None:
     policies = {"top-k": few, "max": {**few, "selection": "max"}}
     section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(2,), nodes=(1, 3))
     chosen = figure(sections=(section,), across="nodes", metrics=("success", "messages"))
-    rows = [measured(group) for group in reproduce(chosen, tmp_path, seeds=2)]
+    rows = [measured(group) for group in run(chosen, tmp_path, seeds=2)]
     assert [(row.label, row.nodes) for row in rows] == [("top-k", 1), ("max", 1), ("top-k", 3), ("max", 3)]
 
 
@@ -381,7 +395,7 @@ def test_without_times_a_figure_says_nothing_of_seconds(name: str, tmp_path: Pat
     assert "| runtime, s" not in page
     assert "within a deadline" not in page
     assert "| control loop, ms" not in page
-    write_reproduction(tmp_path, timeless, groups, trials=False)
+    write_figure(tmp_path, timeless, groups)
     columns = (tmp_path / f"{name}.csv").read_text().splitlines()[0].split(",")
     assert "success_rate" in columns or "successes" in columns
     assert not [column for column in columns if "runtime" in column or column in ("step_time", "waiting_share")]
@@ -414,47 +428,45 @@ def test_the_papers_tables_are_copied_right() -> None:
 # The command line.
 
 
-def test_without_a_name_the_figures_are_listed(d4orm, tmp_path: Path) -> None:
-    status, out, _ = d4orm()
+def test_without_a_name_the_figures_are_listed(paper, tmp_path: Path) -> None:
+    status, out, _ = paper()
     assert status == 0
     assert [line.split()[0] for line in out.splitlines()] == list(FIGURES)
-    assert d4orm("--list") == (0, out, "")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("fig4",), f"'fig4' is unknown; choose one of {', '.join(FIGURES)}"),
+        (("fig4",), "invalid choice: 'fig4'"),
         (("big-teams", "--section", "Nowhere"), "no section 'Nowhere'; choose of Differential Drive; 2D Holonomic"),
         (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; d4orm; d4orm, defaults"),
         (("amswarm", "--quick", "--seeds", "0"), "seeds"),
         (("amswarm", "--quick", "--workers", "0"), "workers"),
     ],
 )
-def test_bad_input_gets_one_line(d4orm, arguments: tuple[str, ...], complaint: str) -> None:
-    status, out, err = d4orm(*arguments)
+def test_bad_input_is_named_in_the_last_line(paper, arguments: tuple[str, ...], complaint: str) -> None:
+    status, out, err = paper(*arguments)
     assert (status, out) == (2, "")
-    assert err.count("\n") == 1
-    assert complaint in err
+    assert complaint in err.splitlines()[-1]
 
 
 def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Path) -> None:
     section = Section(title="Circle", policies={"d4orm": {}}, scenarios=("circle",), num_robots=(2,))
     chosen = figure(sections=(section, replace(section, title="Others", policies={"perfect": {}})))
     with pytest.raises(ValueError, match="policy 'perfect' is unknown"):
-        reproduce(chosen, tmp_path)
+        run(chosen, tmp_path, seeds=1)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_part_of_a_figure() -> None:
-    part = find_figure("big-teams").only(["2D Holo Random"], ["hybrid", "d4orm-c2f"])
+    part = FIGURES["big-teams"].only(["2D Holo Random"], ["hybrid", "d4orm-c2f"])
     assert [(section.num_robots, list(section.policies)) for section in part.sections] == [
         ((16, 32, 64), ["hybrid", "d4orm-c2f"]),
     ]
-    assert find_figure("big-teams").only() == FIGURES["big-teams"]
+    assert FIGURES["big-teams"].only() == FIGURES["big-teams"]
     for labels, limit in ((["d4orm-c2f"], None), (["d4orm-c2f", "d4orm-d"], 30.0)):  # which is a planner's
-        assert {section.time_limit for section in find_figure("robustness").only((), labels).sections} == {limit}
+        assert {section.time_limit for section in FIGURES["robustness"].only((), labels).sections} == {limit}
 
 
 # The store.
@@ -464,7 +476,7 @@ def test_the_time_before_the_first_action_is_stored(tmp_path: Path) -> None:
     few = {"num_samples": 64, "num_steps": 5, "max_iterations": 1}
     policies = {"d4orm": few, "d4orm-c2f": {"refine": "off", "coarse_iterations": 1, "num_steps": 2}}
     section = Section(title="Circle", policies=policies, scenarios=("circle",), num_robots=(2,))
-    groups = reproduce(figure(sections=(section,)), tmp_path, seeds=1)
+    groups = run(figure(sections=(section,)), tmp_path, seeds=1)
     (plan,), (acting,) = (group.trials for group in groups)
     assert plan.preparation == plan.wall_time
     assert 0 < acting.preparation < acting.wall_time

@@ -13,6 +13,8 @@ from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig, State
 from d4orm_planners.base.settings import Count, NotNegative, Number, Positive, Share, Steps
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.baselines.amswarm.alternation import alternate
+from d4orm_planners.baselines.amswarm.swarm import Swarm
 
 Degree = Annotated[Count, Field(ge=5, le=30)]
 Lookahead = Annotated[Count, Field(ge=2, le=1000)]
@@ -88,8 +90,6 @@ class AMSwarm(Planner):
 
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: a run of the whole team."""
-        from d4orm_planners.baselines.amswarm.swarm import Swarm
-
         _refuse_polygons(search.problem)
         if search.iteration == 0:
             with search.watch.paused():
@@ -101,9 +101,6 @@ class AMSwarm(Planner):
 
     def _compile(self, search: SolveRun) -> None:
         """Compile the alternation and the step of such a team, if they are not yet."""
-        from d4orm_planners.baselines.amswarm.alternation import alternate
-        from d4orm_planners.baselines.amswarm.swarm import Swarm
-
         problem, engine = search.problem, search.engine
         arrived, controls = np.zeros(problem.num_robots, bool), search.current.controls[0]
         engine.step(problem.arrays, np.asarray(problem.start), arrived, controls)

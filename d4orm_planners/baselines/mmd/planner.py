@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -13,10 +13,12 @@ from d4orm_env.core.seeds import Stream, generator
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Number, Samples, ShareOrNone, Steps
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.baselines.mmd.constraint_tree import Planning, Tree
+from d4orm_planners.baselines.mmd.guiding import guide
+from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
+from d4orm_planners.baselines.mmd.reverse_process import Denoiser
+from d4orm_planners.baselines.mmd.tracking import tracking_kernel
 from d4orm_planners.mapf.planner import NoPaths
-
-if TYPE_CHECKING:
-    from d4orm_planners.baselines.mmd.constraint_tree import Tree
 
 Stretch = Annotated[Number, Field(ge=1, le=100)]
 GuideSteps = Annotated[Count, Field(le=1000)]
@@ -80,9 +82,6 @@ class MMD(Planner):
 
     def iterate(self, search: SolveRun, state: Tree | NoPaths | None) -> tuple[Tree | NoPaths, Iteration]:
         """See :meth:`Planner.iterate`: everybody's motion at first, then an expansion of the best node."""
-        from d4orm_planners.baselines.mmd.constraint_tree import Planning
-        from d4orm_planners.baselines.mmd.reverse_process import Denoiser
-
         if state is None:
             with search.watch.paused():
                 compile_mmd(search.problem)
@@ -105,9 +104,6 @@ class MMD(Planner):
 
 def _begin(search: SolveRun) -> Tree | NoPaths:
     """The tree before its root."""
-    from d4orm_planners.baselines.mmd.constraint_tree import Tree
-    from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
-
     problem, space = search.problem, world_space(search.problem)
     reason = NoPaths.unless_reachable(problem)
     if reason is not None:
@@ -124,12 +120,6 @@ def _seeds(search: SolveRun, count: int) -> list[int]:
 
 def compile_mmd(problem: Problem) -> None:
     """Compile what the method needs for such a team, if it is not yet."""
-    from d4orm_planners.baselines.mmd.constraint_tree import Planning
-    from d4orm_planners.baselines.mmd.guiding import guide
-    from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
-    from d4orm_planners.baselines.mmd.reverse_process import Denoiser
-    from d4orm_planners.baselines.mmd.tracking import tracking_kernel
-
     if guide.signatures and all(tracking_kernel(name).signatures for name in problem.team.models):
         return
     config = MMDConfig(num_samples=2, num_steps=1, guide_from=1.0, guide_steps=1)

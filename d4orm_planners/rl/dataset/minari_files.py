@@ -18,11 +18,16 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import BoolArray
+from d4orm_env.core.lazy import LazyModule
 from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
+
+h5py: Any = LazyModule("h5py", "a dataset", "dataset")
+data_collector: Any = LazyModule("minari.data_collector", "a dataset", "dataset")
+minari_storage: Any = LazyModule("minari.dataset.minari_storage", "a dataset", "dataset")
 
 MAIN, METADATA = "main_data.hdf5", "metadata.json"
 
@@ -72,8 +77,6 @@ class DatasetFiles:
 
     def write_main(self, metadata: Mapping[str, object]) -> None:
         """Write the main file and the metadata anew, for the shards that are there."""
-        import h5py
-
         partial = self.folder / ".main"
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -95,9 +98,9 @@ class DatasetFiles:
         partial.rmdir()
 
     def _storage(self, folder: Path) -> MinariStorage:
-        from minari.dataset.minari_storage import MinariStorage
-
-        return MinariStorage.new(folder, self.observation_space, self.action_space, self.env_spec, "hdf5")
+        return minari_storage.MinariStorage.new(
+            folder, self.observation_space, self.action_space, self.env_spec, "hdf5"
+        )
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
@@ -150,8 +153,6 @@ _PARTS: Mapping[str, Callable[[RecordedEpisode], Iterable[_Shard]]] = {"team": _
 
 def _buffer(episode: RecordedEpisode, part: _Shard) -> EpisodeBuffer:
     """An episode as Minari takes it."""
-    from minari.data_collector import EpisodeBuffer
-
     steps, pick = part.steps, part.pick
     names = ("arrived", "collided", "margin_violated", "distance_to_goal")
     infos = {name: pick(getattr(episode, name))[: steps + 1] for name in names}
@@ -162,7 +163,7 @@ def _buffer(episode: RecordedEpisode, part: _Shard) -> EpisodeBuffer:
         infos |= {"robot_rewards": np.concatenate([at_reset, rewards]), "state": episode.state}
         ended, rewards = np.all(np.maximum.accumulate(ended), axis=1), rewards.mean(axis=1)
     last = np.arange(steps) == steps - 1
-    return EpisodeBuffer(
+    return data_collector.EpisodeBuffer(
         seed=int(episode.metadata["seed"]),
         observations=_flat(pick(episode.observations)[: steps + 1]),
         actions=_flat(pick(episode.actions)[:steps]),

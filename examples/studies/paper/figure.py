@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal
 
-from d4orm_env.core.arrays import whole_number
 from d4orm_planners.base.planner_registry import list_planners
-from d4orm_planners.evaluation.evaluate import Progress, run_study
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.evaluation.study import Study
 
@@ -95,8 +92,8 @@ class Figure:
         source: Its place in the paper.
         sections: Its panels.
         across: Attribute that varies from left to right.
-        metrics: Metrics in the tables, see :data:`~d4orm_planners.reproduction.numbers.METRICS`.
-        plots: Plots, see :data:`~d4orm_planners.reproduction.plots.PLOTS`.
+        metrics: Metrics in the tables, see :data:`~examples.studies.paper.numbers.METRICS`.
+        plots: Plots, see :data:`~examples.studies.paper.plots.PLOTS`.
         seeds: Trials per policy, problem and level of noise; the paper's number.
         deadlines: Seconds for planning, for tables of success within them.
         paper: The numbers that the paper gives.
@@ -139,6 +136,10 @@ class Figure:
             remarks=(*self.remarks, "The machine did other work too, so seconds are left out."),
         )
 
+    def studies(self, seeds: int) -> list[tuple[str, Study]]:
+        """Title of the section and study of everything in the figure."""
+        return [(section.title, study) for section in self.sections for study in section.studies(seeds)]
+
     def only(self, titles: Sequence[str] = (), labels: Sequence[str] = ()) -> Figure:
         """A part of the figure.
 
@@ -179,46 +180,8 @@ class Group:
     trials: Sequence[Trial]
 
 
-def reproduce(
-    figure: Figure,
-    out: str | os.PathLike[str],
-    *,
-    seeds: int | None = None,
-    workers: int | None = 1,
-    progress: Progress | None = None,
-) -> list[Group]:
-    """Run what a figure compares, as far as its trials are not stored yet.
-
-    Args:
-        figure: The figure, or its :meth:`Figure.quick` version.
-        out: Folder to keep the trials in; made if it does not exist.
-        seeds: Number of seeds, from 0 up; the figure's own number by default.
-        workers: Processes of one thread each; 1 plans one after another on all cores, as times should be measured.
-        progress: Called as ``progress(what, trials done, trials in all)`` for every section.
-
-    Returns:
-        The trials, section by section.
-
-    Raises:
-        ValueError: For a policy that does not exist, a number that makes no sense, or a store that is something else.
-            Nothing has run then.
-        ImportError: If a policy needs a library that is not installed.
-        OSError: If the folder or the store cannot be used, or workers do not start.
-    """
-    studies = _studies(figure, whole_number(figure.seeds if seeds is None else seeds, "seeds", 1))
-    for _, study in studies:  # before the first of them runs for hours
-        study.configurations()
-    return [
-        Group(title, label, trials)
-        for title, study in studies
-        for label, trials, *_ in run_study(study, out, workers=workers, progress=progress)
-    ]
-
-
-def regrouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
-    """The groups of a figure among trials that were made before, whatever the policies' other settings were then.
-
-    Groups of which there are no trials are left out.
+def grouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
+    """The groups of a figure, as far as there are trials of them, whatever the policies' other settings were then.
 
     Raises:
         ValueError: If none of the trials is one of the figure's.
@@ -226,7 +189,7 @@ def regrouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
     """
     there = {_place(trial.label, trial.key): trial for trial in trials}
     groups = []
-    for title, study in _studies(figure, 1 + max((trial.seed for trial in trials), default=0)):
+    for title, study in figure.studies(1 + max((trial.seed for trial in trials), default=0)):
         for jobs in study.groups():
             label = jobs[0].policy.label
             for condition in jobs[0].conditions:
@@ -236,11 +199,6 @@ def regrouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
     if not groups:
         raise ValueError(f"none of the {len(trials)} trials is one of the figure {figure.name!r}; give it its own")
     return groups
-
-
-def _studies(figure: Figure, seeds: int) -> list[tuple[str, Study]]:
-    """Title and study of everything in the figure."""
-    return [(section.title, study) for section in figure.sections for study in section.studies(seeds)]
 
 
 def _place(label: str, key: TrialKey) -> tuple[object, ...]:

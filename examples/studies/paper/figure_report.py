@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+
+from examples.studies.paper.figure import Figure, Group
+from examples.studies.paper.numbers import METRICS, Measured, column, first_solution, is_time, measured
+from examples.studies.paper.plots import draw
 
 from d4orm_planners.evaluation.comparison import paired, steps_to_solution
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
-from d4orm_planners.evaluation.tables import deadline_table, errors, table, target, write_csv, write_parquet
-from d4orm_planners.reproduction.figure import Figure, Group
-from d4orm_planners.reproduction.numbers import METRICS, Measured, column, first_solution, is_time, measured
-from d4orm_planners.reproduction.plots import draw
+from d4orm_planners.evaluation.tables import deadline_table, errors, table, target, write_csv
 
 INTRODUCTION = """\
 Success with its 95% interval (Wilson); runtime and denoising steps to the first solution: median and quartiles over
@@ -145,25 +145,14 @@ def _is_told(figure: Figure, name: str) -> bool:
     return figure.timed or not is_time(name)
 
 
-def write_reproduction(
-    folder: str | os.PathLike[str], figure: Figure, groups: Sequence[Group], *, trials: bool = True
-) -> list[Path]:
-    """Write ``NAME.csv``, ``NAME.md`` and ``NAME.png`` for the figure, and its trials as ``trials.csv`` and as Parquet.
-
-    Args:
-        folder: Output folder.
-        figure: The figure.
-        groups: Result of :func:`~d4orm_planners.reproduction.figure.reproduce` for it.
-        trials: Whether to write those too; ``trials.parquet`` only where pyarrow is installed.
-
-    Returns:
-        The paths.
+def write_figure(folder: Path, figure: Figure, groups: Sequence[Group]) -> list[Path]:
+    """Write ``NAME.csv``, ``NAME.md`` and ``NAME.png`` for the figure into a folder, and return their paths.
 
     Raises:
         OSError: If the folder does not exist or cannot be written to.
     """
     rows = [measured(group) for group in groups]
-    paths = [Path(folder, f"{figure.name}.{kind}") for kind in ("csv", "md", "png")]
+    paths = [folder / f"{figure.name}.{kind}" for kind in ("csv", "md", "png")]
     said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
     columns = [{name: value for name, value in vars(row).items() if _is_told(figure, name)} for row in rows]
     write_csv(paths[0], [{**shown, **beside} for shown, beside in zip(columns, said)])
@@ -171,11 +160,4 @@ def write_reproduction(
         temporary.write_text(markdown(figure, groups), encoding="utf-8")
     with target(paths[2]) as temporary:
         draw(temporary, figure, groups, rows)
-    if not trials:
-        return paths
-    each = [trial for group in groups for trial in group.trials]
-    paths.append(Path(folder, "trials.csv"))
-    write_csv(paths[-1], [vars(trial) for trial in each])
-    if write_parquet(Path(folder, "trials.parquet"), each):
-        paths.append(Path(folder, "trials.parquet"))
     return paths

@@ -7,8 +7,9 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
+from examples.studies.paper.figure import Figure, Section
+
 from d4orm_planners.d_d4orm.selection import SELECTIONS
-from d4orm_planners.reproduction.figure import Figure, Section
 
 PAPER: Mapping[str, object] = {"preset": "paper"}
 C2F: dict[str, object] = {"policy": "d4orm-c2f", "refine": "sync"}
@@ -306,14 +307,3 @@ FIGURES: Mapping[str, Figure] = MappingProxyType({
     )
 })  # fmt: skip
 """Every figure by its name."""
-
-
-def find_figure(name: str) -> Figure:
-    """A figure by name.
-
-    Raises:
-        ValueError: For an unknown name.
-    """
-    if name not in FIGURES:
-        raise ValueError(f"figure {name!r} is unknown; choose one of {', '.join(FIGURES)}")
-    return FIGURES[name]

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
+from examples.studies.paper.figure import TIMES, Figure, Group
 
 from d4orm_planners.evaluation.comparison import steps_to_solution
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import Compared
-from d4orm_planners.reproduction.figure import TIMES, Figure, Group
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,44 @@
+"""Modules that are imported when they are first used: those that take long, and those of optional extras."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+
+class LazyModule:
+    """A module that is imported when an attribute of it is asked for.
+
+    Args:
+        name: Its full name.
+        user: What needs it, for the message if it is missing; empty for a module that is always there.
+        extra: Extra of this package that has it.
+
+    Raises:
+        ImportError: If the library of an extra is missing, when an attribute is asked for.
+    """
+
+    def __init__(self, name: str, user: str = "", extra: str = "") -> None:
+        self._name, self._user, self._extra = name, user, extra
+
+    def __getattr__(self, attribute: str) -> Any:
+        if attribute.startswith("__"):  # asked by what looks through the names of a module
+            raise AttributeError(attribute)
+        return getattr(load(self), attribute)
+
+
+def load(module: LazyModule) -> ModuleType:
+    """Import a module now.
+
+    Raises:
+        ImportError: If the library of an extra is missing.
+    """
+    try:
+        return import_module(module._name)
+    except ImportError as error:
+        if not module._user:
+            raise
+        library = error.name or module._name.partition(".")[0]
+        remedy = f"install it with: pip install 'd4orm-env[{module._extra}]'"
+        raise ImportError(f"{module._user} needs {library}; {remedy}", name=error.name) from error

@@ -1,0 +1,45 @@
+"""``d4orm scenarios`` and ``d4orm planners``: lists of names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+from d4orm_env.scenarios import describe_scenario, list_scenarios
+from d4orm_planners.base.names import PLANNERS, POLICIES
+from d4orm_planners.base.planner_registry import default_settings, describe_planner, describe_policy
+from d4orm_planners.cli.outputs import print_table
+
+
+def scenarios() -> None:
+    """List the scenarios."""
+
+    def described(name: str) -> str:
+        try:
+            return describe_scenario(name)
+        except ValueError as error:  # an installed package offers it and cannot be imported
+            return str(error)
+
+    print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
+
+
+def planners(
+    name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
+) -> None:
+    """List the planners and policies, or what --set can set of one."""
+    if name is not None:
+        settings = default_settings(name).items()
+        print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
+        return
+    for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
+        print_table(title, [(name, _or_error(describe, name)) for name in table])
+
+
+def _or_error(describe: Callable[[str], str], name: str) -> str:
+    """A description, or why there is none: what another package brings may be broken."""
+    try:
+        return describe(name)
+    except ValueError as error:
+        return f"unusable: {error}"
