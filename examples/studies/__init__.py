@@ -1,1 +1,8 @@
-"""Measurements that the pages of the documentation rest on, a program each."""
+"""Studies: the numbers of the documentation, each a program that measures or reads what was measured."""
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+
+AS_IN_THE_PAPER: Mapping[str, float] = MappingProxyType({"goal_speed": math.inf})
+"""Scenarios' arguments in all studies: goals stop robots dead."""

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import save_table, study_trials, trials_parser
+from examples.studies import AS_IN_THE_PAPER
 from examples.studies.disturbance_study import (
     DISTURBANCES,
     FIRST_SEED,
@@ -71,6 +72,7 @@ def studies(scenarios: Sequence[str], disturbances: Sequence[str], seeds: int) -
                 for label in (ALL, MEANT_FOR[name], WITHOUT_ALL)
             },
             scenarios=scenarios, num_robots=ROBOTS, seeds=range(FIRST_SEED, FIRST_SEED + seeds),
+            scenario_settings=AS_IN_THE_PAPER,
             disturbances={name: [[] if name == NOTHING else [DISTURBANCES[name]]]},
         )
         for name in disturbances

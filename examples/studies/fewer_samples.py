@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import save_table, study_trials, trials_parser
+from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
 from d4orm_planners.evaluation.store import Trial
@@ -77,7 +78,11 @@ def study(teams: Sequence[int], seeds: int, own: dict[str, Any]) -> Study:
         for label, settings in SETTINGS.items()
     }
     return Study(
-        policies=policies, scenarios=("circle",), num_robots=teams, seeds=range(FIRST_SEED, FIRST_SEED + seeds)
+        policies=policies,
+        scenarios=("circle",),
+        num_robots=teams,
+        seeds=range(FIRST_SEED, FIRST_SEED + seeds),
+        scenario_settings=AS_IN_THE_PAPER,
     )
 
 

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import COLOURS, plt, save_figure, save_table, study_parser, study_rows
+from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
@@ -45,7 +46,7 @@ LEAST = {"team": 2, "group": 2 * GROUP, "robot": 1, MORE: 2}
 
 def crossing(num_robots: int) -> Problem:
     """Robots on a circle of 5 m, small enough that 64 of them stand on it without touching."""
-    return make_problem("circle", num_robots=num_robots, diameter=5.0, radius=0.02, margin=0.01)
+    return make_problem("circle", num_robots=num_robots, diameter=5.0, radius=0.02, margin=0.01, **AS_IN_THE_PAPER)
 
 
 def robots_that_share(credit: str, num_robots: int) -> int:

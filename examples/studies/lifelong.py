@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import count, save_gif, save_table, study_parser, study_rows
+from examples.studies import AS_IN_THE_PAPER
 from numpy.typing import NDArray
 
 from d4orm_env import Problem, make_problem, navigation_v0
@@ -150,7 +151,7 @@ def main() -> None:
     def measure() -> list[dict[str, Any]]:
         drives: list[dict[str, Any]] = []
         for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-            problem = make_problem(arguments.scenario, num_robots=num_robots, seed=seed)
+            problem = make_problem(arguments.scenario, num_robots=num_robots, seed=seed, **AS_IN_THE_PAPER)
             row, frames = drive(problem, seed, minutes, 0.0 if drives else film)
             drives.append({"scenario": arguments.scenario, "seed": seed, **row})
             if seed == arguments.seed:

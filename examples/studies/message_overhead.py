@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import argument_parser, count, require, save_table
+from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -52,7 +53,7 @@ def zenoh_pair() -> tuple[ZenohTransport, ZenohTransport]:
 
 def measure(robots: int, ends: tuple[Transport, Transport], repetitions: int) -> dict[str, float]:
     """Bytes of a message, and the medians of what is done with it [ms]."""
-    problem = make_problem("circle", num_robots=robots)
+    problem = make_problem("circle", num_robots=robots, **AS_IN_THE_PAPER)
     plan = make_planner("d4orm", engine="cpu").solve(problem, seed=0, max_iterations=1)
     message = Message(0, 1, plan.controls, plan.metrics["reward"], plan.solved)
     data, engine = encode(message, problem), get_sampling_engine("cpu")

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import plt, require, save_figure, save_table, study_parser, study_rows
+from examples.studies import AS_IN_THE_PAPER
 
 require("ipopt", "casadi")
 from d4orm_env import Problem, World, make_problem, verify
@@ -47,7 +48,7 @@ CLASSES: dict[Signature, tuple[str, str]] = {
 
 def crossing(radius: float) -> Problem:
     """Robot 0 goes from right to left and robot 1 from left to right, with a circle at the origin in their way."""
-    return make_problem("circle", num_robots=2).replace(world=World(2, circles=[[0, 0, radius]]))
+    return make_problem("circle", num_robots=2, **AS_IN_THE_PAPER).replace(world=World(2, circles=[[0, 0, radius]]))
 
 
 def winding(path: np.ndarray) -> float:

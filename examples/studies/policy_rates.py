@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from examples.outputs import require, save_table, study_parser, study_rows
+from examples.studies import AS_IN_THE_PAPER
 
 require("rl", "stable_baselines3")
 from d4orm_planners.evaluation.summary import wilson_interval
@@ -88,7 +89,7 @@ def measure(files: Sequence[str], seeds: int, observing: Sequence[int]) -> Rows:
             for observed in observing if case.num_robots > min(observing) else observing[:1]:
                 worlds = RobotVecEnv(
                     seeds, case.num_robots, case.scenario, seed=FIRST_SEED, model=model, observed_robots=observed,
-                    shortest_paths=bool(network.header.shortest_paths), **case.own,
+                    shortest_paths=bool(network.header.shortest_paths), **AS_IN_THE_PAPER, **case.own,
                 )  # fmt: skip
                 ends = run_worlds(network, worlds, FIRST_SEED)
                 worlds.close()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import COLOURS, count, plt, save_figure, save_table, study_parser, study_rows
+from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -45,7 +46,8 @@ def measure(sizes: Sequence[int], seeds: int, time_limit: float) -> list[dict[st
     rows = []
     for robots in sizes:
         for seed in range(seeds):
-            problem = make_problem("random", num_robots=robots, seed=seed, size=(robots * AREA) ** 0.5)
+            size = (robots * AREA) ** 0.5
+            problem = make_problem("random", num_robots=robots, seed=seed, size=size, **AS_IN_THE_PAPER)
             plan = planner.solve(problem, seed=seed, time_limit=time_limit)
             rows.append(
                 {"robots": robots, "seed": seed, "solved": plan.solved, "iterations": plan.iterations,

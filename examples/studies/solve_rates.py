@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from examples.outputs import save_table, study_parser, study_rows
+from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, verify
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
@@ -117,8 +118,8 @@ def instance(scenario: str, settings: Mapping[str, Any], seed: int) -> Problem:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "cells.map"
             path.write_text("\n".join(["type octile", "height 32", "width 32", "map", *rows, ""]))
-            return make_problem(scenario, **settings, map=path, seed=seed)
-    problem = make_problem(scenario, **settings, seed=seed)
+            return make_problem(scenario, **settings, map=path, seed=seed, **AS_IN_THE_PAPER)
+    problem = make_problem(scenario, **settings, seed=seed, **AS_IN_THE_PAPER)
     if not scenario.startswith("amswarm"):
         return problem
     start = problem.start.copy()
