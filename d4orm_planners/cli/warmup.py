@@ -84,7 +84,7 @@ def compile_for_planning(
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     # What ends it, as Ctrl-C, ends this process too, which says so.
     return subprocess.Popen(
-        [sys.executable, "-c", f"from {__name__} import find_ways, roll_out_once, sample_once; {call}"],
+        [sys.executable, "-c", f"from {__name__} import find_paths, roll_out_once, sample_once; {call}"],
         stderr=subprocess.DEVNULL,
     )
 
@@ -133,7 +133,7 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_ways()")
+    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths()")
     sample_once((TEAMS[0], TEAMS[-1]))
     for models in TEAMS[1:]:
         roll_out_once(models)
@@ -218,7 +218,7 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     from d4orm_planners import engine as sampling_engine
     from d4orm_planners.engine.score import score_kernel
     from d4orm_planners.mapf.beam_search import search_kernel
-    from d4orm_planners.tracking.straight_drives import drive_kernel
+    from d4orm_planners.tracking.straight_drives import straight_kernel
 
     packages = (engine, paths, sampling_engine, tracking, mapf, d4orm_c2f)
     modules = [import_module(f"{package.__name__}.{module.name}") for package in packages
@@ -229,7 +229,7 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
         *found.values(),
         *worlds,
         *map(score_kernel, TEAMS),
-        *map(drive_kernel, COMMON),
+        *map(straight_kernel, COMMON),
     ]
     kernels += map(search_kernel, COMMON)
     return [kernel for kernel in kernels if isinstance(kernel, Dispatcher) and kernel.stats.cache_path is not None]

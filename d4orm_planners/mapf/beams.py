@@ -8,51 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_index import BLOCK
-from d4orm_planners.mapf.beam_search import BeamRules, Moves, Queries, search_kernel
+from d4orm_planners.mapf.beam_search import BeamRules, Queries, search_kernel
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives, Moves
 from d4orm_planners.tracking.steering import Rollouts, by_model
-
-
-@dataclass(frozen=True)
-class MotionPrimitives:
-    """Moves of robots that look for a path.
-
-    Attributes:
-        angles: By which a robot turns off from the path to its goal [degrees]; in space up and down as well.
-        paces: Shares of its speed with which it heads for its goal: waiting has no direction.
-        beside: Goal radii beside its goal to which it may head too: one that docks there keeps clear of a neighbour.
-        on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
-    """
-
-    angles: tuple[float, ...]
-    paces: tuple[float, ...]
-    beside: float = 0.8
-    on_the_spot: float = 0.001
-
-    def moves(self, dimension: int, *, has_heading: bool) -> Moves:
-        """The same for the search."""
-        angle = np.radians(np.array(self.angles))
-        # To the left and to the right; in space upwards and downwards too.
-        across = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[: 2 * (dimension - 1)]
-        sides = portable.sin(angle)[:, None, None] * across
-        ahead = np.broadcast_to(portable.cos(angle)[:, None, None], (*sides.shape[:2], 1))
-        turned = np.concatenate([ahead, sides], axis=2).reshape(-1, 3)
-        home = np.zeros((1, 3))
-        beside = np.column_stack([np.zeros(len(across)), self.beside * across])
-        parts = [(home, True, pace) for pace in self.paces] + [(beside, True, 1.0), (turned, False, 1.0)]
-        if has_heading:
-            parts += [(home, True, self.on_the_spot), (turned, False, self.on_the_spot)]
-        sizes = [len(turns) for turns, _, _ in parts]
-        return Moves(
-            np.concatenate([turns for turns, _, _ in parts]).astype(np.float32),
-            np.repeat([homewards for _, homewards, _ in parts], sizes),
-            np.repeat([pace for _, _, pace in parts], sizes).astype(np.float32),
-        )
 
 
 @dataclass(frozen=True, eq=False)

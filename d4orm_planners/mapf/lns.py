@@ -16,7 +16,8 @@ from d4orm_env.core.portable import log
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_index import BLOCK
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
+from d4orm_planners.mapf.beams import OtherAgents, find_paths
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import straight_drives
 
 

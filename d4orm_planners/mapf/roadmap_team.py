@@ -20,7 +20,7 @@ from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path, straighten, touches
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.mapf.safe_intervals import Others
-from d4orm_planners.tracking.path_drives import drive_along
+from d4orm_planners.tracking.path_drives import drive_routes
 from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
@@ -86,7 +86,7 @@ def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> TeamRoll
     routes = join_routes(
         problem, make_routes(problem, stops, range(problem.num_robots), FIRST_CUT * problem.team.largest_radius)
     )
-    return TeamRollout(*drive_along(problem, routes, OVERTIME * problem.horizon))
+    return TeamRollout(*drive_routes(problem, routes, OVERTIME * problem.horizon))
 
 
 class Replanning:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from d4orm_planners.tracking.routes import Routes
     from d4orm_planners.tracking.timed_path import Timed
 
+Place: TypeAlias = tuple[float, float, float]
+"""A position in space, in float64 [m]."""
 Length: TypeAlias = Callable[[Row], np.float32]
 Steering: TypeAlias = Callable[[Row, Row, np.float32, np.float32, bool, Row, TimeStep], Row]
 Turning: TypeAlias = Callable[[Row, Row, Row, np.float32, bool, Row], tuple[Row, np.float32]]
@@ -57,14 +59,14 @@ def lookaheads(problem: Problem) -> Floats:
 
 
 @compiled
-def square_to(points: Floats, i: int, place: Floats) -> float:
+def square_to(points: Floats, i: int, place: Place) -> float:
     """Squared distance of a point from a place."""
     dx, dy, dz = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
     return dx * dx + dy * dy + dz * dz
 
 
 @compiled
-def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats, size: float) -> int:
+def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Place, size: float) -> int:
     """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached.
 
     ``size`` is the radius of the largest robot [m].
@@ -88,8 +90,8 @@ def point_ahead(
     at: int,
     last: int,
     stop: float,
-    lookahead: tuple[float, float],
-    place: Floats,
+    lookahead: tuple[float, float | np.float32],
+    place: Place,
     size: float,
 ) -> int:
     """The point that a robot at point ``at`` heads for.
@@ -104,7 +106,7 @@ def point_ahead(
         last: The last point that it may head for.
         stop: Length of the route from which on it heads for no further point [m].
         lookahead: Its least look-ahead [m], and the time step [s].
-        place: ``(3,)`` where it really is [m].
+        place: Where it really is [m].
         size: The radius of the largest robot [m].
     """
     target, slowest, reached = min(at + 1, last), paces[at], REACHED * size
@@ -124,17 +126,31 @@ def point_ahead(
     return target
 
 
+@compiled
+def _in_plane(state: Row) -> Place:
+    return np.float64(state[0]), np.float64(state[1]), 0.0
+
+
+@compiled
+def _in_space(state: Row) -> Place:
+    return np.float64(state[0]), np.float64(state[1]), np.float64(state[2])
+
+
+PLACE_OF = {2: _in_plane, 3: _in_space}
+"""Compiled place of a robot in a state, by dimension."""
+
+
 @cache
 def steering(name: str) -> Steering:
-    """Compiled control of a robot of the model with this name towards a target.
+    """Compiled velocity of a robot of the model with this name towards a target.
 
-    ``(state, target, room, pace, backs_up, limits, h) -> control`` drives as fast as ``pace`` allows, and so as to be
-    able to stop within ``room``. ``backs_up`` is of those that drive in order to turn.
+    ``(state, target, room, pace, backs_up, limits, h) -> velocity`` is as fast as ``pace`` allows, and such that it can
+    stop within ``room``. ``backs_up`` is of those that drive in order to turn.
     """
     robot = MODELS[name]
-    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
+    approach = inlined(robot.functions.approach)
     scaled, length, between = _vectors(robot.dimension)
-    limit_control, turned = inlined(robot.functions.limit_control), _turning(robot, length)
+    turned = _turning(robot, length)
 
     @inlined
     def steer(
@@ -151,7 +167,7 @@ def steering(name: str) -> Steering:
         if speed > pace:
             factor = pace / speed
             wanted = scaled(between(wanted, wanted), wanted, factor)
-        return limit_control(track(state, wanted, limits, h, OPS), limits, OPS)
+        return wanted
 
     return steer
 

@@ -19,8 +19,9 @@ from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
 from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
+from d4orm_planners.mapf.beams import OtherAgents, find_paths
 from d4orm_planners.mapf.lns import improve_paths
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import straight_drives
 
 STRAIGHT, STRICT = MotionPrimitives((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32, 1e6, 0.1)

@@ -128,9 +128,9 @@ def compile_mmd(problem: Problem) -> None:
     from d4orm_planners.baselines.mmd.guiding import guide
     from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
     from d4orm_planners.baselines.mmd.reverse_process import Denoiser
-    from d4orm_planners.baselines.mmd.tracking import tracking_kernel
+    from d4orm_planners.baselines.mmd.tracking import motion_kernel
 
-    if guide.signatures and all(tracking_kernel(name).signatures for name in problem.team.models):
+    if guide.signatures and all(motion_kernel(name).signatures for name in problem.team.models):
         return
     config = MMDConfig(num_samples=2, num_steps=1, guide_from=1.0, guide_steps=1)
     for robot in {name: number for number, name in enumerate(problem.team.models)}.values():
