@@ -20,7 +20,7 @@ from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tile_layout import Row
-from d4orm_planners.tracking.pursuit import Place, lookaheads, point_ahead, point_reached, square_to, steering
+from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.routes import Routes
 from d4orm_planners.tracking.steering import by_model
 from d4orm_planners.tracking.tracker import tracker
@@ -64,11 +64,6 @@ RouteStep: TypeAlias = Kernel[[ProblemArrays, IntArray, Progress, BoolArray, Flo
 """A kernel of :func:`route_kernel`."""
 
 
-@inlined
-def _place(positions: Floats, k: Whole) -> Place:
-    return positions[k, 0], positions[k, 1], positions[k, 2]
-
-
 @cached_kernel(variant="direct", **OPTIONS)
 def direct(
     routes: Routes,
@@ -97,7 +92,7 @@ def direct(
     points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
-        i = point_reached(points, arcs, first + progress.at[k], last, _place(positions, k), size)
+        i = point_reached(points, arcs, first + progress.at[k], last, positions[k], size)
         progress.at[k] = (last if standing[k] else i) - first
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
@@ -105,7 +100,7 @@ def direct(
         while wait < end and progress.at[routes.wait_for[wait]] >= routes.wait_until[wait]:
             wait += 1
         progress.waits[k] = wait
-        i, here = first + progress.at[k], _place(positions, k)
+        i, here = first + progress.at[k], positions[k]
         limit = last if wait == end else max(first + routes.wait_at[wait] - 1, i)
         target = point_ahead(routes, paces, i, limit, np.inf, (sights[k], dt), here, size)
         progress.targets[k, 0], progress.targets[k, 1] = points[target, 0], points[target, 1]

@@ -20,14 +20,12 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.elementary import OPS, cosine, sine
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.tile_layout import SQUARED_NORM, Row
 
 if TYPE_CHECKING:
     from d4orm_planners.tracking.routes import Routes
     from d4orm_planners.tracking.timed_path import Timed
 
-Place: TypeAlias = tuple[float, float, float]
-"""A position in space, in float64 [m]."""
 Length: TypeAlias = Callable[[Row], np.float32]
 Steering: TypeAlias = Callable[[Row, Row, np.float32, np.float32, bool, Row, TimeStep], Row]
 Turning: TypeAlias = Callable[[Row, Row, Row, np.float32, bool, Row], tuple[Row, np.float32]]
@@ -59,14 +57,17 @@ def lookaheads(problem: Problem) -> Floats:
 
 
 @compiled
-def square_to(points: Floats, i: int, place: Place) -> float:
-    """Squared distance of a point from a place."""
-    dx, dy, dz = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
-    return dx * dx + dy * dy + dz * dz
+def square_to(points: Floats, i: int, place: Floats | Row) -> float:
+    """Squared distance of a point from a place, which may be the beginning of a state."""
+    square = 0.0
+    for axis in range(points.shape[1]):
+        gap = points[i, axis] - place[axis]
+        square += gap * gap
+    return square
 
 
 @compiled
-def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Place, size: float) -> int:
+def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats | Row, size: float) -> int:
     """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached.
 
     ``size`` is the radius of the largest robot [m].
@@ -91,7 +92,7 @@ def point_ahead(
     last: int,
     stop: float,
     lookahead: tuple[float, float | np.float32],
-    place: Place,
+    place: Floats | Row,
     size: float,
 ) -> int:
     """The point that a robot at point ``at`` heads for.
@@ -124,20 +125,6 @@ def point_ahead(
         target += 1
         slowest = min(slowest, paces[target])
     return target
-
-
-@compiled
-def _in_plane(state: Row) -> Place:
-    return np.float64(state[0]), np.float64(state[1]), 0.0
-
-
-@compiled
-def _in_space(state: Row) -> Place:
-    return np.float64(state[0]), np.float64(state[1]), np.float64(state[2])
-
-
-PLACE_OF = {2: _in_plane, 3: _in_space}
-"""Compiled place of a robot in a state, by dimension."""
 
 
 @cache
@@ -174,34 +161,29 @@ def steering(name: str) -> Steering:
 
 def _vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Length, Callable[[Row, Row], Row]]:
     """``origin + step * factor``, the length of a step, and the step from a state to a place."""
-    if dimension == 2:
+    squared_norm = SQUARED_NORM[dimension]
 
-        @inlined
-        def scaled(origin: Row, step: Row, factor: np.float32) -> Row:
-            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor)
+    @inlined
+    def length(step: Row) -> np.float32:
+        return np.sqrt(squared_norm(step))
 
-        @inlined
-        def length(step: Row) -> np.float32:
-            return np.sqrt(step[0] * step[0] + step[1] * step[1])
+    @inlined
+    def scaled_2(origin: Row, step: Row, factor: np.float32) -> Row:
+        return (origin[0] + step[0] * factor, origin[1] + step[1] * factor)
 
-        @inlined
-        def between(state: Row, target: Row) -> Row:
-            return (target[0] - state[0], target[1] - state[1])
-    else:
+    @inlined
+    def between_2(state: Row, target: Row) -> Row:
+        return (target[0] - state[0], target[1] - state[1])
 
-        @inlined
-        def scaled(origin: Row, step: Row, factor: np.float32) -> Row:
-            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor, origin[2] + step[2] * factor)
+    @inlined
+    def scaled_3(origin: Row, step: Row, factor: np.float32) -> Row:
+        return (origin[0] + step[0] * factor, origin[1] + step[1] * factor, origin[2] + step[2] * factor)
 
-        @inlined
-        def length(step: Row) -> np.float32:
-            return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    @inlined
+    def between_3(state: Row, target: Row) -> Row:
+        return (target[0] - state[0], target[1] - state[1], target[2] - state[2])
 
-        @inlined
-        def between(state: Row, target: Row) -> Row:
-            return (target[0] - state[0], target[1] - state[1], target[2] - state[2])
-
-    return scaled, length, between
+    return (scaled_2, length, between_2) if dimension == 2 else (scaled_3, length, between_3)
 
 
 def _turning(robot: Model, length: Length) -> Turning:

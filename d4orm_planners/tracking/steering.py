@@ -44,13 +44,7 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
         goals: ``(K, d)`` [m].
     """
     h = TimeStep(*problem.arrays.time_step)
-    return _model_by_model(
-        problem,
-        goals.shape[1],
-        lambda model, x, goal, limits: model.approach(x, goal, limits, h, NUMPY_OPS),
-        states,
-        goals,
-    )
+    return _by_rows(problem, goals.shape[1], (states, goals), lambda model, *rows: model.approach(*rows, h, NUMPY_OPS))
 
 
 def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
@@ -99,7 +93,7 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     def law(model: ModelFunctions, x: Columns, velocity: Columns, limits: Columns) -> Columns:
         return model.limit_control(model.track(x, velocity, limits, h, NUMPY_OPS), limits, NUMPY_OPS)
 
-    controls = _model_by_model(problem, problem.control_size, law, states, velocities)
+    controls = _by_rows(problem, problem.control_size, (states, velocities), law)
     # The norm may come out above the limit by a rounding error.
     limit = problem.team.control_limits
     return np.clip(controls, -limit, limit)
@@ -131,17 +125,13 @@ def present_velocities(problem: Problem, states: FloatArray, controls: FloatArra
         states: ``(K, n)``.
         controls: ``(K, m)`` executed last.
     """
-    return _model_by_model(
-        problem,
-        problem.dimension,
-        lambda model, x, u, limits: model.velocity(x, u, limits, NUMPY_OPS),
-        states,
-        controls,
+    return _by_rows(
+        problem, problem.dimension, (states, controls), lambda model, *rows: model.velocity(*rows, NUMPY_OPS)
     )
 
 
-def _model_by_model(problem: Problem, width: int, law: Callable[..., Columns], *rows: FloatArray) -> FloatArray:
-    """``(K, width)`` results of ``law(functions, *columns, limits)`` for rows ``(K, .)`` of all robots, zero-padded."""
+def _by_rows(problem: Problem, width: int, rows: tuple[FloatArray, ...], law: Callable[..., Columns]) -> FloatArray:
+    """``(K, width)`` results of ``law(functions, *rows, limits)`` for the rows of every robot, padded with zeros."""
     results = np.zeros((problem.num_robots, width), np.float32)
     for model, robots in by_model(problem):
         columns = (tuple(part[robots].T) for part in (*rows, problem.team.limits))
@@ -225,7 +215,7 @@ def drives(
     from d4orm_env.engine.threads import Threads, available_cores
     from d4orm_planners.tracking.straight_drives import DriveInputs, straight_kernel
 
-    switch = np.asarray(switch_times, np.int64)
+    switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
     num_steps, dimension = problem.horizon, problem.dimension
     points = np.empty((*switch.shape, 0, dimension), np.float32) if vias is None else np.asarray(vias, np.float32)
     u = np.zeros((*switch.shape, num_steps, problem.control_size), np.float32)
@@ -237,10 +227,7 @@ def drives(
     threads = Threads(available_cores())
     for model, robots in by_model(problem):
         kernel, index = straight_kernel(model.name), np.array(robots)
-        threads.over(
-            len(index),
-            lambda part: kernel(problem.arrays, inputs, index[part[0] : part[1]], u, x, arrived),  # noqa: B023
-        )
+        threads.over(len(index), lambda part: kernel(arrays, inputs, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
     return Rollouts(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
 
 

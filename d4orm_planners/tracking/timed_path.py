@@ -17,7 +17,7 @@ from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.tracking.path_drives import BRAKING, RESERVE, beyond_goal, paces_along
-from d4orm_planners.tracking.pursuit import PLACE_OF, lookaheads, point_ahead, point_reached, square_to, steering
+from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.routes import Corners, Route
 from d4orm_planners.tracking.tracker import tracker
 
@@ -31,7 +31,7 @@ class Timed(NamedTuple):
     """A route and its clock.
 
     Attributes:
-        points: ``(P, 3)`` float64 [m].
+        points: ``(P, d)`` float64 [m].
         targets: ``(P, d)`` the same in float32.
         arcs: ``(P,)`` float64 length of the route up to each [m].
         paces: ``(P,)`` float64 how fast each may be passed [m/s].
@@ -94,26 +94,26 @@ def timed_kernel(name: str) -> Kernel[[ProblemArrays, int, Timed, FloatArray, Fl
     arrival, ``T + 1`` for none.
     """
     model = MODELS[name]
-    steer, place_of, n, d = steering(name), PLACE_OF[model.dimension], model.state_size, model.dimension
+    steer, n, d = steering(name), model.state_size, model.dimension
 
     @inlined
     def by_clock(
         route: Timed, memory: tuple[int, int], step: int, x: Row, goal: Row, limits: Row, h: TimeStep
     ) -> tuple[Row, tuple[int, int], bool]:
-        (at, corner), here, near = memory, place_of(x), NEAR * route.size
+        (at, corner), near = memory, NEAR * route.size
         last, last_corner = route.arcs.shape[0] - 1, route.corners.shape[0] - 1
-        at = point_reached(route.points, route.arcs, at, last, here, route.size)
+        at = point_reached(route.points, route.arcs, at, last, x, route.size)
         while corner < last_corner and route.arcs[at] >= route.corners[corner] - near:
             corner += 1
         stop = stop_before(route, step, at, corner, limits[0] * route.dt)
-        target = point_ahead(route, route.paces, at, last, stop, (route.lookahead, route.dt), here, route.size)
+        target = point_ahead(route, route.paces, at, last, stop, (route.lookahead, route.dt), x, route.size)
         if route.arcs[target] > stop + near:
             target = at
         room = RESERVE * max(stop - route.arcs[at], 0.0)
         if stop == route.corners[last_corner]:
             room += route.beyond
         elif room < SHORT * route.size:
-            room = np.sqrt(square_to(route.points, target, here))
+            room = np.sqrt(square_to(route.points, target, x))
         pace = pace_to(route, step, at, corner, stop, route.dt)
         aim = to_fixed_tuple(route.targets[target], d)
         return steer(x, aim, np.float32(room), pace, route.backs_up, limits, h), (at, corner), at == last
@@ -158,8 +158,9 @@ def drive_by_clock(
     moves = np.diff(route.points, axis=0)
     arcs = np.append(0.0, np.cumsum(np.sqrt(moves[:, 0] ** 2 + moves[:, 1] ** 2 + moves[:, 2] ** 2)))
     paces = paces_along(problem, robot, arcs, route.bends, HURRYING if hurrying else BRAKING)
+    points = np.ascontiguousarray(route.points[:, :d])
     timed = Timed(
-        route.points, np.ascontiguousarray(route.points[:, :d], np.float32), arcs, paces, route.bends, arcs[at],
+        points, points.astype(np.float32), arcs, paces, route.bends, arcs[at],
         departs, arrives, lookaheads(problem)[robot], np.float32(beyond_goal(problem)), problem.team.largest_radius,
         problem.arrays.time_step[0], backs_up,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tile_layout import Row
@@ -44,18 +44,6 @@ class TrackedMotions(NamedTuple):
     clearances: Floats
 
 
-@compiled
-def _catch_up(
-    points: Floats, times: Floats, i: int, time: np.float32, dt: np.float32, place: Row, wanted: FloatArray
-) -> None:
-    """Fill ``wanted`` ``(d,)`` with the velocity from a place to where the motion is a step later [m/s]."""
-    for axis in range(wanted.shape[0]):
-        pace = (points[i + 1, axis] - points[i, axis]) / (times[i + 1] - times[i])
-        error = points[i, axis] + (time - times[i]) * pace - place[axis]
-        # By the next step the motion has gone on as well.
-        wanted[axis] = pace + GAIN * (error - pace * dt)
-
-
 @cache
 def motion_kernel(
     name: str,
@@ -80,7 +68,11 @@ def motion_kernel(
             i += 1
         if i == last:
             return approach(x, goal, limits, h, OPS), i, True
-        _catch_up(points, times, i, time, dt, x, wanted)
+        for axis in range(d):
+            pace = (points[i + 1, axis] - points[i, axis]) / (times[i + 1] - times[i])
+            error = points[i, axis] + (time - times[i]) * pace - x[axis]
+            # By the next step the motion has gone on as well.
+            wanted[axis] = pace + GAIN * (error - pace * dt)
         return to_fixed_tuple(wanted, d), i, True
 
     drive = tracker(model, by_motion)
