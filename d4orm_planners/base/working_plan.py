@@ -117,7 +117,7 @@ class WorkingPlan:
         """``(R, V)`` faults of paths, plus the share of the horizon that they take, less than one; and the step of the
         first fault.
         """
-        from d4orm_planners.engine.path_index import check_alone
+        from d4orm_planners.engine.path_checks import check_alone
 
         paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
         checked = paths[:, :, :: self._interval]

@@ -9,7 +9,7 @@ from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.conflict_groups import components
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.engine.path_index import BLOCK
+from d4orm_planners.engine.path_table import BLOCK
 from d4orm_planners.hybrid.settings import REROUTE_RULES
 from d4orm_planners.mapf.beam_search import BeamRules
 from d4orm_planners.mapf.beams import OtherAgents, find_paths

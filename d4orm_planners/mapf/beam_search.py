@@ -24,7 +24,8 @@ from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tile_layout import Row
-from d4orm_planners.engine.path_index import BLOCK, PathTable, count_near, is_unsure, steps_of
+from d4orm_planners.engine.path_checks import is_unsure
+from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
 from d4orm_planners.mapf.motion_primitives import Moves, aiming
 from d4orm_planners.tracking.tracker import tracker, velocity_step
 

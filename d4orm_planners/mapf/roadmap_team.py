@@ -16,6 +16,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.paths.wavefront import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
+from d4orm_planners.mapf.neighbourhoods import draw_neighbourhood
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path, straighten, touches
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
@@ -92,8 +93,6 @@ def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> TeamRoll
 class Replanning:
     """Better paths for some robots of a team at a time, planned one after another around all others as they drive.
 
-    As in MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021).
-
     Args:
         problem: The team.
         roadmap: The roadmap of its world.
@@ -128,12 +127,8 @@ class Replanning:
         late = driven.arrivals > self.problem.horizon
         if late.any() and random.random() < 0.5:
             delay[~late] = 0.0
-        robot = int(random.choice(len(delay), p=delay / delay.sum()))
-        places = driven.places[: int(driven.arrivals[robot]) + 1]
-        gaps = np.sqrt(((places - places[:, robot, None]) ** 2).sum(axis=2)).min(axis=0)
-        gaps += NEARNESS * self.size * random.random(len(delay))
-        gaps[robot] = -1.0
-        return random.permutation(np.argsort(gaps)[: random.integers(1, min(len(delay), most) + 1)])
+        sizes = (1, min(len(delay), most))
+        return draw_neighbourhood(random, delay, driven.places, driven.arrivals, NEARNESS * self.size, sizes)
 
     def better(
         self, driven: TeamRollout, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]
