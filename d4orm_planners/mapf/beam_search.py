@@ -50,6 +50,20 @@ class BeamRules(NamedTuple):
     dedup_distance: float
 
 
+class OtherAgents(NamedTuple):
+    """Agents that robots which look for a path avoid, other than the team as it drives at present.
+
+    Attributes:
+        without: ``(R, N)`` numbers of robots that each does not mind, its own among them.
+        beside: ``(R, M, H+1, d)`` paths that it minds as well [m].
+        radius: ``(R, M)`` radii of the agents on them [m].
+    """
+
+    without: NDArray[np.int64]
+    beside: FloatArray
+    radius: NDArray[np.float64]
+
+
 class Queries(NamedTuple):
     """Robots that look for paths.
 
@@ -58,18 +72,14 @@ class Queries(NamedTuple):
         blocks: ``(R,)`` the block at whose beginning their new paths begin,
         states: ``(R, n)`` and in which state.
         limits: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost.
-        without: ``(R, N)`` numbers of robots that they do not mind, their own among them.
-        beside: ``(R, M, H+1, d)`` paths that they mind as well [m],
-        radius: ``(R, M)`` and the radii of the agents on them [m].
+        others: Agents that they mind, or do not mind.
     """
 
     robots: NDArray[np.int64]
     blocks: NDArray[np.int64]
     states: FloatArray
     limits: NDArray[np.float64]
-    without: NDArray[np.int64]
-    beside: FloatArray
-    radius: NDArray[np.float64]
+    others: OtherAgents
 
 
 class _Beam(NamedTuple):
@@ -127,17 +137,17 @@ def _keep(new: _Beam, node: Whole, kept: _Beam, number: Whole) -> None:
 
 @compiled
 def _count_beside(
-    table: PathTable, robot: Whole, queries: Queries, r: int, path: FloatArray, first: Whole, last: Whole
+    table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, first: Whole, last: Whole
 ) -> int:
     """Count the further paths that a path meets from one step to another; at its end it is at rest."""
     count, end = 0, path.shape[0] - 1
-    for other in range(queries.beside.shape[1]):
-        reach = table.radius[robot] + queries.radius[r, other] + table.margin
+    for other in range(others.beside.shape[1]):
+        reach = table.radius[robot] + others.radius[r, other] + table.margin
         for t in range(first, last):
             gap2 = 0.0
             for axis in range(path.shape[1]):
                 place = np.float64(path[min(t - first, end), axis])
-                gap = place - np.float64(queries.beside[r, other, t, axis])
+                gap = place - np.float64(others.beside[r, other, t, axis])
                 gap2 += gap * gap
             if gap2 <= reach * reach:
                 count += 1
@@ -202,7 +212,7 @@ def search_kernel(name: str) -> Search:
                 beam.states[0, i] = queries.states[r, i]
             beam.faults[0], numbers[0], size, num_kept = 0.0, -1, 1, 0
             best, best_number, best_move = queries.limits[r], -1, -1
-            without = queries.without[r]
+            without = queries.others.without[r]
             for block in range(begin, num_blocks):
                 first, last = steps_of(table, block)
                 count = 0
@@ -232,14 +242,14 @@ def search_kernel(name: str) -> Search:
                         if rules.contact * faults + cost >= best:
                             continue
                         faults += count_near(table, robot, without, path, first, block)
-                        faults += _count_beside(table, robot, queries, r, path, first, last)
+                        faults += _count_beside(table, robot, queries.others, r, path, first, last)
                         if at_goal:
                             # It stays there: whoever comes by later counts too.
                             for axis in range(d):
                                 path[:, axis] = state[axis]
                             for later in range(block + 1, last_busy + 1):
                                 faults += count_near(table, robot, without, path, steps_of(table, later)[0], later)
-                            faults += _count_beside(table, robot, queries, r, path, last, table.places.shape[0])
+                            faults += _count_beside(table, robot, queries.others, r, path, last, len(table.places))
                             if rules.contact * faults + cost < best:
                                 best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
                             continue

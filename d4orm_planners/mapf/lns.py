@@ -14,8 +14,8 @@ from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.portable import log
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
-from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import OtherAgents, find_paths
+from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
+from d4orm_planners.mapf.beams import find_paths
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.mapf.neighbourhoods import draw_neighbourhood
 from d4orm_planners.tracking.steering import straight_drives
@@ -134,13 +134,13 @@ class _Neighbourhoods:
             if left.shape[1]:
                 limits = np.minimum(limits, self.arrival[robots] + RULES.give)
             before = groups[found, :member]
-            other_agents = OtherAgents(
+            others = OtherAgents(
                 groups[found],
                 np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
                 np.asarray(self.problem.team.radius, np.float64)[before],
             )
             rules = BeamRules(RULES.width, RULES.contact, RULES.dedup_distance * self.problem.team.largest_radius)
-            paths = find_paths(self.team, robots, blocks[found], primitives, rules, limits, other_agents)
+            paths = find_paths(self.team, robots, blocks[found], primitives, rules, limits, others)
             controls[:, found, member], states[:, found, member] = paths.controls[:, :, 0], paths.states[:, :, 0]
             budget[found] -= self.costs(robots, paths.positions[:, :, 0])[0]
             found[found] = paths.arrived[:, 0]

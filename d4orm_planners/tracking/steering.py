@@ -213,21 +213,18 @@ def drives(
     """
     # Here, because importing numba takes long.
     from d4orm_env.engine.threads import Threads, available_cores
-    from d4orm_planners.tracking.straight_drives import DriveInputs, straight_kernel
+    from d4orm_planners.tracking.straight_drives import straight_kernel
 
-    switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
-    num_steps, dimension = problem.horizon, problem.dimension
+    switch, dimension = np.asarray(switch_times, np.int64), problem.dimension
     points = np.empty((*switch.shape, 0, dimension), np.float32) if vias is None else np.asarray(vias, np.float32)
-    u = np.zeros((*switch.shape, num_steps, problem.control_size), np.float32)
-    x = np.zeros((*switch.shape, num_steps + 1, problem.state_size), np.float32)
-    arrived = np.zeros(switch.shape, bool)
+    u, x = (np.repeat(rows.swapaxes(0, 1)[:, None], switch.shape[1], axis=1) for rows in (controls, states))
+    u, x, arrived = u.astype(np.float32, copy=False), x.astype(np.float32, copy=False), np.zeros(switch.shape, bool)
     near = NEAR_VIA * problem.team.largest_radius
-    given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
-    inputs = DriveInputs(given_x, given_u, switch, np.ascontiguousarray(points), np.float32(near * near))
+    rest = switch, np.ascontiguousarray(points), np.float32(near * near), u, x, arrived
     threads = Threads(available_cores())
     for model, robots in by_model(problem):
         kernel, index = straight_kernel(model.name), np.array(robots)
-        threads.over(len(index), lambda part: kernel(arrays, inputs, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
+        threads.over(len(index), lambda part: kernel(problem.arrays, index[part[0] : part[1]], *rest))  # noqa: B023
     return Rollouts(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
 
 
