@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import FloatArray, IntArray, Ints
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS, inlined
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.engine.path_table import (
     BLOCK,
@@ -63,10 +63,10 @@ class PathIndex:
 
     def pairs(self) -> IntArray:
         """``(P, 2)`` pairs of robots ever within the margin of each other: the lower number first, ascending."""
-        num_blocks, num_robots = self.table.following.shape
+        num_robots = self.table.following.shape[1]
         parts: dict[int, IntArray] = {}
-        self._threads.over(num_blocks, lambda part: parts.update({int(part[0]): _pairs(self.table, part)}))
-        met = np.unique(np.concatenate(list(parts.values())))
+        self._threads.over(num_robots, lambda part: parts.update({int(part[0]): _pairs(self.table, part)}))
+        met = np.sort(np.concatenate(list(parts.values())))
         return np.stack(np.divmod(met, num_robots), axis=1)
 
     def count_meetings(
@@ -107,27 +107,42 @@ def _move(table: PathTable, robots: IntArray, paths: FloatArray) -> None:
             link(table, block, robots[i])
 
 
+@inlined
+def _mark_near(
+    table: PathTable, robot: Whole, path: FloatArray, middle: tuple[float, float, float], spread: float, block: Whole,
+    met: BoolArray,
+) -> tuple[int, int]:  # fmt: skip
+    """Enter in ``met`` ``(K,)`` who is near in a block; return how many are new there and the first step of these."""
+    count, soonest = 0, table.places.shape[0]
+    low_i, high_i, low_j, high_j, low_k, high_k = cells_around(table, middle, spread)
+    for i in range(low_i, high_i + 1):
+        for j in range(low_j, high_j + 1):
+            for k in range(low_k, high_k + 1):
+                other = table.first[block, bucket_of(table, i, j, k)]
+                while other != NOBODY:
+                    if not met[other]:
+                        t = first_near(table, robot, path, 0, middle, spread, block, other)
+                        if t > 0:
+                            met[other], count, soonest = True, count + 1, min(soonest, t)
+                    other = table.following[block, other]
+    return count, soonest
+
+
 @cached_kernel(**OPTIONS)
-def _pairs(table: PathTable, block_range: IntArray) -> IntArray:
-    """Pairs that are near in a range of blocks, each as one number; some of them more than once."""
-    num_robots = table.places.shape[1]
-    found, count = np.empty(64, np.int64), 0
-    for block in range(block_range[0], block_range[1]):
-        for robot in range(num_robots):
-            path, spread = table.places[:, robot], table.spread[block, robot]
+def _pairs(table: PathTable, robot_range: IntArray) -> IntArray:
+    """Pairs in which a robot of a range has the lower number and they are ever near, each as one number."""
+    num_blocks, num_robots = table.following.shape
+    found, count, met = np.empty(64, np.int64), 0, np.empty(num_robots, np.bool_)
+    for robot in range(robot_range[0], robot_range[1]):
+        met[: robot + 1], met[robot + 1 :] = True, False
+        for block in range(num_blocks):
             x, y, z = table.middle[block, robot]
-            low_i, high_i, low_j, high_j, low_k, high_k = cells_around(table, (x, y, z), spread)
-            for i in range(low_i, high_i + 1):
-                for j in range(low_j, high_j + 1):
-                    for k in range(low_k, high_k + 1):
-                        other = table.first[block, bucket_of(table, i, j, k)]
-                        while other != NOBODY:
-                            if other > robot and first_near(table, robot, path, 0, (x, y, z), spread, block, other) > 0:
-                                if count == found.shape[0]:
-                                    found = np.concatenate((found, np.empty(count, np.int64)))
-                                found[count] = robot * num_robots + other
-                                count += 1
-                            other = table.following[block, other]
+            _mark_near(table, robot, table.places[:, robot], (x, y, z), table.spread[block, robot], block, met)
+        for other in range(robot + 1, num_robots):
+            if met[other]:
+                if count == found.shape[0]:
+                    found = np.concatenate((found, np.empty(count, np.int64)))
+                found[count], count = robot * num_robots + other, count + 1
     return found[:count]
 
 
@@ -146,27 +161,14 @@ def _count_meetings(
     met = np.empty((num_paths, table.places.shape[1]), np.bool_)
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
-        met[:] = False
-        met[:, robot] = True
+        met[:], met[:, robot] = False, True
         counts[r], when[r] = 0, paths.shape[2]
         # Time in the outer loop: paths of one robot look into the same cells.
         for block in range(min(num_blocks, until[r] // BLOCK + 1)):
             first, last = steps_of(table, block)
             for v in range(num_paths):
-                path = paths[r, v]
-                middle, spread = enclose(path, table.places.shape[2], first, last)
+                middle, spread = enclose(paths[r, v], table.places.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
                     continue  # Nothing is other than it was in the block before.
-                low_i, high_i, low_j, high_j, low_k, high_k = cells_around(table, middle, spread)
-                for i in range(low_i, high_i + 1):
-                    for j in range(low_j, high_j + 1):
-                        for k in range(low_k, high_k + 1):
-                            other = table.first[block, bucket_of(table, i, j, k)]
-                            while other != NOBODY:
-                                if not met[v, other]:
-                                    t = first_near(table, robot, path, 0, middle, spread, block, other)
-                                    if t > 0:
-                                        met[v, other] = True
-                                        counts[r, v] += 1
-                                        when[r, v] = min(when[r, v], t)
-                                other = table.following[block, other]
+                count, soonest = _mark_near(table, robot, paths[r, v], middle, spread, block, met[v])
+                counts[r, v], when[r, v] = counts[r, v] + count, min(when[r, v], soonest)
