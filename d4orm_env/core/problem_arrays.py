@@ -50,11 +50,6 @@ class ProblemArrays(NamedTuple):
     docks: np.bool_
     collision_penalty: np.float32
 
-    @property
-    def docking(self) -> FloatArray:
-        """``(K, 2)`` squares of the goal radius and of the goal speeds."""
-        return np.stack(np.broadcast_arrays(self.squared_goal_radius, self.squared_goal_speed), axis=1)
-
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:
     """``(K,)`` one over the start distance; a robot that starts at its goal counts from the goal radius."""

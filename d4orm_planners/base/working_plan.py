@@ -17,8 +17,9 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.tracking.steering import Rollouts
 
 if TYPE_CHECKING:
-    from d4orm_planners.engine import path_index
+    from d4orm_planners.engine import path_checks, path_index
 else:
+    path_checks = LazyModule("d4orm_planners.engine.path_checks")
     path_index = LazyModule("d4orm_planners.engine.path_index")
 
 MISSING = 5
@@ -127,9 +128,9 @@ class WorkingPlan:
         paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
         checked = paths[:, :, :: self._interval]
         met, meeting = self._checked.count_meetings(robots, checked)
-        touching, moves, unsure = path_index.check_alone(self.problem.arrays, robots, paths)
+        touching, moves, unsure = path_checks.check_alone(self.problem.arrays, robots, paths)
         if self._interval > 1:
-            touching = path_index.check_alone(self.problem.arrays, robots, checked)[0] * self._interval
+            touching = path_checks.check_alone(self.problem.arrays, robots, checked)[0] * self._interval
             # What there is none of comes after the last step.
             meeting = np.minimum(meeting * self._interval, horizon + 1)
         faults = met + (unsure <= horizon) + MISSING * (~arrived | (touching <= horizon))

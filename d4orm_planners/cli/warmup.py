@@ -43,7 +43,7 @@ from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.weights import SoftmaxWeights
-from d4orm_planners.tracking.straight_drives import drive_kernel
+from d4orm_planners.tracking.straight_drives import straight_kernel
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
         *found.values(),
         *worlds,
         *map(score_kernel, TEAMS),
-        *map(drive_kernel, COMMON),
+        *map(straight_kernel, COMMON),
     ]
     kernels += map(search_kernel, COMMON)
     return [kernel for kernel in kernels if isinstance(kernel, Dispatcher) and kernel.stats.cache_path is not None]

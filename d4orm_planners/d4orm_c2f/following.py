@@ -8,7 +8,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.tracking.steering import track_velocities
+from d4orm_planners.tracking.steering import track_team
 
 STUCK_WITHIN, STUCK_AFTER = 3, 25
 """Progress without which a robot is stuck: so many waypoints in so many time steps."""
@@ -69,13 +69,13 @@ def keep_time(
     Returns:
         ``(horizon, K, m)``.
     """
-    every, last, states = np.arange(len(indices)), len(path) - 1, joint.states
-    arrays, nobody = problem.with_state(joint.states, joint.goals).arrays, np.zeros(problem.num_robots, bool)
-    controls = np.empty((horizon, problem.num_robots, problem.control_size), np.float32)
-    for t in range(horizon):
-        now = path[np.minimum(indices + t, last), every]
-        after = path[np.minimum(indices + t + 1, last), every]
-        velocities = (after - now) / problem.dt + CATCHING_UP * (now - states[:, : path.shape[2]])
-        controls[t] = track_velocities(problem, states, velocities.astype(np.float32))
-        states = engine.step(arrays, states, nobody, controls[t]).states
+    every, last, d = np.arange(len(indices)), len(path) - 1, path.shape[2]
+
+    def wanted(t: int, states: FloatArray) -> FloatArray:
+        now, after = (path[np.minimum(indices + step, last), every] for step in (t, t + 1))
+        velocities: FloatArray = (after - now) / problem.dt + CATCHING_UP * (now - states[:, :d])
+        return velocities
+
+    controls = track_team(problem.with_state(joint.states, joint.goals), engine, horizon, wanted, each_alone=True)
+    assert controls is not None
     return controls

@@ -9,10 +9,11 @@ from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.conflict_groups import components
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.engine.path_index import BLOCK
+from d4orm_planners.engine.path_table import BLOCK
 from d4orm_planners.hybrid.settings import REROUTE_RULES
-from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
+from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
+from d4orm_planners.mapf.beams import find_paths
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import drives, standing
 
 AWAY = np.float32(1e6)
@@ -73,8 +74,8 @@ def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitive
         beside[:, :, : REROUTE_RULES.standing * BLOCK + 1] = problem.start[second, : problem.dimension]
         paths = []
         for robot, other in ((first, second), (second, first)):
-            other_agents = OtherAgents(pair[None], beside, radius[[[other]]])
-            paths.append(find_paths(team, np.array([robot]), 0, primitives, rules, other_agents=other_agents))
+            others = OtherAgents(pair[None], beside, radius[[[other]]])
+            paths.append(find_paths(team, np.array([robot]), 0, primitives, rules, others=others))
             beside = np.ascontiguousarray(np.moveaxis(paths[-1].positions, 0, 2))
         controls = np.concatenate([path.controls[:, :, 0] for path in paths], axis=1)
         states = np.concatenate([path.states[:, :, 0] for path in paths], axis=1)

@@ -19,35 +19,21 @@ from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import SPEED, TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
-from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tile_layout import Row
-from d4orm_planners.engine.path_index import PathTable, count_near, is_unsure, steps_of
-
-_FAR = np.float32(10)
-"""Look-ahead of a robot that turns off, in seconds at full speed."""
+from d4orm_planners.engine.path_checks import is_unsure
+from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
+from d4orm_planners.mapf.motion_primitives import Moves, aiming
+from d4orm_planners.tracking.tracker import tracker, velocity_step
 
 _AHEAD = np.float32(0.5)
 """Distance ahead of a robot from which the rest of its path is measured [s]."""
 
 _TOUCH = 100.0
 """Robots that are met rather than an obstacle touched for a step."""
-
-
-class Moves(NamedTuple):
-    """The ``P`` moves of a robot in a block.
-
-    Attributes:
-        turns: ``(P, 3)`` directions, along that to the goal and two across.
-        homewards: ``(P,)`` whether it heads for the goal, or so many goal radii from there in the direction.
-        pace: ``(P,)`` share of the speed that it would have.
-    """
-
-    turns: FloatArray
-    homewards: BoolArray
-    pace: FloatArray
 
 
 class BeamRules(NamedTuple):
@@ -64,6 +50,20 @@ class BeamRules(NamedTuple):
     dedup_distance: float
 
 
+class OtherAgents(NamedTuple):
+    """Agents that robots which look for a path avoid, other than the team as it drives at present.
+
+    Attributes:
+        without: ``(R, N)`` numbers of robots that each does not mind, its own among them.
+        beside: ``(R, M, H+1, d)`` paths that it minds as well [m].
+        radius: ``(R, M)`` radii of the agents on them [m].
+    """
+
+    without: NDArray[np.int64]
+    beside: FloatArray
+    radius: NDArray[np.float64]
+
+
 class Queries(NamedTuple):
     """Robots that look for paths.
 
@@ -72,18 +72,14 @@ class Queries(NamedTuple):
         blocks: ``(R,)`` the block at whose beginning their new paths begin,
         states: ``(R, n)`` and in which state.
         limits: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost.
-        without: ``(R, N)`` numbers of robots that they do not mind, their own among them.
-        beside: ``(R, M, H+1, d)`` paths that they mind as well [m],
-        radius: ``(R, M)`` and the radii of the agents on them [m].
+        others: Agents that they mind, or do not mind.
     """
 
     robots: NDArray[np.int64]
     blocks: NDArray[np.int64]
     states: FloatArray
     limits: NDArray[np.float64]
-    without: NDArray[np.int64]
-    beside: FloatArray
-    radius: NDArray[np.float64]
+    others: OtherAgents
 
 
 class _Beam(NamedTuple):
@@ -115,53 +111,6 @@ def _make_beam(size: int, n: int, d: int) -> _Beam:
 
 
 @compiled
-def _frame(place: FloatArray, goal: FloatArray) -> Row:
-    """Unit vectors from a place to its goal, across in the plane, and upright to both, one after the other."""
-    x, y, z = goal[0] - place[0], goal[1] - place[1], ZERO
-    if goal.shape[0] == 3:
-        z = goal[2] - place[2]
-    length = np.sqrt(x * x + y * y + z * z)
-    if length > ZERO:
-        x, y, z = x / length, y / length, z / length
-    else:
-        x = ONE
-    flat = np.sqrt(x * x + y * y)
-    i, j = ZERO, ONE
-    if flat > ZERO:
-        i, j = -y / flat, x / flat
-    return x, y, z, i, j, -z * j, z * i, x * j - y * i
-
-
-@compiled
-def _turned_2(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
-    x, y, _, i, j, _, _, _ = frame
-    return place[0] + far * (turn[0] * x + turn[1] * i), place[1] + far * (turn[0] * y + turn[1] * j)
-
-
-@compiled
-def _turned_3(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
-    x, y, z, i, j, u, v, w = frame
-    return (
-        place[0] + far * (turn[0] * x + turn[1] * i + turn[2] * u),
-        place[1] + far * (turn[0] * y + turn[1] * j + turn[2] * v),
-        place[2] + far * (turn[0] * z + turn[2] * w),
-    )
-
-
-@compiled
-def _slowed_2(v: Row, pace: np.float32) -> Row:
-    return v[0] * pace, v[1] * pace
-
-
-@compiled
-def _slowed_3(v: Row, pace: np.float32) -> Row:
-    return v[0] * pace, v[1] * pace, v[2] * pace
-
-
-_TURNED, _SLOWED = {2: _turned_2, 3: _turned_3}, {2: _slowed_2, 3: _slowed_3}
-
-
-@compiled
 def _is_like_another(new: _Beam, node: Whole, kept: _Beam, size: int, dedup2: float) -> bool:
     """Check whether a path is about where one of those kept is, about as fast."""
     for other in range(size):
@@ -188,17 +137,17 @@ def _keep(new: _Beam, node: Whole, kept: _Beam, number: Whole) -> None:
 
 @compiled
 def _count_beside(
-    table: PathTable, robot: Whole, queries: Queries, r: int, path: FloatArray, first: Whole, last: Whole
+    table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, first: Whole, last: Whole
 ) -> int:
     """Count the further paths that a path meets from one step to another; at its end it is at rest."""
     count, end = 0, path.shape[0] - 1
-    for other in range(queries.beside.shape[1]):
-        reach = table.radius[robot] + queries.radius[r, other] + table.margin
+    for other in range(others.beside.shape[1]):
+        reach = table.radius[robot] + others.radius[r, other] + table.margin
         for t in range(first, last):
             gap2 = 0.0
             for axis in range(path.shape[1]):
                 place = np.float64(path[min(t - first, end), axis])
-                gap = place - np.float64(queries.beside[r, other, t, axis])
+                gap = place - np.float64(others.beside[r, other, t, axis])
                 gap2 += gap * gap
             if gap2 <= reach * reach:
                 count += 1
@@ -220,27 +169,24 @@ def search_kernel(name: str) -> Search:
     paths begin, and says in ``found`` ``(R,)`` whether a path arrives; if none does, the rest is left alone.
     """
     model = MODELS[name]
-    move, dock = make_stepper(model)
-    approach, track = inlined(model.functions.approach), inlined(model.functions.track)
-    velocity_of, limit_control = inlined(model.functions.velocity), inlined(model.functions.limit_control)
-    turned, slowed = _TURNED[model.dimension], _SLOWED[model.dimension]
+    approach, velocity_of = inlined(model.functions.approach), inlined(model.functions.velocity)
+    step_towards, (aim_of, slowed) = velocity_step(model), aiming(model)
     n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
     no_control = (ZERO,) * m
 
     @inlined
-    def aim_of(
-        place: FloatArray, at: Row, limits: Row, goal: FloatArray, goal_radius: np.float32, moves: Moves, number: Whole
-    ) -> Row:
-        """Return the position to head for: ``place`` is an array, ``at`` a tuple of the same numbers."""
-        turn = to_fixed_tuple(moves.turns[number], 3)
-        if moves.homewards[number]:
-            return turned(to_fixed_tuple(goal, d), goal_radius, turn, _frame(place, goal))
-        return turned(at, _FAR * limits[SPEED], turn, _frame(place, goal))
+    def by_moves(
+        reference: tuple[Moves, IntArray, int, FloatArray, np.float32, FloatArray],
+        aim: Row, step: int, state: Row, at: Row, limits: Row, h: TimeStep,
+    ) -> tuple[Row, Row, bool]:  # fmt: skip
+        moves, did, begin, goal, goal_radius, states = reference
+        block = step // BLOCK - begin
+        number = did[did.shape[0] - 1 - block] if block < did.shape[0] else 0
+        if step % BLOCK == 0:
+            aim = aim_of(states[step], state, limits, goal, goal_radius, moves, number)
+        return slowed(approach(state, aim, limits, h, OPS), moves.pace[number]), aim, True
 
-    @inlined
-    def control_of(state: Row, aim: Row, pace: np.float32, limits: Row, h: TimeStep) -> Row:
-        velocity = slowed(approach(state, aim, limits, h, OPS), pace)
-        return limit_control(track(state, velocity, limits, h, OPS), limits, OPS)
+    drive = tracker(model, by_moves)
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def search(
@@ -266,7 +212,7 @@ def search_kernel(name: str) -> Search:
                 beam.states[0, i] = queries.states[r, i]
             beam.faults[0], numbers[0], size, num_kept = 0.0, -1, 1, 0
             best, best_number, best_move = queries.limits[r], -1, -1
-            without = queries.without[r]
+            without = queries.others.without[r]
             for block in range(begin, num_blocks):
                 first, last = steps_of(table, block)
                 count = 0
@@ -277,9 +223,8 @@ def search_kernel(name: str) -> Search:
                         faults, end = beam.faults[node], first
                         for t in range(first, last):
                             if not transition.stands(at_goal, arrays.docks):
-                                control = control_of(state, aim, moves.pace[number], limits, h)
-                                state = move(False, state, control, limits, h)
-                                state, _, at_goal = dock(False, state, control, limits, at, docking)
+                                velocity = slowed(approach(state, aim, limits, h, OPS), moves.pace[number])
+                                control, state, at_goal = step_towards(state, velocity, limits, at, docking, h)
                                 end = t
                             for axis in range(d):
                                 path[t - first, axis] = state[axis]
@@ -297,14 +242,14 @@ def search_kernel(name: str) -> Search:
                         if rules.contact * faults + cost >= best:
                             continue
                         faults += count_near(table, robot, without, path, first, block)
-                        faults += _count_beside(table, robot, queries, r, path, first, last)
+                        faults += _count_beside(table, robot, queries.others, r, path, first, last)
                         if at_goal:
                             # It stays there: whoever comes by later counts too.
                             for axis in range(d):
                                 path[:, axis] = state[axis]
                             for later in range(block + 1, last_busy + 1):
                                 faults += count_near(table, robot, without, path, steps_of(table, later)[0], later)
-                            faults += _count_beside(table, robot, queries, r, path, last, table.places.shape[0])
+                            faults += _count_beside(table, robot, queries.others, r, path, last, len(table.places))
                             if rules.contact * faults + cost < best:
                                 best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
                             continue
@@ -332,22 +277,10 @@ def search_kernel(name: str) -> Search:
             did[0], length = best_move, 1
             while best_number >= 0:
                 did[length], best_number, length = made_by[best_number], before[best_number], length + 1
+            state, start = to_fixed_tuple(queries.states[r], n), begin * BLOCK
             for i in range(n):
-                x[r, steps_of(table, begin)[0] - 1, i] = queries.states[r, i]
-            state, at_goal = to_fixed_tuple(queries.states[r], n), False
-            for block in range(begin, num_blocks):
-                first, last = steps_of(table, block)
-                number = did[length - 1 - block + begin] if block - begin < length else 0
-                aim = aim_of(x[r, first - 1], state, limits, goal, goal_radius, moves, number)
-                for t in range(first, last):
-                    standing = transition.stands(at_goal, arrays.docks)
-                    control = control_of(state, aim, moves.pace[number], limits, h)
-                    if not standing:
-                        state = move(False, state, control, limits, h)
-                        state, _, at_goal = dock(False, state, control, limits, at, docking)
-                    for i in range(m):
-                        u[r, t - 1, i] = ZERO if standing else control[i]
-                    for i in range(n):
-                        x[r, t, i] = state[i]
+                x[r, start, i] = state[i]
+            reference = (moves, did[:length], begin, goal, goal_radius, x[r])
+            drive(arrays, robot, reference, at, start, state, False, u[r], x[r])
 
     return search

@@ -3,77 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.engine.path_index import BLOCK
-from d4orm_planners.mapf.beam_search import BeamRules, Moves, Queries, search_kernel
+from d4orm_planners.engine.path_table import BLOCK
+from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents, Queries, search_kernel
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives, Moves
 from d4orm_planners.tracking.steering import Rollouts, by_model
-
-
-@dataclass(frozen=True)
-class MotionPrimitives:
-    """Moves of robots that look for a path.
-
-    Attributes:
-        angles: By which a robot turns off from the path to its goal [degrees]; in space up and down as well.
-        paces: Shares of its speed with which it heads for its goal: waiting has no direction.
-        beside: Goal radii beside its goal to which it may head too: one that docks there keeps clear of a neighbour.
-        on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
-    """
-
-    angles: tuple[float, ...]
-    paces: tuple[float, ...]
-    beside: float = 0.8
-    on_the_spot: float = 0.001
-
-    def moves(self, dimension: int, *, has_heading: bool) -> Moves:
-        """The same for the search."""
-        angle = np.radians(np.array(self.angles))
-        # To the left and to the right; in space upwards and downwards too.
-        across = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[: 2 * (dimension - 1)]
-        sides = portable.sin(angle)[:, None, None] * across
-        ahead = np.broadcast_to(portable.cos(angle)[:, None, None], (*sides.shape[:2], 1))
-        turned = np.concatenate([ahead, sides], axis=2).reshape(-1, 3)
-        home = np.zeros((1, 3))
-        beside = np.column_stack([np.zeros(len(across)), self.beside * across])
-        parts = [(home, True, pace) for pace in self.paces] + [(beside, True, 1.0), (turned, False, 1.0)]
-        if has_heading:
-            parts += [(home, True, self.on_the_spot), (turned, False, self.on_the_spot)]
-        sizes = [len(turns) for turns, _, _ in parts]
-        return Moves(
-            np.concatenate([turns for turns, _, _ in parts]).astype(np.float32),
-            np.repeat([homewards for _, homewards, _ in parts], sizes),
-            np.repeat([pace for _, _, pace in parts], sizes).astype(np.float32),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class OtherAgents:
-    """Agents that robots which look for a path avoid, other than the team as it drives at present.
-
-    Attributes:
-        without: ``(R, N)`` numbers of robots that each does not mind.
-        beside: ``(R, M, H+1, d)`` paths that it minds as well [m].
-        radius: ``(R, M)`` radii of the agents on them [m].
-    """
-
-    without: NDArray[np.int64]
-    beside: FloatArray
-    radius: NDArray[np.float64]
-
-    @classmethod
-    def nobody(cls, robots: IntArray, horizon: int, dimension: int) -> OtherAgents:
-        """No others but the team."""
-        beside = np.zeros((len(robots), 0, horizon + 1, dimension), np.float32)
-        return cls(robots[:, None], beside, np.zeros((len(robots), 0)))
 
 
 def find_paths(
@@ -83,7 +24,7 @@ def find_paths(
     primitives: MotionPrimitives,
     rules: BeamRules,
     limits: ArrayLike = np.inf,
-    other_agents: OtherAgents | None = None,
+    others: OtherAgents | None = None,
 ) -> Rollouts:
     """The best paths that robots ``(R,)`` find; one that finds none does what it does, and does not arrive.
 
@@ -96,23 +37,23 @@ def find_paths(
         primitives: Their motion primitives.
         rules: Rules by which paths are kept.
         limits: ``(R,)`` what a path must cost less than [s]: its time, and what it costs to meet others.
-        other_agents: Agents that they mind, or do not mind.
+        others: Agents that they mind, or do not mind.
 
     Returns:
         A single path of each.
     """
     problem, horizon = team.problem, team.problem.horizon
     blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))
-    other_agents = other_agents or OtherAgents.nobody(robots, horizon, problem.dimension)
+    if others is None:
+        beside = np.zeros((len(robots), 0, horizon + 1, problem.dimension), np.float32)
+        others = OtherAgents(robots[:, None], beside, np.zeros((len(robots), 0)))
     u, x = (np.ascontiguousarray(rows[:, robots].swapaxes(0, 1)) for rows in (team.controls, team.states))
     arrived = np.zeros(len(robots), bool)
     for model, members in by_model(problem):
         mine = np.flatnonzero(np.isin(robots, members))
         if len(mine):
-            queries = Queries(
-                robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], other_agents.without[mine],
-                other_agents.beside[mine], other_agents.radius[mine],
-            )  # fmt: skip
+            minded = OtherAgents(others.without[mine], others.beside[mine], others.radius[mine])
+            queries = Queries(robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], minded)
             moves = primitives.moves(problem.dimension, has_heading=model.heading_index is not None)
             u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, queries, u[mine], x[mine])
     u, x = (rows.swapaxes(0, 1)[:, :, None] for rows in (u, x))

@@ -1,7 +1,6 @@
 """Large-neighbourhood search: a few robots at a time find faster paths around all others, under their own dynamics.
 
-After MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021); what is worse is accepted as in
-simulated annealing.
+What is worse is accepted as in simulated annealing.
 """
 
 from __future__ import annotations
@@ -14,9 +13,11 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.portable import log
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.engine.path_index import BLOCK
-from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
+from d4orm_planners.engine.path_table import BLOCK
+from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
+from d4orm_planners.mapf.beams import find_paths
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives
+from d4orm_planners.mapf.neighbourhoods import draw_neighbourhood
 from d4orm_planners.tracking.steering import straight_drives
 
 
@@ -111,7 +112,10 @@ class _Neighbourhoods:
 
     def run(self, temperature: float) -> None:
         """One round."""
-        groups = np.stack([self.group() for _ in range(RULES.groups)])
+        delay = np.maximum(self.arrival - self.soonest, RULES.least_delay)
+        until, nearness = np.full(len(delay), self.problem.horizon), RULES.nearness * self.problem.team.largest_radius
+        drawn = self.random, delay, self.team.positions, until, nearness, (self.size, self.size)
+        groups = np.stack([draw_neighbourhood(*drawn) for _ in range(RULES.groups)])
         # Exponential, by a logarithm that is the same everywhere.
         slack = -temperature * log(1 - self.random.random(len(groups)))
         blocks = self.random.integers(0, 2, len(groups)) * self.arrival[groups[:, 0]] / self.problem.dt // BLOCK
@@ -130,28 +134,18 @@ class _Neighbourhoods:
             if left.shape[1]:
                 limits = np.minimum(limits, self.arrival[robots] + RULES.give)
             before = groups[found, :member]
-            other_agents = OtherAgents(
+            others = OtherAgents(
                 groups[found],
                 np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
                 np.asarray(self.problem.team.radius, np.float64)[before],
             )
             rules = BeamRules(RULES.width, RULES.contact, RULES.dedup_distance * self.problem.team.largest_radius)
-            paths = find_paths(self.team, robots, blocks[found], primitives, rules, limits, other_agents)
+            paths = find_paths(self.team, robots, blocks[found], primitives, rules, limits, others)
             controls[:, found, member], states[:, found, member] = paths.controls[:, :, 0], paths.states[:, :, 0]
             budget[found] -= self.costs(robots, paths.positions[:, :, 0])[0]
             found[found] = paths.arrived[:, 0]
         for number in np.flatnonzero(found):
             self.take_over(groups[number], controls[:, number], states[:, number], slack[number])
-
-    def group(self) -> IntArray:
-        """``(size,)`` a robot that is late, and some that it comes near to, in random order."""
-        delay = np.maximum(self.arrival - self.soonest, RULES.least_delay)
-        robot = int(self.random.choice(self.num_robots, p=delay / delay.sum()))
-        places = self.team.positions
-        gap = np.sqrt(((places - places[:, [robot]]) ** 2).sum(axis=2).min(axis=0))
-        gap += RULES.nearness * self.problem.team.largest_radius * self.random.random(self.num_robots)
-        gap[robot] = -1.0
-        return self.random.permutation(np.argsort(gap, kind="stable")[: self.size])
 
     def take_over(self, robots: IntArray, controls: FloatArray, states: FloatArray, slack: float) -> None:
         """Let robots ``(R,)`` do as they found, if it fits what the others do and costs no more than so much [s]."""

@@ -54,7 +54,14 @@ def cell_range(cells: Cells, axis: int, lowest: float, highest: float) -> tuple[
     """The first cell along an axis that a stretch touches, and the one after its last."""
     first = int(np.floor((lowest - cells.low[axis]) / cells.width))
     last = int(np.floor((highest - cells.low[axis]) / cells.width))
-    return max(first, 0), min(last, cells.size[axis] - 1) + 1
+    return min(max(first, 0), cells.size[axis]), max(min(last, cells.size[axis] - 1) + 1, 0)
+
+
+@inlined
+def items_in(cells: Cells, i: int, j: int, low: int, high: int) -> tuple[Whole, Whole]:
+    """The first of ``items`` in a row of cells along the last axis, and the one after the last."""
+    row = (i * cells.size[1] + j) * cells.size[2]
+    return cells.first[row + low], cells.first[row + high]
 
 
 @inlined
@@ -106,16 +113,15 @@ def near_lines(
         (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, tails[q], heads[q], reach)
         for i in range(low_i, high_i):
             for j in range(low_j, high_j):
-                for k in range(low_k, high_k):
-                    cell = (i * cells.size[1] + j) * cells.size[2] + k
-                    for number in range(cells.first[cell], cells.first[cell + 1]):
-                        point = cells.items[number]
-                        if after and point <= q:
-                            continue
-                        if squared_gap(cells.points, point, tails, q, heads, q) < reach * reach:
-                            if count < items.shape[0]:
-                                items[count] = point
-                            count += 1
+                begin, end = items_in(cells, i, j, low_k, high_k)
+                for number in range(begin, end):
+                    point = cells.items[number]
+                    if after and point <= q:
+                        continue
+                    if squared_gap(cells.points, point, tails, q, heads, q) < reach * reach:
+                        if count < items.shape[0]:
+                            items[count] = point
+                        count += 1
         if count <= items.shape[0]:
             items[first[q] : count].sort()
     first[tails.shape[0]] = count

@@ -17,7 +17,7 @@ from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_planners.mapf.near_neighbours import Cells, cells_about, sort_into_cells
+from d4orm_planners.mapf.near_neighbours import Cells, cells_about, items_in, sort_into_cells
 from d4orm_planners.mapf.roadmap import Roadmap
 from d4orm_planners.tracking.routes import Corners, Route, Routes
 
@@ -220,24 +220,23 @@ def find_waits(
             (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], reach)
             for ci in range(low_i, high_i):
                 for cj in range(low_j, high_j):
-                    for ck in range(low_k, high_k):
-                        cell = (ci * cells.size[1] + cj) * cells.size[2] + ck
-                        for number in range(cells.first[cell], cells.first[cell + 1]):
-                            b = cells.items[number]
-                            j = owner[b]
-                            if j == k or times[b] >= times[a]:
-                                continue
-                            until = b - first[j] + 1
-                            if until <= passed[j] or until <= wanted[j]:
-                                continue
-                            near = radius[k] + radius[j] + margin
-                            dx, dy = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
-                            dz = points[a, 2] - points[b, 2]
-                            if dx * dx + dy * dy + dz * dz < near * near:
-                                if wanted[j] == 0:
-                                    touched[num_touched] = j
-                                    num_touched += 1
-                                wanted[j] = until
+                    begin, end = items_in(cells, ci, cj, low_k, high_k)
+                    for number in range(begin, end):
+                        b = cells.items[number]
+                        j = owner[b]
+                        if j == k or times[b] >= times[a]:
+                            continue
+                        until = b - first[j] + 1
+                        if until <= passed[j] or until <= wanted[j]:
+                            continue
+                        near = radius[k] + radius[j] + margin
+                        dx, dy = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
+                        dz = points[a, 2] - points[b, 2]
+                        if dx * dx + dy * dy + dz * dz < near * near:
+                            if wanted[j] == 0:
+                                touched[num_touched] = j
+                                num_touched += 1
+                            wanted[j] = until
             for number in range(num_touched):
                 j = touched[number]
                 # Where it is at that time it is out of the way, however near that is.

@@ -52,7 +52,7 @@ def _fill_boxes(others: Others, boxes: Floats) -> None:
 def _is_line_free(
     others: Others, boxes: Floats, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole
 ) -> bool:
-    """:func:`_is_line_clear`, looking only at those who are about."""
+    """Check whether none is near a robot that drives straight from one position to another between two steps."""
     for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
         first, last = max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)
         for i in range(boxes.shape[1]):
@@ -77,17 +77,6 @@ def _is_line_free(
     return True
 
 
-@compiled
-def _is_line_clear(others: Others, k: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """Check whether none is near a robot that drives straight from one position to another between two steps."""
-    for step in range(depart + 1, arrive + 1):
-        share = (step - depart) / (arrive - depart)
-        x, y = tail[0] + share * (head[0] - tail[0]), tail[1] + share * (head[1] - tail[1])
-        if not _is_clear(others, k, step, x, y, tail[2] + share * (head[2] - tail[2])):
-            return False
-    return True
-
-
 @cached_kernel(variant="straighten", **OPTIONS)
 def straighten(
     roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, path: IntArray
@@ -101,12 +90,14 @@ def straighten(
         others: Their positions.
         k: The robot.
         reach: Distance that it keeps from obstacles [m].
-        path: ``(n, 3)`` of :func:`find_way`, changed in place.
+        path: ``(n, 3)`` of :func:`find_path`, changed in place.
 
     Returns:
         How many are left.
     """
     nodes, goal, docked, count, i = roadmap.nodes, bodies.goals[k], bodies.docked + bodies.slack, 1, 0
+    boxes = np.empty((path[-1, 2] // BLOCK + 1, others.positions.shape[1], 6))
+    _fill_boxes(others, boxes)
     while i + 1 < path.shape[0]:
         j = i + 1
         depart, tail = path[j, 1], nodes[path[i, 0]]
@@ -119,7 +110,7 @@ def straighten(
             if space is not None:  # noqa: SIM102
                 if not is_free_line(space, reach, tail, head):
                     break
-            if not _is_line_clear(others, k, tail, head, depart, path[j + 1, 2]):
+            if not _is_line_free(others, boxes, k, tail, head, depart, path[j + 1, 2]):
                 break
             j += 1
         path[count, 0], path[count, 1], path[count, 2] = path[j, 0], depart, path[j, 2]

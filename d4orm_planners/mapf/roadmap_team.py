@@ -16,11 +16,12 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.paths.wavefront import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
+from d4orm_planners.mapf.neighbourhoods import draw_neighbourhood
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path, straighten, touches
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.mapf.safe_intervals import Others
-from d4orm_planners.tracking.path_drives import drive_along
+from d4orm_planners.tracking.path_drives import drive_routes
 from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
@@ -86,13 +87,11 @@ def drive_moves(problem: Problem, roadmap: Roadmap, moves: IntArray) -> TeamRoll
     routes = join_routes(
         problem, make_routes(problem, stops, range(problem.num_robots), FIRST_CUT * problem.team.largest_radius)
     )
-    return TeamRollout(*drive_along(problem, routes, OVERTIME * problem.horizon))
+    return TeamRollout(*drive_routes(problem, routes, OVERTIME * problem.horizon))
 
 
 class Replanning:
     """Better paths for some robots of a team at a time, planned one after another around all others as they drive.
-
-    As in MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021).
 
     Args:
         problem: The team.
@@ -128,12 +127,8 @@ class Replanning:
         late = driven.arrivals > self.problem.horizon
         if late.any() and random.random() < 0.5:
             delay[~late] = 0.0
-        robot = int(random.choice(len(delay), p=delay / delay.sum()))
-        places = driven.places[: int(driven.arrivals[robot]) + 1]
-        gaps = np.sqrt(((places - places[:, robot, None]) ** 2).sum(axis=2)).min(axis=0)
-        gaps += NEARNESS * self.size * random.random(len(delay))
-        gaps[robot] = -1.0
-        return random.permutation(np.argsort(gaps)[: random.integers(1, min(len(delay), most) + 1)])
+        sizes = (1, min(len(delay), most))
+        return draw_neighbourhood(random, delay, driven.places, driven.arrivals, NEARNESS * self.size, sizes)
 
     def better(
         self, driven: TeamRollout, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]

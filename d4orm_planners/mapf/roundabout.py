@@ -18,7 +18,7 @@ from d4orm_env.core.portable import arctan2, cos, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
-from d4orm_planners.tracking.steering import track_velocities
+from d4orm_planners.tracking.steering import track_team
 
 SLACK = 1 / 75
 """Added to the distance that robots keep from each other in it, in radii of the largest robot."""
@@ -74,21 +74,16 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
     if bends is None:
         return None
     speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))
-    states, docked = problem.start, np.zeros(problem.num_robots, bool)
-    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
     # Who accelerates has the velocity at the end of a step, and who sets its velocity has it all the time.
     lead = np.array([1.0 if ACCELERATION in model.control_limits else 0.5 for model in problem.team.robot_models])
-    for t in range(problem.horizon):
+
+    def wanted(t: int, states: FloatArray) -> Floats:
         now, then = problem.dt * t, problem.dt * (t + lead)
         due, _ = bends.at(_driven(now, speed, acceleration))
         _, direction = bends.at(_driven(then, speed, acceleration))
-        wanted = direction * np.minimum(speed, acceleration * then)[:, None] + CORRECTION * (due - states[:, :2])
-        controls[t] = track_velocities(problem, states, wanted.astype(np.float32))
-        after = engine.step(problem.arrays, states, docked, controls[t])
-        if after.margin_violated.any():
-            return None
-        states, docked = after.states, after.arrived & problem.docks
-    return controls
+        return direction * np.minimum(speed, acceleration * then)[:, None] + CORRECTION * (due - states[:, :2])
+
+    return track_team(problem, engine, problem.horizon, wanted, each_alone=False)
 
 
 def _driven(time: float | Floats, speed: Floats, acceleration: Floats) -> Floats:

@@ -9,7 +9,7 @@ from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_planners.mapf.near_neighbours import Cells, cells_about
+from d4orm_planners.mapf.near_neighbours import Cells, cells_about, items_in
 
 
 class Others(NamedTuple):
@@ -62,21 +62,20 @@ def find_visits(cells: Cells, others: Others, k: Whole, steps: Whole) -> tuple[I
             (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, place, place, need)
             for ci in range(low_i, high_i):
                 for cj in range(low_j, high_j):
-                    for ck in range(low_k, high_k):
-                        cell = (ci * cells.size[1] + cj) * cells.size[2] + ck
-                        for number in range(cells.first[cell], cells.first[cell + 1]):
-                            n = cells.items[number]
-                            dx, dy, dz = nodes[n, 0] - place[0], nodes[n, 1] - place[1], nodes[n, 2] - place[2]
-                            if dx * dx + dy * dy + dz * dz >= need * need:
-                                continue
-                            v = last[n]
-                            if v >= 0 and visits[v, 0] <= step <= visits[v, 1]:
-                                visits[v, 1] = max(visits[v, 1], end)
-                                continue
-                            if used == visits.shape[0]:
-                                visits = np.concatenate((visits, np.empty((used, 3), np.int64)))
-                            visits[used, 0], visits[used, 1], visits[used, 2], last[n] = step, end, v, used
-                            used += 1
+                    first, after_last = items_in(cells, ci, cj, low_k, high_k)
+                    for number in range(first, after_last):
+                        n = cells.items[number]
+                        dx, dy, dz = nodes[n, 0] - place[0], nodes[n, 1] - place[1], nodes[n, 2] - place[2]
+                        if dx * dx + dy * dy + dz * dz >= need * need:
+                            continue
+                        v = last[n]
+                        if v >= 0 and visits[v, 0] <= step <= visits[v, 1]:
+                            visits[v, 1] = max(visits[v, 1], end)
+                            continue
+                        if used == visits.shape[0]:
+                            visits = np.concatenate((visits, np.empty((used, 3), np.int64)))
+                        visits[used, 0], visits[used, 1], visits[used, 2], last[n] = step, end, v, used
+                        used += 1
             step = end
     return visits[:used], last
 

@@ -11,16 +11,19 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, IntArray
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics import transition
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, ZERO, to_fixed_tuple
-from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
+from d4orm_env.engine.stepping import models_key
+from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.routes import Routes
+from d4orm_planners.tracking.steering import by_model
+from d4orm_planners.tracking.tracker import tracker
 
 BRAKING = 0.5
 """Share of its acceleration that a robot counts on before corners and in them."""
@@ -57,28 +60,8 @@ class Progress(NamedTuple):
         return cls(np.zeros(size, np.int64), waits, targets, np.zeros(size, np.float32), np.zeros(size, np.float32))
 
 
-class Part(NamedTuple):
-    """The robots of a team that have the same model.
-
-    Attributes:
-        time_step: ``(4,)`` see :class:`~d4orm_env.dynamics.robot_model.TimeStep`.
-        docks: Whether a robot that has arrived stays there for good.
-        robots: ``(B,)`` int64.
-        docking: ``(B, 2)`` squares of the goal radius and of the goal speed.
-        limits: ``(B, L)``.
-        goals: ``(B, d)`` [m].
-    """
-
-    time_step: FloatArray
-    docks: np.bool_
-    robots: IntArray
-    docking: FloatArray
-    limits: FloatArray
-    goals: FloatArray
-
-
-Drive: TypeAlias = Kernel[[Part, Progress, FloatArray, BoolArray, FloatArray], None]
-"""A kernel of :func:`drive_kernel`."""
+RouteStep: TypeAlias = Kernel[[ProblemArrays, IntArray, Progress, BoolArray, FloatArray, FloatArray], None]
+"""A kernel of :func:`route_kernel`."""
 
 
 @cached_kernel(variant="direct", **OPTIONS)
@@ -151,37 +134,38 @@ def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: f
 
 
 @cache
-def drive_kernel(name: str) -> Drive:
+def route_kernel(name: str) -> RouteStep:
     """One compiled step of the robots of the model with this name that drive to where they are directed.
 
-    Args of the kernel: the :class:`Part`, the whole team's :class:`Progress`, ``states`` ``(K, n)`` and ``docked``
-    ``(K,)`` changed in place, and ``controls`` ``(K, m)`` output.
+    Args of the kernel: the team, the numbers ``(B,)`` of these robots, the whole team's :class:`Progress`, ``docked``
+    ``(K,)`` and ``states`` ``(2, K, n)`` before the step and after it, changed in place, and ``controls`` ``(1, K,
+    m)``, output.
     """
-    robot = MODELS[name]
-    (move, dock), steer = make_stepper(robot), steering(name)
-    n, m, d, num_limits = robot.state_size, robot.control_size, robot.dimension, len(robot.limit_names)
+    model = MODELS[name]
+    steer, n, d = steering(name), model.state_size, model.dimension
+
+    @inlined
+    def as_directed(
+        progress: Progress, k: Whole, step: int, x: Row, goal: Row, limits: Row, h: TimeStep
+    ) -> tuple[Row, Whole, bool]:
+        target = to_fixed_tuple(progress.targets[k], d)
+        return steer(x, target, progress.room[k], progress.pace[k], True, limits, h), k, True
+
+    drive = tracker(model, as_directed)
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
-    def drive(part: Part, progress: Progress, states: FloatArray, docked: BoolArray, controls: FloatArray) -> None:
-        h = transition.TimeStep(part.time_step[0], part.time_step[1], part.time_step[2], part.time_step[3])
-        docks = part.docks
-        for b in range(part.robots.shape[0]):
-            k, rules = part.robots[b], (part.docking[b, 0], part.docking[b, 1], docks)
-            own, goal = to_fixed_tuple(part.limits[b], num_limits), to_fixed_tuple(part.goals[b], d)
-            state, target = to_fixed_tuple(states[k], n), to_fixed_tuple(progress.targets[k], d)
-            standing = transition.stands(docked[k], docks)
-            control = steer(state, target, progress.room[k], progress.pace[k], True, own, h)
-            for i in range(m):
-                controls[k, i] = ZERO if standing else control[i]
-            control = to_fixed_tuple(controls[k], m)
-            state, _, docked[k] = dock(standing, move(standing, state, control, own, h), control, own, goal, rules)
-            for i in range(n):
-                states[k, i] = state[i]
+    def drive_step(
+        arrays: ProblemArrays, robots: IntArray, progress: Progress, docked: BoolArray, states: FloatArray,
+        controls: FloatArray,
+    ) -> None:  # fmt: skip
+        for k in robots:
+            state = to_fixed_tuple(states[0, k], n)
+            docked[k] = drive(arrays, k, progress, k, 0, state, docked[k], controls[:, k], states[:, k]) <= 1
 
-    return drive
+    return drive_step
 
 
-def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Floats, IntArray]:
+def drive_routes(problem: Problem, routes: Routes, most_steps: int) -> tuple[FloatArray, Floats, IntArray]:
     """Drive the team along its routes until all have arrived, or for ``most_steps``.
 
     Args:
@@ -198,23 +182,23 @@ def drive_along(problem: Problem, routes: Routes, most_steps: int) -> tuple[Floa
         [paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())]
     )
     controls = np.zeros((most_steps, num_robots, problem.control_size), np.float32)
-    sights = lookaheads(problem)
-    states, docked = problem.start.copy(), np.zeros(num_robots, bool)
-    progress = Progress.of(routes)
-    places = np.zeros((most_steps + 1, num_robots, 3))
+    states, docked = np.stack([problem.start, problem.start]), np.zeros(num_robots, bool)
+    places, progress = np.zeros((most_steps + 1, num_robots, 3)), Progress.of(routes)
     arrivals = np.full(num_robots, most_steps + 1, np.int64)
-    parts, beyond, size = _parts(problem), beyond_goal(problem), problem.team.largest_radius
+    sights, beyond, size = lookaheads(problem), beyond_goal(problem), problem.team.largest_radius
+    parts = [(route_kernel(model.name), np.array(robots)) for model, robots in by_model(problem)]
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
-        places[steps, :, :d] = states[:, :d]
+        places[steps, :, :d] = states[0, :, :d]
         direct(routes, paces, sights, problem.dt, beyond, size, places[steps], docked & problem.docks, progress)
         # Without docking a robot may come through its goal before it has made way for others.
         there = docked & (problem.docks | (progress.at == ends))
         arrivals[:] = np.where(there, np.minimum(arrivals, steps), most_steps + 1)
         if steps == most_steps or there.all():
             return controls[:steps], places[: steps + 1], arrivals
-        for drive, part in parts:
-            drive(part, progress, states, docked, controls[steps])
+        for drive, robots in parts:
+            drive(problem.arrays, robots, progress, docked, states, controls[steps : steps + 1])
+        states[0] = states[1]
         steps += 1
 
 
@@ -224,17 +208,6 @@ def beyond_goal(problem: Problem) -> float:
         return 0.0
     speed, acceleration = (problem.team.limits[:, column].astype(np.float64) for column in (SPEED, ACCELERATION))
     return float((BEYOND * speed**2 / (2 * acceleration)).max())
-
-
-def _parts(problem: Problem) -> list[tuple[Drive, Part]]:
-    """The robots by model, with what drives them."""
-    arrays, models, parts = problem.arrays, np.array(problem.team.models), []
-    for name in dict.fromkeys(problem.team.models):
-        robots = np.flatnonzero(models == name)
-        docking = arrays.docking[robots]
-        part = Part(arrays.time_step, arrays.docks, robots, docking, arrays.limits[robots], problem.goal[robots])
-        parts.append((drive_kernel(name), part))
-    return parts
 
 
 def paces_along(problem: Problem, robot: int, arcs: Floats, bends: Floats, share: float = BRAKING) -> Floats:

@@ -20,7 +20,7 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.elementary import OPS, cosine, sine
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.tile_layout import SQUARED_NORM, Row
 
 if TYPE_CHECKING:
     from d4orm_planners.tracking.routes import Routes
@@ -57,14 +57,17 @@ def lookaheads(problem: Problem) -> Floats:
 
 
 @compiled
-def square_to(points: Floats, i: int, place: Floats) -> float:
-    """Squared distance of a point from a place."""
-    dx, dy, dz = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
-    return dx * dx + dy * dy + dz * dz
+def square_to(points: Floats, i: int, place: Floats | Row) -> float:
+    """Squared distance of a point from a place, which may be the beginning of a state."""
+    square = 0.0
+    for axis in range(points.shape[1]):
+        gap = points[i, axis] - place[axis]
+        square += gap * gap
+    return square
 
 
 @compiled
-def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats, size: float) -> int:
+def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats | Row, size: float) -> int:
     """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached.
 
     ``size`` is the radius of the largest robot [m].
@@ -88,8 +91,8 @@ def point_ahead(
     at: int,
     last: int,
     stop: float,
-    lookahead: tuple[float, float],
-    place: Floats,
+    lookahead: tuple[float, float | np.float32],
+    place: Floats | Row,
     size: float,
 ) -> int:
     """The point that a robot at point ``at`` heads for.
@@ -104,7 +107,7 @@ def point_ahead(
         last: The last point that it may head for.
         stop: Length of the route from which on it heads for no further point [m].
         lookahead: Its least look-ahead [m], and the time step [s].
-        place: ``(3,)`` where it really is [m].
+        place: Where it really is [m].
         size: The radius of the largest robot [m].
     """
     target, slowest, reached = min(at + 1, last), paces[at], REACHED * size
@@ -126,15 +129,15 @@ def point_ahead(
 
 @cache
 def steering(name: str) -> Steering:
-    """Compiled control of a robot of the model with this name towards a target.
+    """Compiled velocity of a robot of the model with this name towards a target.
 
-    ``(state, target, room, pace, backs_up, limits, h) -> control`` drives as fast as ``pace`` allows, and so as to be
-    able to stop within ``room``. ``backs_up`` is of those that drive in order to turn.
+    ``(state, target, room, pace, backs_up, limits, h) -> velocity`` is as fast as ``pace`` allows, and such that it can
+    stop within ``room``. ``backs_up`` is of those that drive in order to turn.
     """
     robot = MODELS[name]
-    approach, track = inlined(robot.functions.approach), inlined(robot.functions.track)
+    approach = inlined(robot.functions.approach)
     scaled, length, between = _vectors(robot.dimension)
-    limit_control, turned = inlined(robot.functions.limit_control), _turning(robot, length)
+    turned = _turning(robot, length)
 
     @inlined
     def steer(
@@ -151,41 +154,36 @@ def steering(name: str) -> Steering:
         if speed > pace:
             factor = pace / speed
             wanted = scaled(between(wanted, wanted), wanted, factor)
-        return limit_control(track(state, wanted, limits, h, OPS), limits, OPS)
+        return wanted
 
     return steer
 
 
 def _vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Length, Callable[[Row, Row], Row]]:
     """``origin + step * factor``, the length of a step, and the step from a state to a place."""
-    if dimension == 2:
+    squared_norm = SQUARED_NORM[dimension]
 
-        @inlined
-        def scaled(origin: Row, step: Row, factor: np.float32) -> Row:
-            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor)
+    @inlined
+    def length(step: Row) -> np.float32:
+        return np.sqrt(squared_norm(step))
 
-        @inlined
-        def length(step: Row) -> np.float32:
-            return np.sqrt(step[0] * step[0] + step[1] * step[1])
+    @inlined
+    def scaled_2(origin: Row, step: Row, factor: np.float32) -> Row:
+        return (origin[0] + step[0] * factor, origin[1] + step[1] * factor)
 
-        @inlined
-        def between(state: Row, target: Row) -> Row:
-            return (target[0] - state[0], target[1] - state[1])
-    else:
+    @inlined
+    def between_2(state: Row, target: Row) -> Row:
+        return (target[0] - state[0], target[1] - state[1])
 
-        @inlined
-        def scaled(origin: Row, step: Row, factor: np.float32) -> Row:
-            return (origin[0] + step[0] * factor, origin[1] + step[1] * factor, origin[2] + step[2] * factor)
+    @inlined
+    def scaled_3(origin: Row, step: Row, factor: np.float32) -> Row:
+        return (origin[0] + step[0] * factor, origin[1] + step[1] * factor, origin[2] + step[2] * factor)
 
-        @inlined
-        def length(step: Row) -> np.float32:
-            return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    @inlined
+    def between_3(state: Row, target: Row) -> Row:
+        return (target[0] - state[0], target[1] - state[1], target[2] - state[2])
 
-        @inlined
-        def between(state: Row, target: Row) -> Row:
-            return (target[0] - state[0], target[1] - state[1], target[2] - state[2])
-
-    return scaled, length, between
+    return (scaled_2, length, between_2) if dimension == 2 else (scaled_3, length, between_3)
 
 
 def _turning(robot: Model, length: Length) -> Turning:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +14,12 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import Model
+from d4orm_env.dynamics.robot_model import Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep
+from d4orm_env.engine.types import Engine
+
+Columns: TypeAlias = tuple[FloatArray, ...]
+"""Components of the states, velocities, controls or limits of some robots."""
 
 if TYPE_CHECKING:
     from d4orm_env.engine import threads as thread_counts
@@ -47,12 +51,8 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
         states: ``(K, n)``.
         goals: ``(K, d)`` [m].
     """
-    velocities = np.zeros(goals.shape, np.float32)
     h = TimeStep(*problem.arrays.time_step)
-    for model, robots in by_model(problem):
-        x, goal, limits = (tuple(rows[robots].T) for rows in (states, goals, problem.team.limits))
-        velocities[robots] = np.stack(model.functions.approach(x, goal, limits, h, NUMPY_OPS), axis=1)
-    return velocities
+    return _by_rows(problem, goals.shape[1], (states, goals), lambda model, *rows: model.approach(*rows, h, NUMPY_OPS))
 
 
 def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
@@ -96,13 +96,12 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
         states: ``(K, n)``.
         velocities: ``(K, d)`` wanted [m/s].
     """
-    controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
     h = TimeStep(*problem.arrays.time_step)
-    for model, robots in by_model(problem):
-        x, velocity, limits = (tuple(rows[robots].T) for rows in (states, velocities, problem.team.limits))
-        wanted = model.functions.track(x, velocity, limits, h, NUMPY_OPS)
-        allowed = model.functions.limit_control(wanted, limits, NUMPY_OPS)
-        controls[robots, : model.control_size] = np.stack(allowed, axis=1)
+
+    def law(model: ModelFunctions, x: Columns, velocity: Columns, limits: Columns) -> Columns:
+        return model.limit_control(model.track(x, velocity, limits, h, NUMPY_OPS), limits, NUMPY_OPS)
+
+    controls = _by_rows(problem, problem.control_size, (states, velocities), law)
     # The norm may come out above the limit by a rounding error.
     limit = problem.team.control_limits
     return np.clip(controls, -limit, limit)
@@ -134,11 +133,47 @@ def present_velocities(problem: Problem, states: FloatArray, controls: FloatArra
         states: ``(K, n)``.
         controls: ``(K, m)`` executed last.
     """
-    velocities = np.zeros((problem.num_robots, problem.dimension), np.float32)
+    return _by_rows(
+        problem, problem.dimension, (states, controls), lambda model, *rows: model.velocity(*rows, NUMPY_OPS)
+    )
+
+
+def _by_rows(problem: Problem, width: int, rows: tuple[FloatArray, ...], law: Callable[..., Columns]) -> FloatArray:
+    """``(K, width)`` results of ``law(functions, *rows, limits)`` for the rows of every robot, padded with zeros."""
+    results = np.zeros((problem.num_robots, width), np.float32)
     for model, robots in by_model(problem):
-        x, u, limits = (tuple(rows[robots].T) for rows in (states, controls, problem.team.limits))
-        velocities[robots] = np.stack(model.functions.velocity(x, u, limits, NUMPY_OPS), axis=1)
-    return velocities
+        columns = (tuple(part[robots].T) for part in (*rows, problem.team.limits))
+        result = np.stack(law(model.functions, *columns), axis=1)
+        results[robots, : result.shape[1]] = result
+    return results
+
+
+def track_team(
+    problem: Problem, engine: Engine, steps: int, wanted: Callable[[int, FloatArray], ArrayLike], *, each_alone: bool
+) -> FloatArray | None:
+    """Drive the team from its start at velocities that depend on where it is.
+
+    Args:
+        problem: The team.
+        engine: Engine for the steps.
+        steps: ``T``.
+        wanted: ``(step, states (K, n)) -> (K, d)`` velocities [m/s].
+        each_alone: Whether none arrives and none is in the way of another.
+
+    Returns:
+        ``(T, K, m)`` controls; ``None`` if a robot comes within the margin of anything.
+    """
+    states, arrived = problem.start, np.zeros(problem.num_robots, bool)
+    controls = np.empty((steps, problem.num_robots, problem.control_size), np.float32)
+    for t in range(steps):
+        controls[t] = track_velocities(problem, states, np.asarray(wanted(t, states), np.float32))
+        after = engine.step(problem.arrays, states, arrived, controls[t])
+        states = after.states
+        if not each_alone:
+            arrived = after.arrived & problem.docks
+            if after.margin_violated.any():
+                return None
+    return controls
 
 
 def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals: FloatArray) -> BoolArray:
@@ -199,28 +234,22 @@ def drives(
         switch_times: ``(R, V)`` time steps.
         vias: ``(R, V, P, d)`` the points [m]; none by default.
     """
-    switch, arrays = np.asarray(switch_times, np.int64), problem.arrays
-    num_steps, dimension = problem.horizon, problem.dimension
+    switch, dimension = np.asarray(switch_times, np.int64), problem.dimension
     points = np.empty((*switch.shape, 0, dimension), np.float32) if vias is None else np.asarray(vias, np.float32)
-    u = np.zeros((*switch.shape, num_steps, problem.control_size), np.float32)
-    x = np.zeros((*switch.shape, num_steps + 1, problem.state_size), np.float32)
-    arrived = np.zeros(switch.shape, bool)
+    u, x = (np.repeat(rows.swapaxes(0, 1)[:, None], switch.shape[1], axis=1) for rows in (controls, states))
+    u, x, arrived = u.astype(np.float32, copy=False), x.astype(np.float32, copy=False), np.zeros(switch.shape, bool)
     near = NEAR_VIA * problem.team.largest_radius
-    rules = drive_kernels.DriveRules(arrays.time_step, arrays.docks, np.float32(near * near))
-    given_x, given_u = (np.ascontiguousarray(rows.swapaxes(0, 1), np.float32) for rows in (states, controls))
-    inputs = drive_kernels.DriveInputs(
-        arrays.limits, arrays.docking, problem.goal, given_x, given_u, switch, np.ascontiguousarray(points)
-    )
+    rest = switch, np.ascontiguousarray(points), np.float32(near * near), u, x, arrived
     threads = thread_counts.Threads(thread_counts.available_cores())
     for model, robots in by_model(problem):
-        kernel, index = drive_kernels.drive_kernel(model.name), np.array(robots)
-        threads.over(len(index), lambda part: kernel(rules, inputs, index[part[0] : part[1]], u, x, arrived))  # noqa: B023
+        kernel, index = drive_kernels.straight_kernel(model.name), np.array(robots)
+        threads.over(len(index), lambda part: kernel(problem.arrays, index[part[0] : part[1]], *rest))  # noqa: B023
     return Rollouts(np.moveaxis(u, 2, 0), np.moveaxis(x, 2, 0), arrived, dimension)
 
 
 def prepare_drives(problem: Problem) -> None:
     """Compile what drives of this team need, if it is not yet."""
-    if not all(drive_kernels.drive_kernel(name).signatures for name in set(problem.team.models)):
+    if not all(drive_kernels.straight_kernel(name).signatures for name in set(problem.team.models)):
         straight_drives(problem)
 
 

@@ -9,16 +9,17 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
-from d4orm_env.dynamics import transition
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS
+from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, ZERO, inlined, to_fixed_tuple
-from d4orm_env.engine.stepping import make_stepper, models_key
-from d4orm_planners.tracking import path_drives, pursuit
-from d4orm_planners.tracking.path_drives import RESERVE
-from d4orm_planners.tracking.pursuit import point_ahead, point_reached, square_to, steering
+from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
+from d4orm_env.engine.stepping import models_key
+from d4orm_env.engine.tile_layout import Row
+from d4orm_planners.tracking.path_drives import BRAKING, RESERVE, beyond_goal, paces_along
+from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.routes import Corners, Route
-from d4orm_planners.tracking.straight_drives import RobotSpec
+from d4orm_planners.tracking.tracker import tracker
 
 HURRYING = 0.85
 """Share of its acceleration that a robot counts on that hurries: if it leaves its route so, it drives by the clock."""
@@ -30,7 +31,8 @@ class Timed(NamedTuple):
     """A route and its clock.
 
     Attributes:
-        points: ``(P, 3)`` float64 [m].
+        points: ``(P, d)`` float64 [m].
+        targets: ``(P, d)`` the same in float32.
         arcs: ``(P,)`` float64 length of the route up to each [m].
         paces: ``(P,)`` float64 how fast each may be passed [m/s].
         bends: ``(P,)`` float64 radius of the bend at each [m].
@@ -40,9 +42,12 @@ class Timed(NamedTuple):
         lookahead: Least look-ahead of the robot [m].
         beyond: Distance beyond its goal that it may plan to drive, if that stops it [m].
         size: The radius of the largest robot [m].
+        dt: Time step [s].
+        backs_up: Whether the robot does, see :func:`~d4orm_planners.tracking.pursuit.gear_towards`.
     """
 
     points: Floats
+    targets: FloatArray
     arcs: Floats
     paces: Floats
     bends: Floats
@@ -52,10 +57,12 @@ class Timed(NamedTuple):
     lookahead: float
     beyond: np.float32
     size: float
+    dt: np.float32
+    backs_up: bool
 
 
 @inlined
-def stop_before(route: Timed, step: int, at: int, corner: int, stride: float) -> float:
+def stop_before(route: Timed, step: int, at: int, corner: int, stride: np.float32) -> float:
     """Length of the route up to where a robot at point ``at`` has to be able to stop [m]; ``stride`` in a step [m].
 
     It stays where it waits until it may set out, and stops there only if it has to.
@@ -80,60 +87,45 @@ def pace_to(route: Timed, step: int, at: int, corner: int, stop: float, dt: np.f
 
 
 @cache
-def timed_kernel(name: str) -> Kernel[[RobotSpec, Timed, bool, FloatArray, Floats], int]:
+def timed_kernel(name: str) -> Kernel[[ProblemArrays, int, Timed, FloatArray, FloatArray], int]:
     """The compiled drive of a robot of the model with this name along a :class:`Timed` route.
 
-    Args of the kernel: the :class:`~d4orm_planners.tracking.straight_drives.RobotSpec`, the route, whether the robot
-    backs up, see :func:`~d4orm_planners.tracking.pursuit.gear_towards`, ``controls`` ``(T, m)`` and ``places`` ``(T +
-    1, 3)``, output. It returns the step of arrival, ``T + 1`` for none.
+    The kernel fills ``controls`` ``(T, m)`` and ``states`` ``(T + 1, n)`` from the first on, and returns the step of
+    arrival, ``T + 1`` for none.
     """
     model = MODELS[name]
-    (move, dock), steer = make_stepper(model), steering(name)
-    n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
+    steer, n, d = steering(name), model.state_size, model.dimension
+
+    @inlined
+    def by_clock(
+        route: Timed, memory: tuple[int, int], step: int, x: Row, goal: Row, limits: Row, h: TimeStep
+    ) -> tuple[Row, tuple[int, int], bool]:
+        (at, corner), near = memory, NEAR * route.size
+        last, last_corner = route.arcs.shape[0] - 1, route.corners.shape[0] - 1
+        at = point_reached(route.points, route.arcs, at, last, x, route.size)
+        while corner < last_corner and route.arcs[at] >= route.corners[corner] - near:
+            corner += 1
+        stop = stop_before(route, step, at, corner, limits[0] * route.dt)
+        target = point_ahead(route, route.paces, at, last, stop, (route.lookahead, route.dt), x, route.size)
+        if route.arcs[target] > stop + near:
+            target = at
+        room = RESERVE * max(stop - route.arcs[at], 0.0)
+        if stop == route.corners[last_corner]:
+            room += route.beyond
+        elif room < SHORT * route.size:
+            room = np.sqrt(square_to(route.points, target, x))
+        pace = pace_to(route, step, at, corner, stop, route.dt)
+        aim = to_fixed_tuple(route.targets[target], d)
+        return steer(x, aim, np.float32(room), pace, route.backs_up, limits, h), (at, corner), at == last
+
+    drive = tracker(model, by_clock)
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
-    def drive(robot: RobotSpec, route: Timed, backs_up: bool, controls: FloatArray, places: Floats) -> int:
-        dt, docks, rules = robot.time_step, robot.docks, (robot.docking[0], robot.docking[1], robot.docks)
-        h, own = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), to_fixed_tuple(robot.limits, num_limits)
-        goal, x = to_fixed_tuple(robot.goal, d), to_fixed_tuple(robot.start, n)
-        last, last_corner, steps = route.arcs.shape[0] - 1, route.corners.shape[0] - 1, controls.shape[0]
-        target_place, end = np.zeros(d, np.float32), route.corners[last_corner]
-        at, corner, there, arrival, near = 0, min(1, last_corner), False, steps + 1, NEAR * route.size
-        places[:] = 0.0
-        for i in range(d):
-            places[0, i] = x[i]
-        for step in range(steps):
-            here = places[step]
-            at = point_reached(route.points, route.arcs, at, last, here, route.size)
-            while corner < last_corner and route.arcs[at] >= route.corners[corner] - near:
-                corner += 1
-            stop = stop_before(route, step, at, corner, own[0] * dt[0])
-            pace = pace_to(route, step, at, corner, stop, dt[0])
-            target = point_ahead(route, route.paces, at, last, stop, (route.lookahead, dt[0]), here, route.size)
-            if route.arcs[target] > stop + near:
-                target = at
-            room = RESERVE * max(stop - route.arcs[at], 0.0)
-            if stop == end:
-                room += route.beyond
-            elif room < SHORT * route.size:
-                room = np.sqrt(square_to(route.points, target, here))
-            for i in range(d):
-                target_place[i] = route.points[target, i]
-            standing = transition.stands(there, docks)
-            control = steer(x, to_fixed_tuple(target_place, d), np.float32(room), pace, backs_up, own, h)
-            for i in range(m):
-                controls[step, i] = ZERO if standing else control[i]
-            control = to_fixed_tuple(controls[step], m)
-            x, _, there = dock(standing, move(standing, x, control, own, h), control, own, goal, rules)
-            for i in range(d):
-                places[step + 1, i] = x[i]
-            if not (there and (docks or at == last)):
-                arrival = steps + 1
-            elif arrival > steps:
-                arrival = step + 1
-        return arrival
+    def drive_timed(arrays: ProblemArrays, robot: int, route: Timed, controls: FloatArray, states: FloatArray) -> int:
+        memory = (np.int64(0), np.int64(min(1, route.corners.shape[0] - 1)))
+        return drive(arrays, robot, route, memory, 0, to_fixed_tuple(states[0], n), False, controls, states)
 
-    return drive
+    return drive_timed
 
 
 def drive_by_clock(
@@ -157,7 +149,7 @@ def drive_by_clock(
         hurrying: Whether it comes to each as soon as it can, and waits only where it would have waited.
         backs_up: Whether it backs up, if it drives in order to turn, where it could swing round.
     """
-    departs, arrives = stops.departs, stops.arrives
+    departs, arrives, d = stops.departs, stops.arrives, problem.dimension
     # Corners are rounded: the middle of those of its points that are passed at its time.
     at = (np.searchsorted(route.times, arrives) + np.searchsorted(route.times, arrives, side="right") - 1) // 2
     if hurrying:
@@ -165,18 +157,16 @@ def drive_by_clock(
         departs, arrives = np.where(waits, departs, 0.0), np.zeros(len(arrives))
     moves = np.diff(route.points, axis=0)
     arcs = np.append(0.0, np.cumsum(np.sqrt(moves[:, 0] ** 2 + moves[:, 1] ** 2 + moves[:, 2] ** 2)))
-    share = HURRYING if hurrying else path_drives.BRAKING
-    paces = path_drives.paces_along(problem, robot, arcs, route.bends, share)
-    controls = np.zeros((steps, problem.control_size), np.float32)
-    places = np.empty((steps + 1, 3))
-    lookahead, beyond, size = (
-        pursuit.lookaheads(problem)[robot],
-        path_drives.beyond_goal(problem),
-        problem.team.largest_radius,
-    )
+    paces = paces_along(problem, robot, arcs, route.bends, HURRYING if hurrying else BRAKING)
+    points = np.ascontiguousarray(route.points[:, :d])
     timed = Timed(
-        route.points, arcs, paces, route.bends, arcs[at], departs, arrives, lookahead, np.float32(beyond), size
-    )
-    drive = timed_kernel(problem.team.models[robot])
-    arrival = drive(RobotSpec.of(problem, robot), timed, backs_up, controls, places)
+        points, points.astype(np.float32), arcs, paces, route.bends, arcs[at],
+        departs, arrives, lookaheads(problem)[robot], np.float32(beyond_goal(problem)), problem.team.largest_radius,
+        problem.arrays.time_step[0], backs_up,
+    )  # fmt: skip
+    controls = np.zeros((steps, problem.control_size), np.float32)
+    states, places = np.empty((steps + 1, problem.state_size), np.float32), np.zeros((steps + 1, 3))
+    states[0] = problem.start[robot]
+    arrival = timed_kernel(problem.team.models[robot])(problem.arrays, robot, timed, controls, states)
+    places[:, :d] = states[:, :d]
     return controls, places, int(arrival)

@@ -24,7 +24,7 @@ from d4orm_planners.engine import path_index, softmax
 from d4orm_planners.engine import score as sampling
 from d4orm_planners.engine.softmax import softmax_weights
 from d4orm_planners.mapf.beam_search import search_kernel
-from d4orm_planners.tracking.straight_drives import drive_kernel
+from d4orm_planners.tracking.straight_drives import straight_kernel
 
 PORTABILITY = Path(__file__).parents[1] / "portability"
 sys.path.insert(0, str(PORTABILITY))
@@ -68,7 +68,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "spread", wavefront._spread
     yield "look", wavefront.look
     yield "settle", wavefront.settle_nodes
-    yield "drive", drive_kernel("differential_drive")
+    yield "drive", straight_kernel("differential_drive")
     yield "search", search_kernel("differential_drive")
     yield "meetings", path_index._count_meetings
     yield "alternate", alternate

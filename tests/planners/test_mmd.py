@@ -43,7 +43,7 @@ from d4orm_planners.baselines.mmd.prior import (
     predict,
 )
 from d4orm_planners.baselines.mmd.reverse_process import Denoiser
-from d4orm_planners.baselines.mmd.tracking import drive_along
+from d4orm_planners.baselines.mmd.tracking import drive_motions
 from d4orm_planners.baselines.mmd.training_set import draw_examples, modes_of
 
 # The network.
@@ -179,7 +179,7 @@ def test_a_drive_is_what_its_controls_lead_to(model: str) -> None:
     problem = lone_problem(model, horizon=150)
     arguments = still(problem, 4)
     arguments["motions"] = np.random.default_rng(0).normal(size=(4, SIZE)).astype(np.float32)
-    driven = drive_along(problem, 0, **arguments)
+    driven = drive_motions(problem, 0, **arguments)
     for b in range(4):
         trajectory = rollout(problem, driven.controls[b][:, None], engine="cpu")
         expected = trajectory.positions[:, 0]
@@ -192,7 +192,7 @@ def test_a_drive_takes_as_long_as_its_motion_and_no_less_than_its_dynamics() -> 
     problem = lone_problem()
     arrivals = []
     for duration in (1.0, 5.0, 8.0):
-        driven = drive_along(problem, 0, **still(problem) | {"durations": np.full(1, duration)})
+        driven = drive_motions(problem, 0, **still(problem) | {"durations": np.full(1, duration)})
         arrivals.append(problem.dt * driven.arrivals[0])
     assert 4.3 < arrivals[0] < 5.0
     assert arrivals[1:] == pytest.approx([5.0, 8.0], abs=0.5)
@@ -244,7 +244,7 @@ def guided_places(problem: Problem, steps: int = 10, **changes: Any) -> np.ndarr
         steps,
         motions,
     )
-    places: np.ndarray = drive_along(problem, 0, **arguments).places[0]
+    places: np.ndarray = drive_motions(problem, 0, **arguments).places[0]
     return places
 
 
@@ -276,7 +276,7 @@ def test_obstacles_are_left_on_the_side_of_the_way() -> None:
     problem = lone_problem(world=World(boxes=[[1.5, 0.21, 2.5, 1.5]]))
     arguments = still(problem)
     arguments["motions"][0, MODES] = 0.5 / 4 / arguments["deviation"][MODES]
-    inside = drive_along(problem, 0, **arguments).clearances[0]
+    inside = drive_motions(problem, 0, **arguments).clearances[0]
     rules = surroundings(problem, clearance=0.22)
     guide(
         *(arguments[name] for name in ("frame", "sines", "deviation")),
@@ -285,7 +285,7 @@ def test_obstacles_are_left_on_the_side_of_the_way() -> None:
         20,
         arguments["motions"],
     )
-    assert inside < 0 < 0.18 < drive_along(problem, 0, **arguments).clearances[0]
+    assert inside < 0 < 0.18 < drive_motions(problem, 0, **arguments).clearances[0]
 
 
 # The search.

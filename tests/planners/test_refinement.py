@@ -18,9 +18,10 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
-from d4orm_planners.mapf.beam_search import BeamRules
-from d4orm_planners.mapf.beams import MotionPrimitives, OtherAgents, find_paths
+from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
+from d4orm_planners.mapf.beams import find_paths
 from d4orm_planners.mapf.lns import improve_paths
+from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import straight_drives
 
 STRAIGHT, STRICT = MotionPrimitives((45.0, 90.0), (1.0, 0.5, 0.0)), BeamRules(32, 1e6, 0.1)
@@ -99,14 +100,14 @@ def test_a_robot_minds_whom_it_is_told_to() -> None:
     straight = straight_drives(team.problem.select([0]))
     nobody = np.zeros((1, 0, 81, 2), np.float32)
     nobody_else = OtherAgents(np.array([[0, 1]]), nobody, np.zeros((1, 0)))
-    alone = find_paths(team, me, 0, STRAIGHT, STRICT, other_agents=nobody_else)
+    alone = find_paths(team, me, 0, STRAIGHT, STRICT, others=nobody_else)
     around = find_paths(team, me, 0, STRAIGHT, STRICT)
     assert arrival(alone) == arrival(straight)
     assert arrival(around) > arrival(alone)
     # Somebody who is not in the team stands where robot 1 does.
     there = np.broadcast_to(np.float32([1.5, 0]), (1, 1, 81, 2)).copy()
     others = OtherAgents(np.array([[0, 1]]), there, np.array([[0.15]]))
-    np.testing.assert_array_equal(find_paths(team, me, 0, STRAIGHT, STRICT, other_agents=others).states, around.states)
+    np.testing.assert_array_equal(find_paths(team, me, 0, STRAIGHT, STRICT, others=others).states, around.states)
 
 
 def test_a_path_that_costs_too_much_is_not_found() -> None:

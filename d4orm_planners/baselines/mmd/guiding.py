@@ -79,8 +79,8 @@ def guide(
     """Change motions so that they violate less.
 
     Args:
-        frame: The robot's :class:`~d4orm_planners.baselines.mmd.way_frame.WayFrame`.
-        sines: ``(N + 1, M)`` of :func:`~d4orm_planners.baselines.mmd.way_frame.sine_table`.
+        frame: The robot's :class:`~d4orm_planners.baselines.mmd.path_frame.PathFrame`.
+        sines: ``(N + 1, M)`` of :func:`~d4orm_planners.baselines.mmd.path_frame.sine_table`.
         deviation: ``(2 M,)`` of the modes.
         surroundings: Constraints on the motion.
         durations: ``(B,)`` of the motions [s].

@@ -17,7 +17,7 @@ from d4orm_planners.baselines.mmd.constraint_tree import Planning, Tree
 from d4orm_planners.baselines.mmd.guiding import guide
 from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
 from d4orm_planners.baselines.mmd.reverse_process import Denoiser
-from d4orm_planners.baselines.mmd.tracking import tracking_kernel
+from d4orm_planners.baselines.mmd.tracking import motion_kernel
 from d4orm_planners.mapf.planner import NoPaths
 
 Stretch = Annotated[Number, Field(ge=1, le=100)]
@@ -120,7 +120,7 @@ def _seeds(search: SolveRun, count: int) -> list[int]:
 
 def compile_mmd(problem: Problem) -> None:
     """Compile what the method needs for such a team, if it is not yet."""
-    if guide.signatures and all(tracking_kernel(name).signatures for name in problem.team.models):
+    if guide.signatures and all(motion_kernel(name).signatures for name in problem.team.models):
         return
     config = MMDConfig(num_samples=2, num_steps=1, guide_from=1.0, guide_steps=1)
     for robot in {name: number for number, name in enumerate(problem.team.models)}.values():

@@ -23,7 +23,7 @@ from d4orm_planners.baselines.mmd.prior import (
     posterior,
     predict,
 )
-from d4orm_planners.baselines.mmd.tracking import TrackedMotions, drive_along
+from d4orm_planners.baselines.mmd.tracking import TrackedMotions, drive_motions
 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig
@@ -94,7 +94,7 @@ class Denoiser:
                 guide(frame, self._sines, self._deviation, surroundings, durations, config.guide_steps, clean)
             motions = self._less_noisy(step, motions, clean, draw)
             done += 1
-        driven = drive_along(
+        driven = drive_motions(
             self._problem, robot, frame, self._sines, self._deviation, surroundings.space, durations, motions
         )
         return Batch(motions, durations, driven, done)

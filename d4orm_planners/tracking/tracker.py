@@ -1,0 +1,88 @@
+"""The loop that drives a robot along a reference under its own dynamics, compiled with numba.
+
+A reference is data and a guide, which says what velocity is wanted next: from point to point
+(:mod:`~d4orm_planners.tracking.straight_drives`), along a route as others let it pass
+(:mod:`~d4orm_planners.tracking.path_drives`), or by the clock (:mod:`~d4orm_planners.tracking.timed_path`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from d4orm_env.core.arrays import FloatArray, Whole
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics import transition
+from d4orm_env.dynamics.robot_model import Model, TimeStep
+from d4orm_env.engine.compiling import ZERO, inlined, to_fixed_tuple
+from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.stepping import Docking, make_stepper
+from d4orm_env.engine.tile_layout import Row
+
+Guide: TypeAlias = Callable[[Any, Any, int, Row, Row, Row, TimeStep], tuple[Row, Any, bool]]
+"""``(reference, memory, step, state, goal, limits, h) -> (velocity, memory, is_at_end)``: the velocity that is wanted,
+what the guide remembers for the next step, and whether the reference ends here: only there does a robot arrive that may
+be moved again."""
+Tracker: TypeAlias = Callable[[ProblemArrays, Whole, Any, Any, int, Row, bool, FloatArray, FloatArray], int]
+VelocityStep: TypeAlias = Callable[[Row, Row, Row, Row, Docking, TimeStep], tuple[Row, Row, bool]]
+
+
+def velocity_step(model: Model) -> VelocityStep:
+    """The compiled step of a robot of this model towards a velocity.
+
+    ``(state, velocity, limits, goal, docking, h) -> (control, state, has_arrived)``.
+    """
+    move, dock = make_stepper(model)
+    track, limit_control = inlined(model.functions.track), inlined(model.functions.limit_control)
+
+    @inlined
+    def step(x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep) -> tuple[Row, Row, bool]:
+        control = limit_control(track(x, velocity, limits, h, OPS), limits, OPS)
+        x, _, arrived = dock(False, move(False, x, control, limits, h), control, limits, goal, docking)
+        return control, x, arrived
+
+    return step
+
+
+def tracker(model: Model, guide: Guide) -> Tracker:
+    """The compiled loop for robots of this model along references of this guide.
+
+    ``(arrays, robot, reference, memory, first, state, arrived, controls, states) -> arrival`` drives a robot of the
+    team from its state at step ``first`` to the end of ``controls`` ``(H, m)``, fills these and ``states`` ``(H+1, n)``
+    after that step, and returns the step of arrival; ``H + 1`` for none. Where goals are absorbing it is at rest from
+    then on.
+    """
+    step_towards = velocity_step(model)
+    n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
+
+    @inlined
+    def drive(
+        arrays: ProblemArrays, robot: Whole, reference: Any, memory: Any, first: int, x: Row, arrived: bool,
+        controls: FloatArray, states: FloatArray,
+    ) -> int:  # fmt: skip
+        dt = arrays.time_step
+        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed[robot], arrays.docks)
+        h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
+        limits, goal = to_fixed_tuple(arrays.limits[robot], num_limits), to_fixed_tuple(arrays.goal[robot], d)
+        horizon = controls.shape[0]
+        arrival = first if arrived else horizon + 1
+        for step in range(first, horizon):
+            if transition.stands(arrived, arrays.docks):
+                for i in range(m):
+                    controls[step:, i] = ZERO
+                for i in range(n):
+                    states[step + 1 :, i] = x[i]
+                break
+            velocity, memory, is_at_end = guide(reference, memory, step, x, goal, limits, h)
+            control, x, arrived = step_towards(x, velocity, limits, goal, docking, h)
+            for i in range(m):
+                controls[step, i] = control[i]
+            for i in range(n):
+                states[step + 1, i] = x[i]
+            if not (arrived and (is_at_end or arrays.docks)):
+                arrival = horizon + 1
+            elif arrival > horizon:
+                arrival = step + 1
+        return arrival
+
+    return drive
