@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import cache, reduce
+from functools import reduce
 from typing import TypeVar
 
 import numpy as np
@@ -193,16 +193,6 @@ class DisturbedWorlds:
             bodies=self._bodies,
         )
 
-    def touched(self, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """Find the robots in ``states`` ``(B, K, n)`` that touch a dynamic obstacle, and those that are near one.
-
-        Returns:
-            Two arrays ``(B, K)`` bool; near is within the margin.
-        """
-        touched, near = np.empty((2, *states.shape[:2]), np.bool_)
-        _contact_kernel()(states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near)
-        return touched, near
-
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Observed:
         """Return the view of all worlds, or of some, as they are in ``scene``, which is always of all.
 
@@ -241,15 +231,6 @@ class DisturbedWorlds:
             one.draws[purpose] = draws = Draws(self._keys, scene.steps, one.stream, purpose, self._ahead)
         draws.turn_to(scene.steps)
         return draws
-
-
-@cache
-def _contact_kernel() -> Callable[..., None]:
-    # Here, because importing the compiler takes longer than importing all the rest of the package.
-    from d4orm_env.engine.moving_obstacles import meet_bodies
-
-    kernel: Callable[..., None] = meet_bodies
-    return kernel
 
 
 def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
