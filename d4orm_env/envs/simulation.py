@@ -25,7 +25,6 @@ from d4orm_env.envs.world_paths import WorldPaths
 from d4orm_env.envs.world_problems import WorldProblems
 from d4orm_env.paths.shortest_paths import observe_paths
 
-Worlds = NDArray[np.intp]
 _READ_BEFORE = ("state", "distance", "docked", "total_reward")
 """Inputs of rewards that a step overwrites."""
 
@@ -73,8 +72,6 @@ class Simulation:
         self.terms = no_terms(self.setup.reward, shape)
         self._paths = WorldPaths(self.problems.all, one_world=num_worlds == 1 or not self.setup.redraws)
         self._follows_paths = self.setup.along_paths or (self.setup.layout.observed_path and not self._observes_apart)
-        if self.setup.along_paths:
-            self._paths.first_length[:] = problem.shortest_paths.length
 
     @property
     def state_bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -106,10 +103,10 @@ class Simulation:
         self._observe(orders, out)
 
     def step_worlds(self, controls: FloatArray, out: FloatArray, restarts: Mapping[int, int] | None = None) -> None:
-        """Advance one time step under ``controls`` ``(B, K, m)``; those of docked robots do not matter.
+        """Advance one time step.
 
         Args:
-            controls: Controls.
+            controls: ``(B, K, m)``; those of docked robots do not matter.
             out: ``(B, K, D)`` observations, output.
             restarts: Seeds of the worlds that begin an episode instead.
 
@@ -186,8 +183,6 @@ class Simulation:
                 self._random[world] = np.random.default_rng(seed)
                 self.problems.begin(world, self._random[world], worlds)
                 self._goals_reached[world] = 0
-            if self.setup.along_paths:
-                self._paths.begin(world)
         indices = np.array(list(seeds), np.intp)
         self._disturbed.max_cycles = self.max_cycles
         self._disturbed.begin(indices, list(seeds.values()), worlds.start[indices], worlds.goal[indices])
@@ -251,7 +246,7 @@ class Simulation:
             observe_paths(seen, layout, *self._paths.look(worlds, inputs.state))
         out[worlds] = self._disturbed.observe(seen, layout)
 
-    def _look(self, worlds: Worlds) -> ObservationInputs:
+    def _look(self, worlds: NDArray[np.intp]) -> ObservationInputs:
         """Return the inputs to the observations of these worlds now, true or believed."""
         batch, every = self.worlds, len(worlds) == len(self.problems.all)
         seen, rows = self._disturbed.see(self._scene, None if every else worlds), slice(None) if every else worlds
@@ -289,11 +284,11 @@ class Simulation:
         worlds.total_reward[:] = before.total_reward + self.robot_rewards.sum(axis=1)
 
     def _reached(self) -> BoolArray:
-        worlds, reached = self.worlds, np.zeros_like(self.reached)
-        for world, problem in enumerate(self.problems.all):
-            arrays = self.problems.seen[world]._replace(goal=worlds.goal[world])
-            reached[world] = reached_goals(problem.team, arrays, worlds.state[world], worlds.control[world])
-        return reached
+        worlds, problems = self.worlds, self.problems
+        parts = zip(problems.all, problems.seen, worlds.goal, worlds.state, worlds.control)
+        return np.stack(
+            [reached_goals(one.team, seen._replace(goal=goal), *moved) for one, seen, goal, *moved in parts]
+        )
 
     def _assign_goals(self) -> None:
         """Give robots that have reached their goals others."""

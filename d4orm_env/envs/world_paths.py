@@ -22,18 +22,18 @@ class WorldPaths:
     Attributes:
         direction: ``(B, K, d)`` unit vectors.
         length: ``(B, K)`` [m].
-        first_length: ``(B, K)`` from the starts [m].
     """
 
     def __init__(self, problems: Sequence[Problem], *, one_world: bool) -> None:
         self._problems, self._one_world = problems, one_world
         shape = len(problems), problems[0].num_robots
         self.direction: Floats = np.zeros((*shape, problems[0].dimension))
-        self.length, self.first_length = np.zeros(shape), np.zeros(shape)
+        self.length: Floats = np.zeros(shape)
 
-    def begin(self, world: int) -> None:
-        """Note the length of the paths from the starts of a world."""
-        self.first_length[world] = self._problems[world].shortest_paths.length
+    @property
+    def first_length(self) -> Floats:
+        """``(B, K)`` length of the paths from the starts [m]."""
+        return np.stack([problem.shortest_paths.length for problem in self._problems])
 
     def update(self, worlds: NDArray[np.intp], states: FloatArray) -> None:
         """Look for the paths in some worlds, where the robots are in ``states`` ``(B, K, n)``."""
