@@ -81,8 +81,7 @@ class Simulation:
     @property
     def ended(self) -> BoolArray:
         """``(B,)`` bool, episodes that are over."""
-        ended: BoolArray = self.worlds.terminated | self.worlds.truncated
-        return ended
+        return np.asarray(self.worlds.terminated | self.worlds.truncated)
 
     def reset_worlds(self, seeds: Mapping[int, int], out: FloatArray, *, others: np.uint8 = LOOK) -> None:
         """Begin episodes.
@@ -116,7 +115,7 @@ class Simulation:
         worlds, before = self.worlds, None
         if self.setup.reward is not None:
             before = worlds._replace(**{name: getattr(worlds, name).copy() for name in _READ_BEFORE})
-        length = self._paths.length.copy()
+        length = self._paths.length.copy() if self._follows_paths else self._paths.length
         orders = np.full(len(worlds.steps), self._move(self._act(controls)))
         if restarts:
             self._begin(restarts)
@@ -143,11 +142,10 @@ class Simulation:
             ValueError: If the states have another shape, are not finite, faster than the robots may be, outside the
                 state space, have padding that is not zero, or move a docked robot. Contact is allowed.
         """
-        worlds, problem = self.worlds, self.problems.all[0]
+        problem, shape = self.problems.all[0], self.worlds.docked.shape
         checked = checked_states(problem, states, docked & problem.docks, self.state_bounds)
-        self._put(checked.reshape(worlds.state.shape))
-        self.terms = no_terms(self.setup.reward, worlds.docked.shape)
-        orders = np.full(len(self.problems.all), LOOK)
+        self._put(checked.reshape(*shape, -1))
+        self.terms, orders = no_terms(self.setup.reward, shape), np.full(shape[0], LOOK)
         self._advance(orders, out)
         self._observe(orders, out)
 
@@ -190,10 +188,8 @@ class Simulation:
 
     @property
     def _scene(self) -> Scene:
-        worlds = self.worlds
-        return self._disturbed.scene(
-            worlds.start, worlds.goal, worlds.state, worlds.control, worlds.docked, worlds.steps
-        )
+        now = self.worlds
+        return self._disturbed.scene(now.start, now.goal, now.state, now.control, now.docked, now.steps)
 
     def _act(self, controls: FloatArray) -> FloatArray:
         """Disturb states and controls at the beginning of a step, and return the controls."""
@@ -235,8 +231,8 @@ class Simulation:
                 observe_paths(out, layout, self._paths.direction, self._paths.length)
             return
         worlds = np.flatnonzero(orders != SKIP)
-        inputs = self._look(worlds)
-        seen: FloatArray = np.empty((len(worlds), *out.shape[1:]), np.float32)
+        inputs, every = self._look(worlds), len(worlds) == len(out)
+        seen: FloatArray = out if every else np.empty((len(worlds), *out.shape[1:]), np.float32)
         if self.problems.alike:
             self._engine.observe_worlds(self.problems.seen[0], layout, inputs, seen)
         for row, world in enumerate(() if self.problems.alike else worlds):
@@ -244,12 +240,17 @@ class Simulation:
             self._engine.observe_worlds(self.problems.seen[world], layout, inputs.select(one), seen[one])
         if layout.observed_path:
             observe_paths(seen, layout, *self._paths.look(worlds, inputs.state))
-        out[worlds] = self._disturbed.observe(seen, layout)
+        seen = self._disturbed.observe(seen, layout)
+        if seen is not out:
+            out[worlds] = seen
 
     def _look(self, worlds: NDArray[np.intp]) -> ObservationInputs:
         """Return the inputs to the observations of these worlds now, true or believed."""
-        batch, every = self.worlds, len(worlds) == len(self.problems.all)
-        seen, rows = self._disturbed.see(self._scene, None if every else worlds), slice(None) if every else worlds
+        batch, every = self.worlds, len(worlds) == len(self.worlds.steps)
+        if every and not self.setup.disturbances:
+            seen = self.true
+        else:
+            seen = self._disturbed.see(self._scene, None if every else worlds)
         if every:
             self._seen = seen
         else:
@@ -257,18 +258,19 @@ class Simulation:
             self._seen = Observed(*(np.array(part) for part in self.seen))
             for past, new in zip(self._seen, seen):
                 past[worlds] = new
-        states, controls, bodies = (part[rows] for part in self._seen)
+        rows = slice(None) if every else worlds
         time_left = np.maximum(0.0, 1.0 - batch.steps[rows] / self.max_cycles).astype(np.float32)
-        return ObservationInputs(batch.goal[rows], states, controls, batch.docked[rows], bodies, time_left)
+        return ObservationInputs(batch.goal[rows], *seen[:2], batch.docked[rows], seen.bodies, time_left)
 
     def _reward(self, before: WorldBatch | None, length: Floats, restarted: list[int]) -> None:
         """Give the robots rewards for the step from ``before``, with paths of ``length``; none where one restarted."""
         worlds = self.worlds
         self.robot_rewards = worlds.rewards.copy()
-        self.robot_rewards[restarted] = 0
+        if restarted:
+            self.robot_rewards[restarted] = 0
         if self.setup.reward is None or before is None:
             return
-        for name in _READ_BEFORE:
+        for name in _READ_BEFORE if restarted else ():
             getattr(before, name)[restarted] = getattr(worlds, name)[restarted]
         problem, rows = self.problems.all[0], self.reward_rows
         step = RewardInput.of_worlds(before, worlds, self.robot_rewards, self.reached, problem, rows)
@@ -278,7 +280,7 @@ class Simulation:
         rewards, terms = compute_rewards(self.setup.reward, step)
         self.robot_rewards = rewards.reshape(worlds.docked.shape)
         self.terms = {name: term.reshape(worlds.docked.shape) for name, term in terms.items()}
-        for values in (self.robot_rewards, *self.terms.values()):
+        for values in (self.robot_rewards, *self.terms.values()) if restarted else ():
             values[restarted] = 0
         worlds.reward[:] = self.robot_rewards.mean(axis=1)
         worlds.total_reward[:] = before.total_reward + self.robot_rewards.sum(axis=1)
