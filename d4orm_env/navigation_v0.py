@@ -65,7 +65,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         self.turn_taker: AECNavigationEnv | None = None
 
     def _make_spaces(self) -> None:
-        layout = self._simulation.layout
+        layout = self._simulation.setup.layout
         limit = self.problem.team.control_limits.max(axis=0)
         box = gymnasium.spaces.Box
         self.observation_spaces = {agent: box(layout.low, layout.high) for agent in self.possible_agents}

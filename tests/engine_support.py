@@ -43,7 +43,9 @@ def observe_team(
 ) -> np.ndarray:
     """``(K, D)`` what the robots of one team see."""
     out = np.empty((1, len(states), layout.size), np.float32)
-    sight = ObservationInputs.of_team(arrays.goal, states, controls, arrived, time_left)
+    parts = [np.array(part)[None] for part in (arrays.goal, states, controls, arrived)]
+    nothing = np.empty((1, 0, 2 * arrays.goal.shape[1] + 1), np.float32)
+    sight = ObservationInputs(*parts, nothing, np.array([time_left], np.float32))
     get_sampling_engine("cpu").observe_worlds(arrays, layout, sight, out)
     return out[0]
 

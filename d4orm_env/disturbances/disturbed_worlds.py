@@ -8,22 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import reduce
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
-from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, DisturbanceEffect, Memory, Observed, Scene
 from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
-
-if TYPE_CHECKING:
-    from d4orm_env.engine import moving_obstacles
-else:
-    moving_obstacles = LazyModule("d4orm_env.engine.moving_obstacles")
 
 Worlds = NDArray[np.intp]
 
@@ -198,18 +192,6 @@ class DisturbedWorlds:
             lost=_together(np.logical_or, [effect.lost for effect in effects]),
             bodies=self._bodies,
         )
-
-    def touched(self, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """Find the robots in ``states`` ``(B, K, n)`` that touch a dynamic obstacle, and those that are near one.
-
-        Returns:
-            Two arrays ``(B, K)`` bool; near is within the margin.
-        """
-        touched, near = np.empty((2, *states.shape[:2]), np.bool_)
-        moving_obstacles.meet_bodies(
-            states, self.problem.team.radius, self._bodies, self.problem.arrays.margin, touched, near
-        )
-        return touched, near
 
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Observed:
         """Return the view of all worlds, or of some, as they are in ``scene``, which is always of all.

@@ -10,15 +10,10 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.episodes import WorldBatch
 from d4orm_env.engine.observing import ObservationSpec
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.types import (
-    ObservationInputs,
-    StepResult,
-    checked_controls,
-)
+from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
 from d4orm_env.engine.world_tiles import WorldArrays
 from d4orm_env.engine.worlds import WorldKernels, kernels_of_codes
 
@@ -37,12 +32,6 @@ class CpuEngine:
         return StepResult(
             after.state[1], after.control[1], after.docked[1], after.collided[1], after.violated[1], after.rewards[1]
         )
-
-    def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """See :meth:`d4orm_env.engine.types.WorldEngine.contacts`."""
-        robots = len(states)
-        here = _rolled_out(arrays, states, np.zeros(robots, bool), np.zeros((0, robots, 1), np.float32))
-        return here.collided[0], here.violated[0]
 
     def observe_worlds(
         self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
@@ -104,7 +93,8 @@ def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, co
     rewards = np.empty(arrived.shape, np.float32)
     state[0], arrived[0], control[1:] = states, docked, controls
     goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
-    moments = WorldArrays(goal, inverse, state, control, arrived, collided, violated, rewards)
+    nothing = np.empty((0, 0, 2 * goal.shape[-1] + 1), np.float32)
+    moments = WorldArrays(goal, inverse, state, control, arrived, nothing, collided, violated, rewards)
     _kernels(arrays).roll_out(arrays, moments)
     return moments
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
+from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
@@ -24,80 +23,8 @@ from d4orm_env.engine.tiles import (
     motion_reader,
     robot_mover,
 )
+from d4orm_env.engine.types import MOVED, RESET, SKIP, STEP, WorldBatch
 from d4orm_env.engine.world_tiles import check_contacts, load, load_world, store_world
-
-STEP, RESET, LOOK, SKIP = (np.uint8(order) for order in range(4))
-"""Orders for a world: step it, put it back to its start, only observe it, or leave it alone altogether."""
-
-
-class WorldBatch(NamedTuple):
-    """``B`` worlds in the middle of their episodes; kernels change them in place.
-
-    Attributes:
-        start: ``(B, K, n)`` where an episode begins.
-        goal: ``(B, K, d)``.
-        inverse: ``(B, K)`` one over the start distances.
-        state: ``(B, K, n)``.
-        control: ``(B, K, m)``; what to do goes in, what was executed comes out.
-        docked: ``(B, K)`` bool.
-        steps: ``(B,)`` int64 steps since the reset.
-        distance: ``(B, K)`` to the goals.
-        collided: ``(B, K)`` bool, hard contact.
-        violated: ``(B, K)`` bool, within the margin.
-        rewards: ``(B, K)`` of each robot where it is now.
-        reward: ``(B,)`` float64 mean of the team in the last step; zero at a reset.
-        terminated: ``(B,)`` bool: all have docked.
-        truncated: ``(B,)`` bool: out of time before that.
-        total_reward: ``(B,)`` float64 sum over robots and steps of the episode.
-        arrival: ``(B, K)`` int64 step since which a robot is at its goal, 0 for not there.
-        contacts: ``(B, K)`` int64 steps in contact.
-        violations: ``(B, K)`` int64 steps within the margin.
-    """
-
-    start: FloatArray
-    goal: FloatArray
-    inverse: FloatArray
-    state: FloatArray
-    control: FloatArray
-    docked: BoolArray
-    steps: IntArray
-    distance: FloatArray
-    collided: BoolArray
-    violated: BoolArray
-    rewards: FloatArray
-    reward: Floats
-    terminated: BoolArray
-    truncated: BoolArray
-    total_reward: Floats
-    arrival: IntArray
-    contacts: IntArray
-    violations: IntArray
-
-    @classmethod
-    def of(cls, start: FloatArray, goal: FloatArray, inverse: FloatArray, control_size: int) -> WorldBatch:
-        """Worlds with these starts and goals, all values but those still to be set by a reset."""
-        worlds, robots = inverse.shape
-        flags, counts = np.zeros((worlds, robots), np.bool_), np.zeros((worlds, robots), np.int64)
-        return cls(
-            start=np.array(start, np.float32),
-            goal=np.array(goal, np.float32),
-            inverse=np.array(inverse, np.float32),
-            state=np.array(start, np.float32),
-            control=np.zeros((worlds, robots, control_size), np.float32),
-            docked=flags.copy(),
-            steps=np.zeros(worlds, np.int64),
-            distance=np.zeros((worlds, robots), np.float32),
-            collided=flags.copy(),
-            violated=flags.copy(),
-            rewards=np.zeros((worlds, robots), np.float32),
-            reward=np.zeros(worlds),
-            terminated=np.zeros(worlds, np.bool_),
-            truncated=np.zeros(worlds, np.bool_),
-            total_reward=np.zeros(worlds),
-            arrival=counts.copy(),
-            contacts=counts.copy(),
-            violations=counts.copy(),
-        )
 
 
 @compiled
@@ -115,7 +42,7 @@ def _restart(batch: WorldBatch, b: int) -> None:
 
 
 @compiled
-def _restart_tile(batch: WorldBatch, orders: NDArray[np.uint8], first: int, count: int) -> tuple[bool, bool]:
+def _prepare_tile(batch: WorldBatch, orders: NDArray[np.uint8], first: int, count: int) -> tuple[bool, bool]:
     """Reset the worlds of a tile that are to be reset, and say whether any is to be stepped, or not to be skipped."""
     moving, busy = False, False
     for b in range(first, first + count):
@@ -123,6 +50,8 @@ def _restart_tile(batch: WorldBatch, orders: NDArray[np.uint8], first: int, coun
         busy |= orders[b] != SKIP
         if orders[b] == RESET:
             _restart(batch, b)
+        for k in range(batch.collided.shape[1]):
+            batch.collided[b, k] &= orders[b] == MOVED or orders[b] == SKIP
     return moving, busy
 
 
@@ -184,7 +113,8 @@ def advance_worlds_kernel(
         arrays: The problem that the worlds share; its starts and goals are not looked at.
         view: Contents of an observation, a :class:`ObservationSpec`.
         max_cycles: Steps in an episode.
-        orders: ``(B,)`` uint8, one of ``STEP``, ``RESET``, ``LOOK`` and ``SKIP`` for every world.
+        orders: ``(B,)`` uint8, one of ``STEP``, ``MOVED``, ``RESET``, ``LOOK`` and ``SKIP`` for every
+            world.
         batch: The worlds, a :class:`WorldBatch`.
         tile_range: First tile of worlds and the one after the last.
         out: ``(B, K, D)`` observations; those of skipped worlds are not written. ``(0, K, D)`` leaves them to
@@ -206,12 +136,12 @@ def advance_worlds_kernel(
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
-        near = np.empty((num_robots, 2), np.uint64)
+        near = np.empty((num_robots, 3), np.uint64)
         sensed = allocate_sensed(num_robots, 0, dimension, view.num_neighbors, view.num_obstacles)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             count = min(TILE, orders.shape[0] - first)
-            moving, busy = _restart_tile(batch, orders, first, count)
+            moving, busy = _prepare_tile(batch, orders, first, count)
             if not busy:
                 continue
             load(batch, first, w)
@@ -222,7 +152,7 @@ def advance_worlds_kernel(
             for b in range(first, first + count):
                 if orders[b] == SKIP:
                     continue
-                if orders[b] == STEP:
+                if orders[b] <= MOVED:
                     _tally(batch, max_cycles, b)
                 for k in range(num_robots):
                     batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + b - first])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -18,12 +18,8 @@ from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zero
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
-from d4orm_env.engine.types import ObservationInputs
+from d4orm_env.engine.types import ObservationInputs, WorldBatch
 from d4orm_env.engine.world_tiles import WorldArrays, load
-
-if TYPE_CHECKING:
-    from d4orm_env.engine.episodes import WorldBatch
-
 
 for _function in (
     observation.observe_robot,

@@ -4,7 +4,7 @@ A tile is a block of :data:`~d4orm_env.engine.simd.TILE` worlds (samples of a pl
 their numbers only. All a tile needs lies in one flat float32 array, the workspace: for every robot :data:`ROWS` rows,
 every row one number per world. So every inner loop runs over worlds with distances between its operands that the
 compiler knows, which is what lets it vectorise without checking for overlap, and the tile stays in cache while all
-robots and pairs are visited. Who is near what is kept apart, in ``near`` ``(K, 2)``: a bit for every world.
+robots and pairs are visited. Who is near what is kept apart, in ``near`` ``(K, 3)``: a bit for every world.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STATE, CONTROL, GOAL, DOCKED, DISTANCE2, BUFFER, ROWS = 0, 6, 10, 13, 14, 15, 17
 STRIDE = ROWS * TILE
 
 # Columns of ``near``.
-ROBOT, OBSTACLE = 0, 1
+ROBOT, OBSTACLE, DYNAMIC = 0, 1, 2
 RobotMover: TypeAlias = Callable[[ProblemArrays, int, FloatArray], None]
 MotionReader: TypeAlias = Callable[[ProblemArrays, int, int, FloatArray, FloatArray, FloatArray], None]
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import LARGEST_NUMBER, BoolArray, FloatArray, as_float32
+from d4orm_env.core.arrays import LARGEST_NUMBER, BoolArray, FloatArray, Floats, IntArray, as_float32
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from d4orm_env.engine.episodes import WorldBatch
 
 
 class StepResult(NamedTuple):
@@ -35,20 +32,6 @@ class StepResult(NamedTuple):
     collided: BoolArray
     margin_violated: BoolArray
     rewards: FloatArray
-
-    def with_contacts(self, touched: BoolArray, near: BoolArray, penalty: np.float32) -> StepResult:
-        """The step with contacts that the engine does not know of, as with dynamic obstacles.
-
-        Args:
-            touched: ``(K,)`` robots in contact.
-            near: ``(K,)`` robots within the margin, which pay for it.
-            penalty: What they pay.
-        """
-        return self._replace(
-            collided=self.collided | touched,
-            margin_violated=self.margin_violated | near,
-            rewards=self.rewards - penalty * near.astype(np.float32),
-        )
 
 
 class Engine(Protocol):
@@ -88,40 +71,97 @@ class ObservationInputs(NamedTuple):
     bodies: FloatArray
     time_left: FloatArray
 
-    @classmethod
-    def of_team(
-        cls,
-        goal: FloatArray,
-        state: FloatArray,
-        control: FloatArray,
-        docked: BoolArray,
-        time_left: float,
-        bodies: FloatArray | None = None,
-    ) -> ObservationInputs:
-        """Make those of one world, in arrays of its own: kernels are compiled anew for read-only ones."""
-        if bodies is None:
-            bodies = np.empty((0, 2 * goal.shape[1] + 1), np.float32)
-        one = np.newaxis
-        return cls(
-            np.array(goal, np.float32)[one],
-            np.array(state, np.float32)[one],
-            np.array(control, np.float32)[one],
-            np.array(docked, np.bool_)[one],
-            np.array(bodies, np.float32)[one],
-            np.array([time_left], np.float32),
-        )
-
-    def of(self, worlds: slice) -> ObservationInputs:
+    def select(self, worlds: slice) -> ObservationInputs:
         """The same of some of the worlds."""
         return ObservationInputs(*(part[worlds] for part in self))  # type: ignore[arg-type]
 
 
+OWN_ARRAYS = ("start", "goal", "inverse_initial_distance")
+"""Arrays of a problem that differ from world to world in one kernel call."""
+STEP, MOVED, RESET, LOOK, SKIP = (np.uint8(order) for order in range(5))
+"""Orders for a world: step it, count a step in which another physics has moved it, put it back to its start, only
+observe it, or leave it alone altogether."""
+
+
+class WorldBatch(NamedTuple):
+    """``B`` worlds in the middle of their episodes; kernels change them in place.
+
+    Attributes:
+        start: ``(B, K, n)`` where an episode begins.
+        goal: ``(B, K, d)``.
+        inverse: ``(B, K)`` one over the start distances.
+        state: ``(B, K, n)``.
+        control: ``(B, K, m)``; what to do goes in, what was executed comes out.
+        docked: ``(B, K)`` bool.
+        steps: ``(B,)`` int64 steps since the reset.
+        distance: ``(B, K)`` to the goals.
+        bodies: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, after the step.
+        collided: ``(B, K)`` bool, hard contact; after ``MOVED``, what was in contact within the step goes in.
+        violated: ``(B, K)`` bool, within the margin.
+        rewards: ``(B, K)`` of each robot where it is now.
+        reward: ``(B,)`` float64 mean of the team in the last step; zero at a reset.
+        terminated: ``(B,)`` bool: all have docked.
+        truncated: ``(B,)`` bool: out of time before that.
+        total_reward: ``(B,)`` float64 sum over robots and steps of the episode.
+        arrival: ``(B, K)`` int64 step since which a robot is at its goal, 0 for not there.
+        contacts: ``(B, K)`` int64 steps in contact.
+        violations: ``(B, K)`` int64 steps within the margin.
+    """
+
+    start: FloatArray
+    goal: FloatArray
+    inverse: FloatArray
+    state: FloatArray
+    control: FloatArray
+    docked: BoolArray
+    steps: IntArray
+    distance: FloatArray
+    bodies: FloatArray
+    collided: BoolArray
+    violated: BoolArray
+    rewards: FloatArray
+    reward: Floats
+    terminated: BoolArray
+    truncated: BoolArray
+    total_reward: Floats
+    arrival: IntArray
+    contacts: IntArray
+    violations: IntArray
+
+    @classmethod
+    def from_problem(cls, problem: Problem, num_worlds: int, num_bodies: int = 0) -> WorldBatch:
+        """Worlds of one problem, all values but those of :data:`OWN_ARRAYS` still to be set by a reset."""
+        start, goal, inverse = (np.repeat(getattr(problem.arrays, name)[None], num_worlds, 0) for name in OWN_ARRAYS)
+        flags, counts = np.zeros(inverse.shape, np.bool_), np.zeros(inverse.shape, np.int64)
+        return cls(
+            start=start,
+            goal=goal,
+            inverse=inverse,
+            state=start.copy(),
+            control=np.zeros((*inverse.shape, problem.control_size), np.float32),
+            docked=flags.copy(),
+            steps=np.zeros(num_worlds, np.int64),
+            distance=np.zeros_like(inverse),
+            bodies=np.zeros((num_worlds, num_bodies, 2 * problem.dimension + 1), np.float32),
+            collided=flags.copy(),
+            violated=flags.copy(),
+            rewards=np.zeros_like(inverse),
+            reward=np.zeros(num_worlds),
+            terminated=np.zeros(num_worlds, np.bool_),
+            truncated=np.zeros(num_worlds, np.bool_),
+            total_reward=np.zeros(num_worlds),
+            arrival=counts.copy(),
+            contacts=counts.copy(),
+            violations=counts.copy(),
+        )
+
+    def select(self, worlds: slice) -> WorldBatch:
+        """Some of the worlds, which share their memory with these."""
+        return WorldBatch(*(part[worlds] for part in self))  # type: ignore[arg-type]
+
+
 class WorldEngine(Engine, Protocol):
     """An engine with what environments need as well."""
-
-    def contacts(self, arrays: ProblemArrays, states: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """``(collided (K,), margin_violated (K,))`` of a team at rest at ``states`` ``(K, n)``."""
-        ...
 
     def observe_worlds(
         self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
@@ -144,7 +184,7 @@ class WorldEngine(Engine, Protocol):
             arrays: The problem that the worlds share; each has its own starts and goals.
             layout: Components of an observation, and their bounds.
             max_cycles: Steps in an episode.
-            orders: ``(B,)`` one of :data:`~d4orm_env.engine.episodes.STEP` and its like for every world.
+            orders: ``(B,)`` one of :data:`STEP` and its like for every world.
             batch: The worlds; ``batch.control`` holds what to do.
             out: ``(B, K, D)`` observations, output; those of skipped worlds are not written. ``(0, K, D)`` makes none.
         """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from d4orm_env.engine.tiles import (
     CONTROL,
     DISTANCE2,
     DOCKED,
+    DYNAMIC,
     GOAL,
     OBSTACLE,
     ROBOT,
@@ -26,10 +27,7 @@ from d4orm_env.engine.tiles import (
     STRIDE,
     mark_pairs,
 )
-from d4orm_env.engine.types import ObservationInputs
-
-if TYPE_CHECKING:
-    from d4orm_env.engine.episodes import WorldBatch
+from d4orm_env.engine.types import ObservationInputs, WorldBatch
 
 
 class WorldArrays(NamedTuple):
@@ -41,7 +39,8 @@ class WorldArrays(NamedTuple):
         state: ``(B, K, n)``.
         control: ``(B, K, m)``; what to do goes in, what was executed comes out.
         docked: ``(B, K)`` bool.
-        collided: ``(B, K)`` bool, hard contact.
+        bodies: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, or ``(0, 0, 2 d + 1)``.
+        collided: ``(B, K)`` bool, hard contact; those known already go in, all come out.
         violated: ``(B, K)`` bool, within the margin.
         rewards: ``(B, K)`` of each robot where it is.
     """
@@ -51,6 +50,7 @@ class WorldArrays(NamedTuple):
     state: FloatArray
     control: FloatArray
     docked: BoolArray
+    bodies: FloatArray
     collided: BoolArray
     violated: BoolArray
     rewards: FloatArray
@@ -91,6 +91,24 @@ def store_world(worlds: WorldArrays | WorldBatch, b: int, s: Whole, w: FloatArra
 
 
 @inlined
+def _mark_bodies(
+    arrays: ProblemArrays, bodies: FloatArray, first: int, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]
+) -> None:
+    """Flag every robot closer to a dynamic obstacle of its world than their radii plus ``extra``."""
+    num_robots, dimension = arrays.goal.shape
+    for s in range(min(TILE, bodies.shape[0] - first)):
+        for k in range(num_robots):
+            for i in range(bodies.shape[1]):
+                gap2 = ZERO
+                for axis in range(dimension):
+                    gap = bodies[first + s, i, axis] - w[k * STRIDE + (STATE + axis) * TILE + s]
+                    gap2 += gap * gap
+                distance = arrays.radius[k] + bodies[first + s, i, 2 * dimension] + extra
+                if gap2 <= distance * distance:
+                    near[k, DYNAMIC] |= np.uint64(1) << np.uint64(s)
+
+
+@inlined
 def _bit(mask: np.uint64, s: int) -> np.uint64:
     return (mask >> np.uint64(s)) & np.uint64(1)
 
@@ -99,27 +117,31 @@ def _bit(mask: np.uint64, s: int) -> np.uint64:
 def check_contacts(
     arrays: ProblemArrays, worlds: WorldArrays | WorldBatch, first: int, w: FloatArray, near: NDArray[np.uint64]
 ) -> None:
-    """Flag contacts and margin violations of the worlds of a tile, and compute rewards."""
-    num_robots = arrays.radius.shape[0]
+    """Complete the flags of contacts and margin violations of the worlds of a tile, then compute the rewards."""
+    num_robots, count = arrays.radius.shape[0], min(TILE, worlds.state.shape[0] - first)
     for k in range(num_robots):
-        near[k, ROBOT] = near[k, OBSTACLE] = NOWHERE
+        near[k, ROBOT] = near[k, OBSTACLE] = near[k, DYNAMIC] = NOWHERE
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
-        flags = worlds.collided if level == 0 else worlds.violated
         mark_pairs(arrays, extra, w, near)
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
             near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
-        for s in range(min(TILE, flags.shape[0] - first)):
+        _mark_bodies(arrays, worlds.bodies, first, extra, w, near)
+        flags = worlds.collided if level == 0 else worlds.violated
+        for s in range(count):
             for k in range(num_robots):
-                flags[first + s, k] = _bit(near[k, ROBOT] | near[k, OBSTACLE], s) != NOWHERE
-    for s in range(min(TILE, worlds.rewards.shape[0] - first)):
+                here = _bit(near[k, ROBOT] | near[k, OBSTACLE] | near[k, DYNAMIC], s) != NOWHERE
+                flags[first + s, k] = here or worlds.collided[first + s, k]
+    for s in range(count):
         own = min(first + s, worlds.inverse.shape[0] - 1)
         for k in range(num_robots):
+            robots, bounds, dynamic = _bit(near[k, ROBOT], s), _bit(near[k, OBSTACLE], s), _bit(near[k, DYNAMIC], s)
+            # A body that was touched within the step and is gone counts as a dynamic obstacle.
+            dynamic |= np.uint64(worlds.violated[first + s, k]) ^ (robots | bounds | dynamic)
             worlds.rewards[first + s, k] = reward.step_reward(
                 np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), worlds.inverse[own, k],
-                np.float32(_bit(near[k, ROBOT], s)), np.float32(_bit(near[k, OBSTACLE], s)),
-                arrays.collision_penalty, ONE,
+                (np.float32(robots), np.float32(bounds), np.float32(dynamic)), arrays.collision_penalty, ONE,
             )  # fmt: skip

@@ -17,12 +17,12 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import COMMON, names_of_codes
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, aligned_zeros
-from d4orm_env.engine.episodes import WorldBatch, advance_worlds_kernel
+from d4orm_env.engine.episodes import advance_worlds_kernel
 from d4orm_env.engine.observing import ObservationSpec, observe_worlds_kernel
 from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, robot_mover
-from d4orm_env.engine.types import ObservationInputs
+from d4orm_env.engine.types import ObservationInputs, WorldBatch
 from d4orm_env.engine.world_tiles import WorldArrays, check_contacts, load, load_world, store_world
 
 
@@ -40,7 +40,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
-        near = np.empty((num_robots, 2), np.uint64)
+        near = np.empty((num_robots, 3), np.uint64)
         lane = np.int64(0)  # a literal zero would compile what it is passed to once more
         state, docked = moments.state, moments.docked
         for t in range(1, state.shape[0]):

@@ -6,7 +6,8 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import DisturbanceEffect
 from d4orm_env.envs.options import EnvOptions
-from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.setup import EnvSetup
+from d4orm_env.envs.team_simulation import TeamSimulation
 from d4orm_env.envs.viewer import Frame, Viewer
 
 
@@ -22,9 +23,9 @@ class BaseEnv:
         self._simulation = self._make_simulation(options)
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}
 
-    def _make_simulation(self, options: EnvOptions) -> Simulation:
+    def _make_simulation(self, options: EnvOptions) -> TeamSimulation:
         """Make the environment's simulation; one with another physics overrides it."""
-        return Simulation(options)
+        return TeamSimulation(EnvSetup(options))
 
     def _make_viewer(self, options: EnvOptions) -> Viewer:
         return Viewer(options.render_mode)
@@ -37,7 +38,7 @@ class BaseEnv:
     @property
     def lifelong(self) -> bool:
         """True if robots that arrive get fresh goals instead of staying there."""
-        return self._simulation.lifelong
+        return self._simulation.setup.lifelong
 
     def state(self) -> FloatArray:
         """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.envs.joint_state`.
@@ -64,7 +65,7 @@ class BaseEnv:
         return self._simulation.effect()
 
     def metrics(self) -> dict[str, float]:
-        """The episode so far in numbers; see :meth:`d4orm_env.envs.episode_record.EpisodeRecord.metrics`.
+        """The episode so far in numbers; see :func:`d4orm_env.envs.episode_metrics.episode_metrics`.
 
         Raises:
             RuntimeError: Before the first reset.

@@ -26,21 +26,19 @@ def checked_states(
     states: ArrayLike,
     docked: BoolArray,
     bounds: tuple[FloatArray, FloatArray],
-    shape: tuple[int, ...],
 ) -> FloatArray:
-    """``states`` as an array of that shape, ``(..., K, n)``, as robots may be put into.
+    """``states`` as an array ``(..., K, n)``, as robots may be put into.
 
     Args:
         problem: The problem.
         states: States as given.
-        docked: ``(..., K)`` bool.
+        docked: ``(..., K)`` bool, robots that must be at rest.
         bounds: Lowest and highest joint state; see :func:`d4orm_env.envs.joint_state.state_bounds`.
-        shape: The shape expected.
 
     Raises:
         ValueError: If a state is none that a robot may be in; the message names the robot.
     """
-    array = frozen_array(states, "states", shape, largest=LARGEST)
+    array = frozen_array(states, "states", (*docked.shape, problem.state_size), largest=LARGEST)
     low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
     for team in array.reshape(-1, *problem.start.shape):
         check_states(problem.team, team, "state")

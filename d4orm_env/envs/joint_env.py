@@ -10,7 +10,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.envs.base_env import BaseEnv
 from d4orm_env.envs.inputs import check_options, joint_controls
 from d4orm_env.envs.options import EnvOptions
-from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.team_step import Info, TeamStep, agent_infos
 from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.scenarios.problems import ScenarioLike
@@ -43,7 +43,7 @@ class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
     def __init__(self, scenario: ScenarioLike | None = None, num_robots: int | None = None, **options: object) -> None:
         self._begin(EnvOptions.of(scenario=scenario, num_robots=num_robots, **options))
         self._agents = [f"robot_{robot}" for robot in range(self.problem.num_robots)]
-        self.observation_space, self.action_space = joint_spaces(self._simulation)
+        self.observation_space, self.action_space = joint_spaces(self._simulation.setup)
         self._action_shape = (self.problem.num_robots * self.problem.control_size,)
 
     def reset(self, *, seed: int | None = None, options: dict[str, object] | None = None) -> tuple[FloatArray, Info]:
@@ -107,9 +107,9 @@ class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
         }
 
 
-def joint_spaces(simulation: Simulation) -> tuple[gymnasium.Space[FloatArray], gymnasium.Space[FloatArray]]:
+def joint_spaces(setup: EnvSetup) -> tuple[gymnasium.Space[FloatArray], gymnasium.Space[FloatArray]]:
     """Spaces of the joint observation ``(K * D,)`` and of the joint action ``(K * m,)``."""
-    team, layout = simulation.problem.team, simulation.layout
+    team, layout = setup.problem.team, setup.layout
     limits = team.control_limits
     # Padding has no limit of its own; a box must not be flat.
     limits = np.where(limits > 0, limits, limits.max(axis=0)).ravel()

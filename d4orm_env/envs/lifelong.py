@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.transition import arrives
+from d4orm_env.engine.types import WorldBatch
 
 _BATCH = 256
 _ATTEMPTS = 20
@@ -46,6 +48,26 @@ def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, control
         (offsets * offsets).sum(axis=1), squared_speed, arrays.squared_goal_radius, arrays.squared_goal_speed
     )
     return reached
+
+
+def assign_goals(problem: Problem, robots: NDArray[np.intp], world: WorldBatch, random: np.random.Generator) -> None:
+    """Give some robots of a batch of one world fresh goals, and distances from there.
+
+    Args:
+        problem: The problem.
+        robots: Their numbers.
+        world: The world, which is changed.
+        random: Generator of the draws.
+
+    Raises:
+        RuntimeError: If there is no free place.
+    """
+    positions, goals = world.state[0, :, : problem.dimension], world.goal[0]
+    for robot in robots.tolist():
+        goals[robot] = fresh_goal(problem, robot, positions, goals, random)
+    world.inverse[0, robots] = inverse_initial_distance(positions[robots], goals[robots], problem.goal_radius)
+    offsets = goals[robots] - positions[robots]
+    world.distance[0, robots] = np.sqrt(np.add.reduce(offsets * offsets, axis=1))
 
 
 def fresh_goal(

@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32
 from d4orm_env.core.errors import unknown
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.engine.types import WorldBatch
 
 __all__ = ["RewardFunction", "RewardInput", "TrainingReward"]
 
@@ -64,6 +66,34 @@ class RewardInput:
                 copy = value.copy()
                 copy.setflags(write=False)
                 object.__setattr__(self, attribute.name, copy)
+
+    @classmethod
+    def of_worlds(
+        cls,
+        before: WorldBatch,
+        after: WorldBatch,
+        paper: FloatArray,
+        arrived: BoolArray,
+        problem: Problem,
+        rows: int | slice,
+    ) -> RewardInput:
+        """The step of the worlds in ``rows``, all or one, with what :class:`WorldBatch` does not know."""
+        return cls(
+            previous_states=before.state[rows],
+            states=after.state[rows],
+            controls=after.control[rows],
+            goals=after.goal[rows],
+            previous_distances=before.distance[rows],
+            distances=after.distance[rows],
+            initial_distances=np.float32(1) / after.inverse[rows],
+            previously_arrived=before.docked[rows],
+            arrived=arrived[rows],
+            collided=after.collided[rows],
+            margin_violated=after.violated[rows],
+            paper=paper[rows],
+            team=problem.team,
+            dt=problem.dt,
+        )
 
     @property
     def previous_positions(self) -> FloatArray:

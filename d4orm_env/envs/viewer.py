@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
-from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.team_simulation import TeamSimulation
 
 if TYPE_CHECKING:
     from d4orm_env.render import frames
@@ -45,7 +45,7 @@ class Viewer:
         # Figures and windows are neither copied nor sent to other processes; a copy opens its own.
         return self.__dict__ | {"_renderer": None, "_problem": None}
 
-    def render(self, simulation: Simulation) -> Frame | None:
+    def render(self, simulation: TeamSimulation) -> Frame | None:
         """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``."""
         if self._mode is None:
             gymnasium.logger.warn("render() was called without a render mode; give render_mode= when making the env.")
@@ -57,8 +57,8 @@ class Viewer:
         frame = self._renderer.draw(
             simulation.states,
             simulation.arrived,
-            simulation.collided,
-            goals=simulation.arrays.goal,
+            simulation.worlds.collided[0],
+            goals=simulation.goals,
             trail=simulation.trail,
             marks=simulation.marks(),
         )

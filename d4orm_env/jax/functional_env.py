@@ -22,7 +22,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.controls import ControlNoise
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import find_reward
-from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.jax import functional
 from d4orm_env.scenarios.problems import ScenarioLike
 
@@ -103,17 +103,17 @@ class FunctionalEnv:
         chosen = EnvOptions.of(scenario=scenario, num_robots=num_robots, **options)
         _refuse(chosen)
         count = whole_number(num_instances, "num_instances", 1, MAX_INSTANCES)
-        template = Simulation(chosen)
-        self.problem: Problem = template.problem
-        self.layout: ObservationLayout = template.layout
-        self.max_cycles: int = template.max_cycles
+        setup = EnvSetup(chosen)
+        self.problem: Problem = setup.problem
+        self.layout: ObservationLayout = setup.layout
+        self.max_cycles: int = setup.max_cycles
         self._reward = find_reward(chosen.reward) or "paper"
-        noise = [one.std for one in template.disturbances if isinstance(one, ControlNoise)]
-        if len(noise) < len(template.disturbances):
+        noise = [one.std for one in setup.disturbances if isinstance(one, ControlNoise)]
+        if len(noise) < len(setup.disturbances):
             raise ValueError("disturbances other than ControlNoise are no pure functions; use gymnasium.make_vec")
         self._noise = np.sqrt(np.sum([np.square(std) for std in noise], axis=0)).astype(np.float32)
         random = np.random.default_rng(chosen.scenario_settings.get("seed") or 0)
-        drawn = [template.draw_instance(random) for _ in range(count)] if template.redraws else [template.problem]
+        drawn = [setup.draw(random) for _ in range(count)] if setup.redraws else [setup.problem]
         self._num_instances, self._varying, self._common, self._structure = len(drawn), *_stacked(drawn)
 
     @cached_property

@@ -182,13 +182,10 @@ def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
 
 def rewards_of(arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array) -> Array:
     """``(K, S)`` reward of one step."""
+    distance, one = goal_distance(arrays, place), jnp.float32(1)
+    violations = pair_violation.astype(jnp.float32), obstacle_violation.astype(jnp.float32), jnp.float32(0)
     return reward.step_reward(
-        goal_distance(arrays, place),
-        arrays.inverse_initial_distance[:, None],
-        pair_violation.astype(jnp.float32),
-        obstacle_violation.astype(jnp.float32),
-        arrays.collision_penalty,
-        jnp.float32(1),
+        distance, arrays.inverse_initial_distance[:, None], violations, arrays.collision_penalty, one
     )
 
 

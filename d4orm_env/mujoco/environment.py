@@ -8,7 +8,6 @@ from pettingzoo.utils import OrderEnforcingWrapper
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray, shown
 from d4orm_env.envs.options import EnvOptions
-from d4orm_env.envs.simulation import Simulation
 from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
 from d4orm_env.mujoco.mujoco_viewer import RENDERERS, MujocoViewer
@@ -61,7 +60,7 @@ class parallel_env(navigation_v0.parallel_env):
         self._physics, self._renderer = physics or Physics(), renderer
         super().__init__(scenario, num_robots, **options)
 
-    def _make_simulation(self, options: EnvOptions) -> Simulation:
+    def _make_simulation(self, options: EnvOptions) -> MujocoSimulation:
         return MujocoSimulation(options, self._physics)
 
     def _make_viewer(self, options: EnvOptions) -> MujocoViewer:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from d4orm_env.envs.simulation import Simulation
+from d4orm_env.envs.team_simulation import TeamSimulation
 from d4orm_env.envs.viewer import Frame, Viewer
 from d4orm_env.mujoco.camera import Camera, NoCameraError
 from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
@@ -28,7 +28,7 @@ class MujocoViewer(Viewer):
     def __getstate__(self) -> dict[str, object]:
         return super().__getstate__() | {"_camera": None, "_looks_at": None}
 
-    def render(self, simulation: Simulation) -> Frame | None:
+    def render(self, simulation: TeamSimulation) -> Frame | None:
         """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``.
 
         Raises:
@@ -49,7 +49,7 @@ class MujocoViewer(Viewer):
                 self.renderer = "pictures"
             else:
                 self.renderer = "mujoco"
-                return self._camera.draw(bodies.data, simulation.arrays.goal)
+                return self._camera.draw(bodies.data, simulation.goals)
         return super().render(simulation)
 
     def close(self) -> None:

@@ -35,7 +35,7 @@ class Episode(DisplayMixin):
     Attributes:
         problem: Problem of the environment.
         trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
-        metrics: The environment's own, see :meth:`d4orm_env.envs.episode_record.EpisodeRecord.metrics`, and
+        metrics: The environment's own, see :func:`d4orm_env.envs.episode_metrics.episode_metrics`, and
             ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.

@@ -146,7 +146,7 @@ def _runner(name: str) -> Callable[..., None]:
                 x, gap2, docked = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
                 w[DOCKED * TILE + s] = ONE if docked else ZERO
-                w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ZERO, ONE)
+                w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
             _copy(w[: dimension * TILE], places[i * dimension * TILE : (i + 1) * dimension * TILE])
 
     return run
@@ -160,7 +160,7 @@ def _add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: F
         for axis in range(goal.shape[0]):
             gap = w[(STATE + axis) * TILE + s] - goal[axis]
             gap2 += gap * gap
-        w[TOTAL * TILE + s] += count * reward.step_reward(np.sqrt(gap2), inverse, ZERO, ZERO, ZERO, ONE)
+        w[TOTAL * TILE + s] += count * reward.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
 
 
 @inlined

@@ -14,9 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.collision import axis_gap, leaves
 from d4orm_env.engine.choice import get_engine
+from d4orm_env.engine.cpu import CpuEngine
+from d4orm_env.engine.types import MOVED, WorldBatch
 
 RADIUS, MARGIN = 0.25, 0.25
 CONTACT, MARGIN_ONLY, CLEAR = (True, True), (False, True), (False, False)
@@ -207,3 +210,30 @@ def test_a_mirrored_team_has_the_same_contacts(engine: str, grid: np.ndarray) ->
         other = stand(ENGINES[engine], problem, mirrored)
         np.testing.assert_array_equal(other.collided, result.collided)
         np.testing.assert_array_equal(other.margin_violated, result.margin_violated)
+
+
+@pytest.mark.parametrize(
+    ("gap", "touched", "flags", "kinds"),
+    [
+        (0.25, False, MARGIN_ONLY, 1),
+        (0.3125, False, CLEAR, 0),
+        (0.0, False, CONTACT, 1),
+        (9.0, True, CONTACT, 1),
+        (0.25, True, CONTACT, 1),
+    ],
+)
+def test_a_dynamic_obstacle_costs_the_penalty_once(
+    gap: float, touched: bool, flags: tuple[bool, bool], kinds: int
+) -> None:
+    """However it was met: at the end of a step, or in the middle of one that another physics has taken."""
+    problem = open_problem(1, radius=RADIUS, margin=MARGIN, collision_penalty=2.0)
+    layout, worlds = ObservationLayout.for_problem(problem), WorldBatch.from_problem(problem, 1, num_bodies=1)
+    worlds.state[0, 0, :2] = 0
+    worlds.bodies[0, 0] = [2 * RADIUS + gap, 0, 0, 0, RADIUS]
+    worlds.collided[0, 0] = touched
+    nothing = np.empty((0, 1, layout.size), np.float32)
+    CpuEngine().advance(problem.arrays, layout, 10, np.array([MOVED]), worlds, nothing)
+    assert (worlds.collided[0, 0], worlds.violated[0, 0]) == flags
+    progress = np.float32(1) - worlds.distance[0, 0] * worlds.inverse[0, 0]
+    assert worlds.rewards[0, 0] == progress - 2 * kinds
+    assert (worlds.steps[0], worlds.violations[0, 0]) == (1, flags[1])

@@ -376,7 +376,7 @@ def test_looking_again_sees_the_same() -> None:
 
 def test_occlusion_hides_what_is_far() -> None:
     problem = line_problem([3.0] * 4, horizon=10)
-    layout = navigation_v0.parallel_env(problem=problem)._simulation.layout
+    layout = navigation_v0.parallel_env(problem=problem)._simulation.setup.layout
     for reach, present in ((0.9, [0, 0, 0, 0]), (1.1, [1, 2, 2, 1]), (2.1, [2, 3, 3, 2])):
         env = navigation_v0.parallel_env(problem=problem, disturbances=[Occlusion(reach)])
         rows = layout.neighbors(np.array(list(env.reset(seed=0)[0].values())))
@@ -534,7 +534,7 @@ def test_limits_are_truly_lower_and_seen_as_before() -> None:
     problem = line_problem([30.0], "holonomic2d")
     env = navigation_v0.parallel_env(problem=problem, disturbances=[LimitMismatch(0.6)])
     seen, _ = env.reset(seed=0)
-    layout = env._simulation.layout
+    layout = env._simulation.setup.layout
     for _ in range(30):
         seen, *_ = env.step(dict.fromkeys(env.agents, np.array([1.0, 0.0], np.float32)))
         assert split_state(problem, env.state()).controls[0, 0] == pytest.approx(0.6)

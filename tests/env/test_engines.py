@@ -211,13 +211,6 @@ def test_goals_may_change_on_the_way(engine: str) -> None:
     np.testing.assert_allclose(result.rewards, [0.95, 0.5], atol=1e-5)
 
 
-def test_contacts_of_a_standing_team() -> None:
-    problem = open_problem(3, radius=0.25, margin=0.25)
-    collided, violated = CPU.contacts(problem.arrays, np.array([[0, 0], [0.4, 0], [1.0, 0]], np.float32))
-    assert collided.tolist() == [True, True, False]
-    assert violated.tolist() == [True, True, True]
-
-
 @numba.njit
 def _sine(x: Any) -> Any:
     return elementary.sine(x)

@@ -60,7 +60,7 @@ def test_it_observes_and_rewards_as_the_environments_do(name: str) -> None:
     problem = make()
     env = navigation_v0.parallel_env(problem=problem, reward=reward, max_cycles=40)
     env.reset(seed=0)
-    layout = env.unwrapped._simulation.layout
+    layout = env.unwrapped._simulation.setup.layout
     step = jax.jit(partial(functional.step, reward=reward))
     observe = jax.jit(lambda problem, state: functional.observe(problem, state, layout, max_cycles=40))
     state, random = functional.reset(problem, KEY), np.random.default_rng(0)
@@ -82,7 +82,7 @@ def test_as_much_is_seen_as_the_layout_says(robots: int, obstacles: int) -> None
     problem = apart(make_problem("four_obstacles", num_robots=4))
     env = navigation_v0.parallel_env(problem=problem, observed_robots=robots, observed_obstacles=obstacles)
     observations, _ = env.reset(seed=0)
-    layout = env.unwrapped._simulation.layout
+    layout = env.unwrapped._simulation.setup.layout
     seen = functional.observe(problem, functional.reset(problem, KEY), layout)
     np.testing.assert_allclose(seen, np.stack(list(observations.values())), atol=1e-5)
 
@@ -103,7 +103,7 @@ def test_a_reward_of_ones_own_is_traced() -> None:
 def test_the_way_is_not_to_be_seen() -> None:
     env = navigation_v0.parallel_env("circle", 2, observed_path=True)
     with pytest.raises(ValueError, match="leave observed_path out"):
-        functional.observe(env.problem, functional.reset(env.problem, KEY), env.unwrapped._simulation.layout)
+        functional.observe(env.problem, functional.reset(env.problem, KEY), env.unwrapped._simulation.setup.layout)
 
 
 def test_worlds_are_those_of_the_batched_environment() -> None:

@@ -421,7 +421,7 @@ def test_a_state_of_another_problem_is_refused() -> None:
 
 def test_time_left_runs_out() -> None:
     env = navigation_v0.parallel_env(problem=line_problem([9.0]), max_cycles=4)
-    index = env._simulation.layout.names.index("time_left")
+    index = env._simulation.setup.layout.names.index("time_left")
     observations, _ = env.reset()
     left = [observations["robot_0"][index]]
     while env.agents:

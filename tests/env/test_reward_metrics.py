@@ -19,11 +19,12 @@ from d4orm_env.engine.choice import get_engine
 
 
 def test_step_reward() -> None:
-    assert step_reward(3.0, 0.25, 0.0, 0.0, 1.0, 1.0) == 0.25
-    assert step_reward(3.0, 0.25, 1.0, 0.0, 1.0, 1.0) == -0.75
-    assert step_reward(3.0, 0.25, 1.0, 1.0, 1.0, 1.0) == -1.75
-    assert step_reward(3.0, 0.25, 1.0, 1.0, 0.5, 1.0) == -0.75
-    assert step_reward(0.0, 0.25, 0.0, 0.0, 1.0, 1.0) == 1.0
+    assert step_reward(3.0, 0.25, (0.0, 0.0, 0.0), 1.0, 1.0) == 0.25
+    assert step_reward(3.0, 0.25, (1.0, 0.0, 0.0), 1.0, 1.0) == -0.75
+    assert step_reward(3.0, 0.25, (1.0, 1.0, 0.0), 1.0, 1.0) == -1.75
+    assert step_reward(3.0, 0.25, (1.0, 1.0, 0.0), 0.5, 1.0) == -0.75
+    assert step_reward(3.0, 0.25, (1.0, 1.0, 1.0), 2.0, 1.0) == -5.75
+    assert step_reward(0.0, 0.25, (0.0, 0.0, 0.0), 1.0, 1.0) == 1.0
 
 
 def test_start_distance_counts_from_the_goal_radius() -> None:

@@ -346,14 +346,14 @@ def test_whatever_goes_wrong_goes_wrong_from_the_next_step_on(session: Session, 
     session.set_speed(20)
     session.disturb({name: level})
     until(lambda: session.levels == {name: level})
-    assert session._lanes[0]._env.unwrapped._simulation.disturbances
+    assert session._lanes[0]._env.unwrapped._simulation.setup.disturbances
     assert len(session.frame.bodies) == (2 if name == "intruder" else 0)
     status = session.frame.status
     assert not status.message
     until(lambda: session.frame.status.time > status.time or session.frame.finished)
     session.disturb({})
     until(lambda: not session.levels)
-    assert not session._lanes[0]._env.unwrapped._simulation.disturbances
+    assert not session._lanes[0]._env.unwrapped._simulation.setup.disturbances
 
 
 def test_the_page_shows_the_truth_and_not_what_the_policy_sees(session: Session) -> None:

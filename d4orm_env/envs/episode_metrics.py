@@ -1,4 +1,4 @@
-"""Running numbers of an episode."""
+"""Numbers of an episode."""
 
 from __future__ import annotations
 
@@ -7,62 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, Floats
 
 Counts = NDArray[np.int64]
-
-
-class EpisodeRecord:
-    """Counts what happens to a team from step to step.
-
-    Args:
-        num_robots: ``K``.
-        dt: Time step [s].
-        lifelong: Whether robots go on to new goals when they arrive.
-    """
-
-    def __init__(self, num_robots: int, dt: float, lifelong: bool) -> None:
-        self._dt = dt
-        self._lifelong = lifelong
-        self._steps = 0
-        self._reward = 0.0
-        self._arrival_step = np.full(num_robots, np.inf)
-        self._goals_reached = np.zeros(num_robots, np.int64)
-        self._collisions = np.zeros(num_robots, np.int64)
-        self._margin_violations = np.zeros(num_robots, np.int64)
-
-    def add(self, rewards: FloatArray, arrived: BoolArray, collided: BoolArray, margin_violated: BoolArray) -> None:
-        """Count one step; all arguments are ``(K,)``."""
-        self._steps += 1
-        self._reward += float(np.add.reduce(rewards))
-        # Most steps see none of these, and counting is much cheaper than adding.
-        if np.count_nonzero(margin_violated):
-            self._collisions += collided
-            self._margin_violations += margin_violated
-        if self._lifelong:
-            self._goals_reached += arrived
-        elif np.count_nonzero(arrived) or np.count_nonzero(self._goals_reached):
-            # Where arriving is not for ever, a robot may have been moved away again.
-            self._arrival_step = np.where(arrived, np.minimum(self._arrival_step, self._steps), np.inf)
-            self._goals_reached = arrived.astype(np.int64)
-
-    def metrics(self, lost: BoolArray | None = None) -> dict[str, float]:
-        """The episode so far, as plain numbers; see :func:`episode_metrics`.
-
-        Args:
-            lost: ``(K,)`` bool: robots that a disturbance keeps from ever arriving.
-        """
-        counts = EpisodeCounts(
-            self._steps,
-            self._reward,
-            self._goals_reached,
-            self._collisions,
-            self._margin_violations,
-            None if self._lifelong else self._arrival_step,
-            lost,
-        )
-        metrics = episode_metrics(counts, self._dt)
-        return {name: float(value) for name, value in metrics.items()}
 
 
 class EpisodeCounts(NamedTuple):

@@ -1,0 +1,169 @@
+"""What an environment is: its problem or its scenario's instances, and its options checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, frozen_array, whole_number
+from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
+from d4orm_env.core.problem import Problem
+from d4orm_env.disturbances.chosen import total_slack
+from d4orm_env.engine.types import OWN_ARRAYS
+from d4orm_env.envs.inputs import checked_cycles
+from d4orm_env.envs.joint_state import state_bounds
+from d4orm_env.envs.lifelong import goal_region
+from d4orm_env.envs.options import EnvOptions
+from d4orm_env.envs.rewards import find_reward, paper_reward
+
+_MAX_OBSERVED = 10_000
+_OPEN_WORLD_EXTENT = 1000.0
+_WORLD_ARRAYS = ("boxes", "triangles", "bounds")
+"""Arrays that may differ between the worlds of a batch, at the price of a kernel call for each world."""
+
+
+class EnvSetup:
+    """Options of an environment for the problem, or the instances of a scenario, that its episodes run.
+
+    Args:
+        options: Options of the environment.
+        num_instances: Choose among so many instances, drawn at first; ``None`` draws a new one each time.
+        batched: Whether the instances are to share all but starts, goals and obstacles.
+        slack: Room that the spaces of a problem need beside that of the disturbances.
+
+    Attributes:
+        problem: The problem, or the instance that the spaces are made for.
+        region: ``(2, d)`` box that holds every start and goal [m].
+        max_cycles: Steps until truncation.
+        disturbances: Those that change anything.
+        slack: Room beyond the limits of the robots that the spaces need.
+        lifelong: Whether robots that arrive get fresh goals.
+        reward: The reward function; ``None`` for the paper's, which the engines compute.
+        along_paths: Whether distances of rewards are lengths of shortest paths.
+        layout: Layout of one robot's observation.
+
+    Raises:
+        ValueError: For an argument out of range, or an instance that differs from the first in more than it may.
+    """
+
+    def __init__(
+        self,
+        options: EnvOptions,
+        num_instances: int | None = None,
+        *,
+        batched: bool = False,
+        slack: Callable[[Problem], BoundsSlack] = lambda problem: BoundsSlack(),
+    ) -> None:
+        self.problem, self._redraw = options.instances()
+        problem = self.problem
+        self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
+        self.disturbances = options.disturbances_of(problem)
+        self.slack = total_slack(self.disturbances, problem).joined(slack(problem))
+        self.lifelong = options.lifelong
+        # In an open world the two are the same.
+        self.along_paths = options.progress == "path" and problem.world.num_obstacles > 0
+        self.reward = find_reward(options.reward) or (paper_reward if self.along_paths else None)
+        self.layout = ObservationLayout.for_problem(
+            problem,
+            num_neighbors=whole_number(options.observed_robots, "observed_robots", 0, _MAX_OBSERVED),
+            num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, _MAX_OBSERVED),
+            observed_path=options.observed_path,
+            slack=self.slack,
+        )
+        if self.along_paths:
+            problem.check_reachable()
+        self.region = self._region()
+        self._prepare_instances(num_instances, batched, differ=not options.stochastic)
+
+    def _region(self) -> FloatArray:
+        region = goal_region(self.problem)
+        if self.redraws and self.problem.world.lower is None:
+            # Nothing but the scenario bounds its instances in an open world, so leave ample room.
+            extent = max(_OPEN_WORLD_EXTENT, 10 * float(np.abs(region).max()))
+            region = np.array([[-extent], [extent]], np.float32).repeat(self.problem.dimension, axis=1)
+        return region
+
+    def _prepare_instances(self, num_instances: int | None, batched: bool, differ: bool) -> None:
+        if num_instances is not None and not self.redraws:
+            raise ValueError(
+                f"num_instances is {num_instances!r} without randomize_instance, or for a scenario that draws nothing "
+                "at random; leave it out"
+            )
+        self._num_instances = None if num_instances is None else whole_number(num_instances, "num_instances", 1)
+        self._batched = batched
+        self._pool: list[Problem] = []
+        if batched and self.redraws and differ:
+            self.draw(np.random.default_rng(0))  # to see what differs
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        # NumPy unpickles read-only arrays as writable ones, for which the engine would have to compile anew.
+        self.__dict__ |= state
+        low, high = (frozen_array(bound, "bounds", (None,)) for bound in (self.layout.low, self.layout.high))
+        self.layout = replace(self.layout, low=low, high=high)
+
+    def state_bounds(self, max_cycles: int, num_bodies: int) -> tuple[FloatArray, FloatArray]:
+        """Finite bounds of the joint states of episodes of so many steps, with so many dynamic obstacles."""
+        return state_bounds(self.problem, self.region, max_cycles, self.slack, num_bodies)
+
+    @property
+    def draws(self) -> bool:
+        """True if anything is random in an episode."""
+        return bool(self.disturbances) or self.redraws or self.lifelong
+
+    @property
+    def redraws(self) -> bool:
+        """True if every episode has an instance of its own."""
+        return self._redraw is not None
+
+    def forget(self) -> None:
+        """Draw other instances to choose among, when the next one is asked for."""
+        self._pool = []
+
+    def choose(self, random: np.random.Generator) -> Problem:
+        """The instance of an episode: a new one, or one of ``num_instances``."""
+        if self._num_instances is None:
+            return self.draw(random)
+        if not self._pool:
+            self._pool = [self.draw(random) for _ in range(self._num_instances)]
+        return self._pool[int(random.integers(self._num_instances))]
+
+    def draw(self, random: np.random.Generator) -> Problem:
+        """A new instance of the scenario.
+
+        Raises:
+            ValueError: If the spaces that were made for the first instance do not hold it, or it cannot share a batch
+                with that.
+        """
+        assert self._redraw is not None
+        drawn, old, region = self._redraw(int(random.integers(2**31))), self.problem, self.region
+        points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
+        if (
+            drawn.team.models != old.team.models
+            or (drawn.team.control_limits != old.team.control_limits).any()
+            or (points < region[0]).any()
+            or (points > region[1]).any()
+        ):
+            raise ValueError(
+                f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
+                f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes places only"
+            )
+        if self.along_paths:
+            drawn.check_reachable()
+        names = set(drawn.arrays._fields) - {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid"} if self._batched else ()
+        differing = self._differing(drawn, names)
+        if differing:
+            raise ValueError(
+                f"instances of scenario {drawn.name!r} differ in their {', '.join(differing)}, and worlds of a batch "
+                "share all but starts, goals and obstacles; use vectorization_mode='sync'"
+            )
+        return drawn
+
+    def shares_world(self, problem: Problem) -> bool:
+        """Check whether a problem has the obstacles and the bounds of the first."""
+        return not self._differing(problem, _WORLD_ARRAYS)
+
+    def _differing(self, problem: Problem, names: Iterable[str]) -> list[str]:
+        one, other = problem.arrays, self.problem.arrays
+        return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
