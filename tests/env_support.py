@@ -30,7 +30,7 @@ def line_problem(distances: list[float], model: str = "velocity2d", **changes: A
     start = np.zeros((len(distances), team.state_size))
     start[:, 1] = np.arange(len(distances))
     goal = start[:, : team.dimension] + np.eye(team.dimension)[0] * np.array(distances)[:, None]
-    return Problem(team, start, goal, **changes)
+    return Problem(team, start, goal, **({"goal_speed": np.inf} | changes))
 
 
 def mixed_problem() -> Problem:

@@ -46,7 +46,7 @@ def hop_problem(num_robots: int = 3, **changes: Any) -> Problem:
     team = Team(("holonomic2d",) * num_robots)
     start = np.zeros((num_robots, 4))
     start[:, 1] = np.arange(num_robots)
-    return Problem(team, start, start[:, :2] + [0.5, 0], **({"horizon": 30} | changes))
+    return Problem(team, start, start[:, :2] + [0.5, 0], **({"horizon": 30, "goal_speed": np.inf} | changes))
 
 
 def walled_in_problem() -> Problem:

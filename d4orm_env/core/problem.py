@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -295,6 +295,10 @@ class Problem(Frozen):
         if arrays.model_codes.max() >= NUM_BUILT_IN:  # such codes depend on the order of registration
             sha.update(repr([model_digest(model) for model in self.team.robot_models]).encode())
             arrays = arrays._replace(model_codes=np.minimum(arrays.model_codes, NUM_BUILT_IN))
+        # As before robots had goal speeds of their own: stored results refer to problems by this.
+        goal_speed = None if np.isinf(self.goal_speed).all() else self.goal_speed.tolist()
+        if goal_speed is None:
+            arrays = arrays._replace(squared_goal_speed=np.float32(np.inf))
         world = self.world
         obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
         for value in (*arrays[:6], *obstacles, *arrays[9:14]):
@@ -303,7 +307,6 @@ class Problem(Frozen):
             sha.update(array.tobytes())
         if world.origin.any():
             sha.update(b"origin" + world.origin.tobytes())
-        goal_speed = None if np.isinf(self.goal_speed).all() else self.goal_speed.tolist()
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {goal_speed!r}".encode())
         if not self.docks:
             sha.update(self.arrival.encode())
@@ -351,6 +354,12 @@ class Problem(Frozen):
             ValueError: If the axes are spatial and the problem is not.
         """
         return pictures.plot(self, None, axes)
+
+    def replace(self, **changes: object) -> Self:
+        """A copy with some attributes changed, checked again; a goal speed that follows from the team goes with it."""
+        if np.array_equal(self.goal_speed, goal_speeds(self.team, self.dt, None)):
+            changes = {"goal_speed": None} | changes
+        return super().replace(**changes)
 
     def with_state(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:
         """The same team in the same world in other states, for planning on from there.

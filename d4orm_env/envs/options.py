@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -37,8 +38,8 @@ class EnvOptions:
             It is short for ``ControlNoise(std)`` as the first of the disturbances.
         disturbances: Disturbances, in the order in which it acts: instances of :mod:`d4orm_env.disturbances`, or of
             subclasses of your own. Those at level zero leave the environment as it is.
-        lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated; its info says
-            ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
+        lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated, and so may arrive
+            at any speed unless ``goal_speed`` is given; its info says ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
         max_cycles: Steps until truncation; the problem's horizon unless given.
         randomize_instance: Draw a new instance of the scenario at every reset. By default wherever the scenario draws
             at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
@@ -142,6 +143,9 @@ class EnvOptions:
         if self.problem is not None:
             return self.problem, None
         settings = {"num_robots": self.num_robots, **self.scenario_settings}
+        if self.lifelong and "goal_speed" in find_scenario(self._scenario).arguments:
+            # Nobody stops at a goal that is followed by another.
+            settings = {"goal_speed": math.inf} | settings
         first = make_problem(self._scenario, **settings)
         if self.randomize_instance is False:
             return first, None

@@ -27,6 +27,7 @@ SQUARED_MAX = 1e18
 
 Number = Annotated[float, Field(ge=-FLOAT32_MAX, le=FLOAT32_MAX)]
 Squared = Annotated[float, Field(ge=-SQUARED_MAX, le=SQUARED_MAX)]
+Speed = Annotated[float, Field(allow_inf_nan=True)]
 Place = Annotated[list[Squared], Field(min_length=2, max_length=3)]
 PlanarPlace = Annotated[list[Number], Field(min_length=2, max_length=2)]
 SpatialPlace = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -161,7 +162,7 @@ class ProblemFile(Entry):
     horizon: int = 100
     margin: Squared = 0.05
     goal_radius: Squared = 0.075
-    goal_speed: float | list[float] | None = None
+    goal_speed: Speed | list[Speed] | None = None
     arrival: Arrival = "dock"
     collision_penalty: Number = 1.0
     robots: list[RobotEntry] = Field(min_length=1)
@@ -237,6 +238,10 @@ PARTS: dict[tuple[str, ...], type[BaseModel]] = {
     ("world", "polygons"): PolygonEntry,
 }
 """The schema of each part of the explicit form."""
+
+
+KINDS = ("float", "list[float]")
+"""Names of alternatives that pydantic puts among those of fields."""
 
 
 def start_fields(model: Model) -> tuple[str, ...]:
@@ -336,7 +341,8 @@ def _explain(error: ValidationError) -> str:
     """The first error, as one line: where, what was expected, what was found."""
     first = error.errors(include_url=False)[0]
     names = tuple(part for part in first["loc"] if isinstance(part, str))
-    where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+    parts = [part for part in first["loc"] if part not in KINDS]
+    where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts).lstrip(".")
     if first["type"] == "extra_forbidden" and names[:-1] in PARTS:
         message = f"unknown field; known are {', '.join(PARTS[names[:-1]].model_fields)}"
     elif first["type"] == "missing":

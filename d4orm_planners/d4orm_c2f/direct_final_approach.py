@@ -58,8 +58,9 @@ def direct_final_approach(
     if not (near | beside).any():
         return controls, home
     latest = np.minimum(_docking_times(engine.rollout(window, controls)), window.horizon)
-    # Past the goal at full speed where that meets it; else so that robots could stop there.
-    for beyond in (speed**2 / (2 * acceleration), np.zeros_like(speed)):
+    # Past the goal at full speed where that meets it and stops them; else so that robots could stop there.
+    overrun = np.where(np.isinf(window.goal_speed)[:, None], speed**2 / (2 * acceleration), 0)
+    for beyond in (overrun, np.zeros_like(speed)):
         if not (near & ~home).any():
             break
         aimed = window.goal + beyond * offsets / np.maximum(away, window.goal_radius)

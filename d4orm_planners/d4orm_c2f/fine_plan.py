@@ -105,7 +105,8 @@ class Window:
             return Prediction(controls, positions, least_gap(truth, positions[1:]))
         special = now.stuck
         if config.direct_final_approach and self._docks:
-            near = self._near_goals(now) & ~now.docked & ~now.stuck
+            # Who is not held at its goal keeps itself there.
+            near = self._near_goals(now) & ~(now.docked & problem.docks) & ~now.stuck
             controls, home = direct_final_approach(truth, self._engine, controls, near, now.docked)
             special = special | home
         return self._safe_mix(truth, controls, special, sampled, now)

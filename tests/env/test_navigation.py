@@ -72,7 +72,7 @@ def test_stepping_a_plan_gives_its_trajectory(case: dict[str, Any]) -> None:
 
 
 def test_some_plan_above_ends_early_and_metrics_agree_with_the_trajectory() -> None:
-    problem = make_problem("circle", num_robots=5)
+    problem = make_problem("circle", num_robots=5, goal_speed=np.inf)
     controls = straight_drive(problem, np.linspace(1, 0.8, 5))
     env = navigation_v0.parallel_env(problem=problem)
     run(env, controls)

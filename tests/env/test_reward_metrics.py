@@ -57,7 +57,7 @@ def test_a_straight_drive_of_a_double_integrator(engine: str) -> None:
     0.005 * 385 = 1.925 up to t = 10, then 0.605 + 0.71 + 0.815 + 0.92 = 3.05, and from t = 15 on, docked at 1.025,
     six times 0.975: 10.825.
     """
-    problem = Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[1, 0]], horizon=20)
+    problem = Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[1, 0]], horizon=20, goal_speed=math.inf)
     trajectory = get_engine(engine).rollout(problem, np.tile([1.0, 0.0], (20, 1, 1)))
     assert trajectory.rewards.sum() == pytest.approx(10.825, abs=1e-5)
     assert int(trajectory.arrived[:, 0].argmax()) == 15
@@ -67,7 +67,9 @@ def test_a_straight_drive_of_a_double_integrator(engine: str) -> None:
 def test_a_straight_drive_of_a_differential_drive_on_a_slope(engine: str) -> None:
     """The same drive along the direction (3, 4) / 5, which the robot faces."""
     heading = math.atan2(4, 3)
-    problem = Problem(Team(("differential_drive",)), [[0, 0, heading, 0]], [[0.6, 0.8]], horizon=20)
+    problem = Problem(
+        Team(("differential_drive",)), [[0, 0, heading, 0]], [[0.6, 0.8]], horizon=20, goal_speed=math.inf
+    )
     trajectory = get_engine(engine).rollout(problem, np.tile([0.0, 1.0], (20, 1, 1)))
     assert trajectory.rewards.sum() == pytest.approx(10.825, abs=1e-5)
 

@@ -221,7 +221,9 @@ def test_amswarm_environments(name: str) -> None:
     assert {(x, y) for x, y, _ in problem.world.cylinders.tolist()} == AMSWARM_CYLINDERS[name]
     np.testing.assert_allclose(problem.world.cylinders[:, 2], 0.2)
     assert problem.world.bounds.tolist() == [[-3] * 3, [3] * 3]
-    assert problem.replace(world=None) == make_problem("circle", 10, model="holonomic3d", radius=0.29)
+    assert problem.replace(world=None) == make_problem(
+        "circle", 10, model="holonomic3d", radius=0.29, goal_speed=math.inf
+    )
 
 
 def test_amswarm_jitter_moves_the_starts_alone() -> None:
@@ -241,7 +243,7 @@ class TestPaper:
     def test_circle(self) -> None:
         problem = make_problem("paper_circle", 4, max_speed=0.1)
         assert problem.horizon == 100
-        assert problem.replace(horizon=1) == make_problem("circle", 4, max_speed=0.1, horizon=1)
+        assert problem.replace(horizon=1) == make_problem("circle", 4, max_speed=0.1, horizon=1, goal_speed=math.inf)
 
     def test_sphere(self) -> None:
         problem = make_problem("paper_sphere", 2)

@@ -92,7 +92,9 @@ def test_arrival_needs_both_place_and_speed() -> None:
 def one_robot(model: str, **changes: Any) -> Problem:
     team = Team((model,))
     goal = np.eye(team.dimension)[:1] * 2
-    return Problem(team, np.zeros((1, team.state_size)), goal, **({"goal_radius": 0.25} | changes))
+    return Problem(
+        team, np.zeros((1, team.state_size)), goal, **({"goal_radius": 0.25, "goal_speed": np.inf} | changes)
+    )
 
 
 def step(engine: str, problem: Problem, state: Any, control: Any, arrived: bool = False) -> StepResult:
