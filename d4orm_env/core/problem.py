@@ -298,7 +298,7 @@ class Problem(Frozen):
         # As before robots had goal speeds of their own: stored results refer to problems by this.
         goal_speed = None if np.isinf(self.goal_speed).all() else self.goal_speed.tolist()
         if goal_speed is None:
-            arrays = arrays._replace(squared_goal_speed=np.float32(np.inf))
+            arrays = arrays._replace(squared_goal_speed=np.array(np.inf, np.float32))
         world = self.world
         obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
         for value in (*arrays[:6], *obstacles, *arrays[9:14]):

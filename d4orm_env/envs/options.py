@@ -39,7 +39,8 @@ class EnvOptions:
         disturbances: Disturbances, in the order in which it acts: instances of :mod:`d4orm_env.disturbances`, or of
             subclasses of your own. Those at level zero leave the environment as it is.
         lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated, and so may arrive
-            at any speed unless ``goal_speed`` is given; its info says ``arrived`` at that step, and ``distance_to_goal`` is to the new goal.
+            at any speed unless ``goal_speed`` is given; its info says ``arrived`` at that step, and
+            ``distance_to_goal`` is to the new goal.
         max_cycles: Steps until truncation; the problem's horizon unless given.
         randomize_instance: Draw a new instance of the scenario at every reset. By default wherever the scenario draws
             at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
