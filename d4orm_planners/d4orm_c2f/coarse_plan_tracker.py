@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,10 @@ NEARER = 1 / 3
 """Least progress towards the goals, all robots together, in radii of the largest one."""
 
 
+WAITING = 0.5
+"""Share of the deadline that a loop waits for a new plan."""
+
+
 class CoarsePlanTracker:
     """Leads a team through an episode.
 
@@ -50,6 +55,7 @@ class CoarsePlanTracker:
         seed: Of the episode.
         refiner: Engine of refinements.
         background: Thread that they are made in, if not between control loops.
+        replanning: Thread that plans anew where loops have a deadline.
         lifelong: Whether robots that arrive get new goals.
         last_step: Time steps after which the episode ends.
 
@@ -73,12 +79,14 @@ class CoarsePlanTracker:
         seed: int,
         refiner: SamplingEngine,
         background: Background[CoarsePlan],
+        replanning: Background[CoarsePlan],
         lifelong: bool,
         last_step: int,
     ) -> None:
         self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
         self._last_step, self._astray = last_step, config.replan_distance * problem.stride
-        self._refiner, self._background = refiner, background
+        self._refiner, self._background, self._replanning = refiner, background, replanning
+        self._late: tuple[JointState, BoolArray] | None = None
         # Paths that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
         # the team does not get on there may be no other paths.
         self._planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
@@ -194,7 +202,16 @@ class CoarsePlanTracker:
             self.anew = np.zeros_like(self.anew)
 
     def replan_if_needed(self, joint: JointState, docked: BoolArray) -> bool:
-        """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end."""
+        """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end.
+
+        With a deadline a plan may be late: the team goes on with the old one until it is there.
+        """
+        if self._late is not None:
+            done, late = self._replanning.result()
+            if late is not None:
+                (begun, anew), self._late = self._late, None
+                self._follow(joint._replace(goals=begun.goals), late, anew)
+            return done
         changed = (joint.goals != self._goals).any(axis=1)
         moving = ~docked
         held_up, lost = np.zeros_like(docked), False
@@ -220,8 +237,15 @@ class CoarsePlanTracker:
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
         initial = self._beginning(joint, keep & (not lost))
-        guidance = self.plan(joint, docked, initial, iterations, thorough)
-        self._follow(joint, guidance, ~keep | lost)
+        work, anew = partial(self.plan, joint, docked, initial, iterations, thorough), ~keep | lost
+        if self._config.deadline is None:
+            self._follow(joint, work(), anew)
+            return True
+        guidance = self._replanning.answer(work, WAITING * self._config.deadline)
+        if guidance is None:
+            self._late = joint, anew
+            return False
+        self._follow(joint, guidance, anew)
         return True
 
     def _relayed(self, joint: JointState, changed: BoolArray) -> CoarseWaypoints | None:

@@ -83,6 +83,7 @@ class D4ormC2F(StatePolicy):
         # On one thread the refinement leaves the other cores, and their threads, to the control loop.
         self._refiner = get_sampling_engine(self.config.engine, 1 if self.config.refine == "background" else None)
         self._refinement: Background[CoarsePlan] = Background(yielding=True)
+        self._replanning: Background[CoarsePlan] = Background(yielding=True)
         self._control: Background[Prediction] = Background()
 
     @property
@@ -99,6 +100,7 @@ class D4ormC2F(StatePolicy):
         self._seed = seed
         self._random = generator(seed, Stream.CONTROLLER_NOISE)
         self._refinement.forget()
+        self._replanning.forget()
         self._control.forget()
         self.loops: deque[LoopRecord] = deque(maxlen=REMEMBERED)
         self._begun = 0
@@ -114,7 +116,7 @@ class D4ormC2F(StatePolicy):
         begin = time.perf_counter()
         last_step = env.unwrapped.max_cycles
         self._guide = CoarsePlanTracker(
-            self.problem, self.config, seed, self._refiner, self._refinement, lifelong, last_step
+            self.problem, self.config, seed, self._refiner, self._refinement, self._replanning, lifelong, last_step
         )
         self._guide.begin(joint, self._docked)
         self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)
