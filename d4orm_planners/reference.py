@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import COMMON
+from d4orm_env.dynamics.transition import docking_speed
 
 
 class PlainTeam(NamedTuple):
@@ -38,7 +39,7 @@ class PlainTeam(NamedTuple):
     dt: Array
     margin: Array
     goal_radius: Array
-    goal_speed: Array  # (K,) infinite without a limit
+    docking_speed: Array  # (K,) goal speed and an allowance; infinite without a limit
     collision_penalty: Array
 
 
@@ -57,7 +58,7 @@ def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
     numbers = (
         problem.start, problem.goal, team.radius, team.max_speed, team.max_acceleration, team.max_turn_rate,
         world.balls, world.cylinders, world.boxes, world.bounds, problem.dt, problem.margin, problem.goal_radius,
-        problem.goal_speed, problem.collision_penalty,
+        docking_speed(problem.goal_speed, team.max_speed), problem.collision_penalty,
     )  # fmt: skip
     return models[0], PlainTeam(*(jnp.asarray(number, jnp.float32) for number in numbers))
 
@@ -139,7 +140,7 @@ def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Array)
         x, docked = carry
         y, speed = jax.vmap(partial(_step_robot, model, team.dt))(limits, x, control)
         arrives = jnp.linalg.norm(y[:, :dimension] - team.goal, axis=1) <= team.goal_radius
-        arrives = arrives & (speed <= team.goal_speed)
+        arrives = arrives & (speed <= team.docking_speed)
         y = jnp.where(arrives[:, None], _at_rest(model, y), y)
         x = jnp.where(docked[:, None], x, y)
         place = x[:, :dimension]

@@ -37,6 +37,7 @@ from d4orm_env.core.summary_line import Row, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
+from d4orm_env.dynamics.transition import docking_speed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -249,7 +250,7 @@ class Problem(Frozen):
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
             squared_goal_radius=np.float32(self.goal_radius * self.goal_radius),
-            squared_goal_speed=self.goal_speed * self.goal_speed,
+            squared_goal_speed=np.square(docking_speed(self.goal_speed, self.team.max_speed)),
             docks=np.bool_(self.docks),
             collision_penalty=np.float32(self.collision_penalty),
         )

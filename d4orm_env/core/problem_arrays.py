@@ -28,7 +28,7 @@ class ProblemArrays(NamedTuple):
         time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
         margin: ``()``.
         squared_goal_radius: ``()``.
-        squared_goal_speed: ``(K,)``, infinite without a limit.
+        squared_goal_speed: ``(K,)`` with the allowance for rounding; infinite without a limit.
         docks: ``()`` bool: a robot that has arrived stays there for good.
         collision_penalty: ``()``.
     """

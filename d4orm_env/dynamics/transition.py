@@ -12,6 +12,9 @@ from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops,
 
 __all__ = ["TimeStep", "advance", "arrives"]
 
+SPEED_ALLOWANCE = 2**-15
+"""Share of the speed limit by which a robot may exceed its goal speed: many come down to just that and a rounding."""
+
 
 def advance(
     model: ModelFunctions, x: tuple[N, ...], u: tuple[N, ...], limits: tuple[N, ...], h: TimeStep, ops: Ops
@@ -25,6 +28,11 @@ def arrives(
 ) -> Flag:
     """Check whether a robot at this distance from its goal, at this speed, arrives there."""
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
+
+
+def docking_speed(goal_speed: N, max_speed: N) -> N:
+    """Speed up to which a robot docks: its goal speed, and what rounding makes of that."""
+    return goal_speed + max_speed * SPEED_ALLOWANCE
 
 
 def stands(arrived: Truth, docks: Truth) -> Flag:

@@ -27,6 +27,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
+from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward, term_names
 from d4orm_env.jax.jax_engine import Worlds, advance_worlds, check_contacts, goal_distance
@@ -208,7 +209,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "time_step": jnp.stack([dt / part for part in (1, 2, 3, 6)]),
         "margin": margin,
         "squared_goal_radius": goal_radius**2,
-        "squared_goal_speed": goal_speed**2,
+        "squared_goal_speed": transition.docking_speed(goal_speed, jnp.asarray(team.max_speed)) ** 2,
         "docks": problem.arrival == "dock",
         "collision_penalty": penalty,
     }

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 RADIUS_TOLERANCE, SPEED_TOLERANCE = 1 / 7500, 1e-5
 """Least distance to the goal radius, as a share of it, and to the goal speed, as a share of the speed limit, that
 rounding does not bridge."""
+SPEED_ALLOWANCE = 2.0**-15
+"""Share of the speed limit by which a robot may exceed its goal speed."""
 ROUNDING = 32 * 2.0**-23
 """The same, as a share of the coordinates; 20 units in float32's last place were measured."""
 MAX_READINGS = 8
@@ -107,7 +109,7 @@ def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats)
     doubt = np.maximum(RADIUS_TOLERANCE * problem.goal_radius, ROUNDING * extent) + motion.integration_error
     doubt = np.minimum(doubt, problem.goal_radius / 4)
     speed_doubt = SPEED_TOLERANCE * motion.max_speed
-    goal_speed = problem.goal_speed.astype(np.float64)
+    goal_speed = problem.goal_speed + SPEED_ALLOWANCE * motion.max_speed
     slow = (motion.pace <= goal_speed - speed_doubt) | (motion.pace == 0)
     possible = (distance <= problem.goal_radius + doubt) & (motion.pace <= goal_speed + speed_doubt)
     return possible, (distance <= problem.goal_radius - doubt) & slow

@@ -41,7 +41,11 @@ class CoarsePlan(CoarseWaypoints):
 def coarse_problem(problem: Problem, factor: int) -> Problem:
     """The problem with steps ``factor`` times as long and as many fewer of them (paper, Algorithm 4, line 1)."""
     return problem.with_state(
-        problem.start, problem.goal, horizon=max(-(-problem.horizon // factor), 1), dt=problem.dt * factor
+        problem.start,
+        problem.goal,
+        horizon=max(-(-problem.horizon // factor), 1),
+        dt=problem.dt * factor,
+        goal_speed=problem.goal_speed * np.float32(factor),
     )
 
 

@@ -28,7 +28,7 @@ def make(models, start, goal, *, world=None, limits=None, **settings):
     padded = np.zeros((team.num_robots, team.state_size))
     for robot, state in enumerate(start):
         padded[robot, : len(state)] = state
-    return Problem(team, padded, goal, world=world, **settings)
+    return Problem(team, padded, goal, world=world, **({"goal_speed": math.inf} | settings))
 
 
 def hold(problem, *controls):
@@ -304,6 +304,8 @@ def test_reaching_the_goal_too_fast_is_not_arriving():
     problem = make(["holonomic2d"], [(0, 0, 1, 0)], [(1, 0)], horizon=10)
     report = verify(problem, hold(problem, (0, 0)))
     assert report.ok
+    assert report.arrival_speeds == pytest.approx([1.0])
+    assert not report.dynamics_ok, "nobody stops from 1 m/s within a step of 0.1 s at 1 m/s^2"
     careful = problem.replace(goal_speed=0.5)
     report = verify(careful, hold(careful, (0, 0)))
     assert kinds(report) == ["not arrived"]
@@ -405,13 +407,27 @@ def test_a_robot_that_docks_at_the_edge_may_be_in_the_way_there():
 
 
 def test_speed_at_the_goal_speed_is_decided_by_rounding_too():
-    problem = make(["holonomic2d"], [(0, 0, 0.5, 0)], [(0.5, 0)], horizon=20, goal_speed=0.5 - 5e-6)
+    problem = make(["holonomic2d"], [(0, 0, 0.5, 0)], [(0.5, 0)], horizon=20, goal_speed=0.5 - 2**-15 - 5e-6)
     coasting = hold(problem, (0, 0))
     report = verify(problem, coasting)
     assert kinds(report) == ["not arrived"]
     assert "which rounding decides" in report.violations[0].detail
     coasting[10] = (-1, 0)
     assert verify(problem, coasting).ok
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "car"])
+def test_a_robot_arrives_at_what_it_brakes_away_in_a_step(model):
+    start = {"holonomic2d": (0, 0, 1, 0), "differential_drive": (0, 0, 0, 1), "car": (0, 0, 0, 1, 0)}[model]
+    problem = make([model], [start], [(0.525, 0)], horizon=20, goal_radius=0.1, goal_speed=None)
+    assert problem.goal_speed == pytest.approx([0.1])
+    brakes = {"holonomic2d": (-1, 0), "differential_drive": (0, -1), "car": (-1, 0)}[model]
+    controls = hold(problem, (0, 0))
+    controls[:9] = brakes  # from 1 m/s down to exactly 0.1 m/s in 0.495 m: nothing is left to rounding
+    report = verify(problem, controls)
+    assert report.ok, report.violations
+    assert report.arrival_speeds == pytest.approx([0.1])
+    assert report.dynamics_ok
 
 
 def test_a_robot_at_rest_is_slow_enough_for_any_goal_speed():
@@ -435,8 +451,8 @@ def test_hovering_at_the_edge_of_the_goal_is_not_arriving():
 
 def test_the_report_is_ok_exactly_when_nothing_is_wrong():
     fault = Violation("robot contact", (0, 3), 1.25, "touches robot_3")
-    assert VerificationReport(1.0, 1.0, np.zeros(4), []).ok
-    assert not VerificationReport(1.0, 1.0, np.zeros(4), [fault]).ok
+    assert VerificationReport(1.0, 1.0, np.zeros(4), np.zeros(4), True, []).ok
+    assert not VerificationReport(1.0, 1.0, np.zeros(4), np.zeros(4), True, [fault]).ok
     assert str(fault) == "robot contact at 1.250 s, robot_0 and robot_3: touches robot_3"
 
 

@@ -462,7 +462,7 @@ def test_a_plan_that_comes_before_the_episode_ends_is_preferred(seed: int) -> No
     policy, env = controller(), navigation_v0.parallel_env(problem=problem)
     env.reset(seed=seed)
     policy.reset(env, seed=seed)
-    joint, left = split_state(problem, env.state()), 33
+    joint, left = split_state(problem, env.state()), 38
     states = joint.states.copy()
     states[0, 2:] = -1.1, 0.0  # A push may make a robot faster than a problem lets it start.
     late = joint._replace(states=states, steps=env.max_cycles - left * policy.config.coarse_factor)
