@@ -55,8 +55,10 @@ class D4ormD(DeformingPlanner):
         if not search.current.unsolved.any() or (isinstance(state, Groups) and search.best.solved):
             return self.whole_team(search, state)
         team = DeformedPlan(self, search, search.current.trajectory, search.current.report)
-        state = state.replan(team) if isinstance(state, Groups) else state.repair(team, self.config)
-        return state, team.iteration()
+        if isinstance(state, Repairs):
+            return state.repair(team, self.config), team.iteration()
+        state, iteration = state.replan(team), team.iteration()
+        return state, replace(iteration, controls=self.braking(search, iteration.controls))
 
     def whole_team(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """Deform all controls at once; unless in groups, then straight to the goals from wherever that is as good."""

@@ -84,9 +84,13 @@ class SamplingPlanner(Planner):
             mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
         controls = np.zeros_like(base)
         controls[:horizon] = task.base + mean
-        if self.config.final_approach and np.isfinite(search.problem.goal_speed).any():
-            controls = with_final_approaches(search, controls)
-        return Iteration(controls, num_steps, excluded)
+        return Iteration(self.braking(search, controls), num_steps, excluded)
+
+    def braking(self, search: SolveRun, controls: FloatArray) -> FloatArray:
+        """``(H, K, m)`` the controls, with final approaches where robots must slow down for their goals."""
+        if not self.config.final_approach or np.isinf(search.problem.goal_speed).all():
+            return controls
+        return with_final_approaches(search, controls)
 
 
 def with_final_approaches(search: SolveRun, controls: FloatArray) -> FloatArray:

@@ -422,7 +422,7 @@ def test_the_first_coarse_plan_may_begin_with_what_a_policy_does() -> None:
 
 
 def test_with_new_goals_for_some_the_others_keep_to_their_ways(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = make_problem("random", num_robots=3, seed=1)
+    problem = make_problem("random", num_robots=3, seed=1, goal_speed=np.inf)
     policy = controller(replan_distance=500.0, patience=1000, coarse_iterations=3, replan_iterations=2)
     factor = policy.config.coarse_factor
     calls = replanned(monkeypatch, policy, lambda actions: actions, problem=problem, lifelong=True, max_cycles=80)

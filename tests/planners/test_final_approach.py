@@ -11,12 +11,14 @@ from planner_support import cheap_planner
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.scenarios import make_problem
+from d4orm_env.verify import verify
 from d4orm_planners import list_planners, make_planner
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.tracking.steering import Rollouts, drives, standing, straight_drives
+from d4orm_planners.tracking.steering import Rollouts, drives, must_brake, standing, straight_drives
 
 FURTHER_IN = "d4orm_planners.base.solve.drive_further_in"
 
@@ -152,3 +154,45 @@ def test_who_is_refused_is_at_fault_until_it_moves() -> None:
 def test_a_solved_plan_has_no_failures() -> None:
     problem = quarters()
     assert given(straight(problem)).solve(problem, max_iterations=1).failures == {}
+
+
+# Robots that must slow down to dock.
+
+
+@pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "mppi", "cem", "mbd", "i-mbd"])
+def test_samplers_brake_for_their_goals_and_the_papers_do_not(name: str) -> None:
+    problem = make_problem("circle", num_robots=3)
+    config = {"engine": "cpu", "num_samples": 64, "num_steps": 20, "max_iterations": 5}
+    plan = make_planner(name, **config).solve(problem, seed=0)
+    assert plan.solved, plan.failures
+    report = verify(problem, plan.controls)
+    assert report.dynamics_ok
+    assert (report.arrival_speeds <= problem.goal_speed + 1e-4).all()
+    without = make_planner(name, **config, final_approach=False).solve(problem, seed=0)
+    # Repairs of D4orm-D do so in any case.
+    assert plan.metrics["travel_time"] < without.metrics["travel_time"] or name == "d4orm-d"
+    assert make_planner(name, preset="paper").config.keywords()["final_approach"] is False
+
+
+def test_goals_that_stop_robots_need_no_final_approach() -> None:
+    problem = make_problem("circle", num_robots=3, goal_speed=np.inf)
+    plans = [
+        make_planner("d4orm", engine="cpu", num_samples=32, num_steps=10, final_approach=final).solve(
+            problem, seed=0, max_iterations=1
+        )
+        for final in (True, False)
+    ]
+    np.testing.assert_array_equal(plans[0].controls, plans[1].controls)
+
+
+def test_who_cannot_wait_with_braking() -> None:
+    problem = make_problem("circle", num_robots=4, diameter=8.0)
+    goals = problem.goal
+    direction = goals / np.linalg.norm(goals, axis=1, keepdims=True)
+    # From 1 m/s it takes 0.5 m and a step of 0.1 m to the radius of 0.075 m around the goal.
+    away = np.array([0.6, 0.7, 0.05, 3.0])[:, None]
+    states = np.concatenate([goals - away * direction, direction * [[1.0], [1.0], [0.0], [1.0]]], axis=1)
+    controls = np.zeros((4, 2), np.float32)
+    args = states.astype(np.float32), controls, goals
+    assert must_brake(problem, *args).tolist() == [True, False, True, False]
+    assert not must_brake(problem.replace(goal_speed=np.inf), *args).any()

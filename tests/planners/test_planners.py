@@ -481,6 +481,7 @@ def test_the_paper_preset_has_the_papers_parameters(name: str) -> None:
         "weight_cutoff": 0,
         "clip_between_iterations": name == "d4orm-d",
         "short_paths": False,
+        "final_approach": False,
     }
     without = {
         "mppi": {"beta_start", "beta_end"},
@@ -539,7 +540,7 @@ def tiny_problem(num_robots: int) -> Problem:
 def method(name: str, **config: Any) -> Any:
     shared = {
         "engine": "cpu", "num_samples": SAMPLES, "num_steps": STEPS, "temperature": TEMPERATURE, "weight_cutoff": 0.0,
-        "beta_start": BETAS[0], "beta_end": BETAS[1], "short_paths": False,
+        "beta_start": BETAS[0], "beta_end": BETAS[1], "short_paths": False, "final_approach": False,
     }  # fmt: skip
     known = PLANNERS[name].config_class.setting_names()
     return make_planner(name, **{key: value for key, value in shared.items() if key in known}, **config)
