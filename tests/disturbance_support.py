@@ -19,6 +19,7 @@ from d4orm_env.disturbances import (
     Dropout,
     Gain,
     Intruder,
+    Lag,
     LimitMismatch,
     Observed,
     Occlusion,
@@ -75,6 +76,7 @@ CASES: dict[str, Disturbance[Any]] = {
     "intruder": Intruder(2, 0.8),
     "drag": Drag(0.5),
     "limit_mismatch": LimitMismatch(0.7),
+    "lag": Lag(0.2),
     "wind": Wind(),
 }
 """By name of the kind, and more behind a hyphen."""

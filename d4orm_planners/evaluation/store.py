@@ -55,7 +55,7 @@ class BestSoFar(NamedTuple):
         seconds: Since the solve began.
         solved: Whether it is a solution, 1 or 0.
         reward: Its mean reward.
-        steps: Denoising steps done; ``None`` in rows that older versions wrote.
+        steps: Denoising steps done; ``None`` where it is not known.
     """
 
     seconds: float

@@ -25,6 +25,7 @@ from examples.studies.disturbance_study import (
     NOTHING,
     ROBOTS,
     SCENARIOS,
+    name_of,
     names_by_text,
     successes,
 )
@@ -84,7 +85,7 @@ def by_cell(trials: Sequence[Trial]) -> Cells:
     named = names_by_text()
     cells: Cells = {(scenario, name): {} for name in MEANT_FOR for scenario in SCENARIOS}
     for trial in trials:
-        cell = cells[trial.scenario, named.get(trial.disturbances, NOTHING)]
+        cell = cells[name_of(trial), named.get(trial.disturbances, NOTHING)]
         cell.setdefault(trial.label, []).append(trial)
     return {key: cell for key, cell in cells.items() if cell}
 

@@ -89,6 +89,11 @@ def names_by_text() -> dict[str, str]:
     return {Condition(disturbances=(one,)).text: name for name, one in DISTURBANCES.items()}
 
 
+def name_of(trial: Trial) -> str:
+    """The name of its scenario, without settings."""
+    return trial.scenario.partition(" (")[0]
+
+
 def by_cell(trials: Iterable[Trial]) -> Cells:
     """The table's cells."""
     named = names_by_text()
@@ -96,7 +101,7 @@ def by_cell(trials: Iterable[Trial]) -> Cells:
     bodies = {model: name for name, model in BODIES.items()}
     for trial in trials:
         disturbance = bodies[trial.model] if trial.physics == "mujoco" else named.get(trial.disturbances, NOTHING)
-        cells.setdefault((trial.scenario, trial.label, disturbance), []).append(trial)
+        cells.setdefault((name_of(trial), trial.label, disturbance), []).append(trial)
     order = [SCENARIOS, tuple(POLICIES), COLUMNS]
     return dict(sorted(cells.items(), key=lambda cell: [known.index(one) for known, one in zip(order, cell[0])]))
 

@@ -11,7 +11,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import closing
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -124,17 +123,6 @@ def test_scenarios_with_other_arguments_are_other_trials(tmp_path: Path) -> None
         for diameter in (6.0, 7.0)
         for seed in range(2)
     }
-
-
-def test_a_store_without_the_newest_column_is_read_and_gets_it(tmp_path: Path) -> None:
-    store = TrialStore(tmp_path / STORE)
-    store.add(trial(0, stretch=1.5))
-    with closing(sqlite3.connect(store.path)) as connection:
-        connection.execute("ALTER TABLE trials DROP COLUMN stretch")
-        connection.commit()
-    assert TrialStore.existing(tmp_path).trials() == [trial(0, stretch=None)]
-    TrialStore(tmp_path / STORE).add(trial(1, stretch=1.25))
-    assert TrialStore.existing(tmp_path).trials() == [trial(0, stretch=None), trial(1, stretch=1.25)]
 
 
 def test_a_problem_with_two_names_runs_once(tmp_path: Path) -> None:

@@ -138,7 +138,9 @@ def test_a_repair_that_makes_things_worse_is_not_taken_over() -> None:
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     ring = np.column_stack([4 + 0.8 * np.cos(angle), 0.8 * np.sin(angle), np.full(12, 0.25)])
     start = [[0, 0, 0, 0], [1.5, -0.5, 0, 0]]
-    problem = Problem(Team(("holonomic2d",) * 2), start, [[4, 0], [1.5, 0]], World(circles=ring), horizon=60)
+    problem = Problem(
+        Team(("holonomic2d",) * 2), start, [[4, 0], [1.5, 0]], World(circles=ring), horizon=60, goal_speed=np.inf
+    )
     controls = np.zeros((60, 2, 2), np.float32)
     controls[:, 1, 1] = 0.5
     search = SolveRun(make_planner("d4orm-d", engine="cpu"), problem, 0, controls, Astray())

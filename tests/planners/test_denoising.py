@@ -79,7 +79,7 @@ def test_a_record_has_the_candidate_for_callbacks_only(problem, tmp_path: Path) 
 
 def test_a_film_ends_where_the_plan_begins(problem) -> None:
     film = DenoisingFilm(problem, num_samples=2)
-    plan = make_planner("d4orm", **QUICK).solve(problem, max_iterations=1, watcher=film)
+    plan = make_planner("d4orm", **QUICK, final_approach=False).solve(problem, max_iterations=1, watcher=film)
     seen = film.developed(most=5)
     assert seen.labels[-1].startswith("denoising step 8 of 8, sigma 0.")
     assert seen.paths.shape == (5, 26, 3, 2)

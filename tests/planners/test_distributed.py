@@ -458,7 +458,7 @@ def test_a_single_node_is_the_planner_that_it_runs(preset: str | None) -> None:
 
 @pytest.mark.parametrize("clip", [True, False])
 def test_nodes_search_by_themselves_and_then_go_on_from_a_common_base(clip: bool) -> None:
-    planner = distributed(nodes=3, selection="max", clip_between_iterations=clip)
+    planner = distributed(nodes=3, selection="max", clip_between_iterations=clip, final_approach=False)
     search = SolveRun(planner, walled_in_problem(), 0, None)
     search.advance()
     nodes = search.state.crew.alive

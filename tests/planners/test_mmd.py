@@ -140,7 +140,7 @@ def lone_problem(model: str = "holonomic2d", world: World | None = None, **chang
     team = Team((model,))
     start, goal = np.zeros((1, team.state_size)), np.zeros((1, team.dimension))
     goal[0, 0] = 4.0
-    return Problem(team, start, goal, world, **({"horizon": 100} | changes))
+    return Problem(team, start, goal, world, **({"horizon": 100, "goal_speed": np.inf} | changes))
 
 
 @pytest.mark.parametrize("model", ["holonomic2d", "holonomic3d"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 import random
 import struct
 import threading
@@ -36,7 +37,7 @@ from d4orm_planners.sampling.d4orm import D4orm
 
 pytestmark = pytest.mark.slow
 
-CIRCLE = make_problem("circle", num_robots=4)
+CIRCLE = make_problem("circle", num_robots=4, goal_speed=math.inf)
 SEED = 3
 LIMIT = 2**16
 """A limit of messages [bytes] that a busy machine is quick to exceed."""

@@ -613,6 +613,7 @@ def test_d4orm_by_default_starts_its_deformation_at_zero(num_robots: int, credit
     ],
 )
 def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_planner("d4orm", num_samples=4, num_steps=2).solve(walled_in_problem(), max_iterations=1)  # compiles
     denoise, calls = CpuSamplingEngine.denoise, []
 
     def recorded(
@@ -623,7 +624,7 @@ def test_late_steps_go_on_with_fewer_samples(late: Any, parts: Any, monkeypatch:
         return result
 
     monkeypatch.setattr(CpuSamplingEngine, "denoise", recorded)
-    planner = make_planner("d4orm", num_samples=40, num_steps=10, **late)
+    planner = make_planner("d4orm", num_samples=40, num_steps=10, final_approach=False, **late)
     search = SolveRun(planner, walled_in_problem(), 0, None)
     _, iteration = planner.iterate(search, None)
     assert [(len(scale), num_samples) for _, scale, num_samples, _, _ in calls] == parts

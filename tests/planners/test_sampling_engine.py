@@ -30,7 +30,7 @@ CPU, JAX = CpuSamplingEngine(), JaxSamplingEngine()
 SOFTMAX = SamplingRules(SoftmaxWeights(0.3))
 NUM_SAMPLES = 200  # three tiles and a bit
 CREDITS = ("team", "robot")
-PLANNED = {"horizon": 25, "dt": 0.2}
+PLANNED: dict[str, Any] = {"horizon": 25, "dt": 0.2, "goal_speed": np.inf}
 
 
 def crowd(model: str = "holonomic2d", num_robots: int = 5) -> SamplingTask:

@@ -56,7 +56,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "temperature": (0.6, {}),
     "weight_cutoff": (0.5, {}),
     "short_paths": (False, {"improve": False}),
-    "final_approach": (False, {"decoupling": "groups"}),
+    "final_approach": (False, {"decoupling": "groups", "improve": False}),
     "beta_start": (1e-3, {}),
     "beta_end": (5e-2, {}),
     "clip_between_iterations": (True, {"clip_between_iterations": False, "decoupling": "groups", "max_iterations": 3}),
@@ -111,9 +111,13 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
 """By setting, another value, and the settings beside which it means something."""
 
 
+INF = float("inf")
+
+
 def crossing(num_robots: int = 4, num_obstacles: int = 0) -> Problem:
     """Robots that meet in the middle."""
-    return make_problem("circle", num_robots=num_robots, diameter=3.0, horizon=50, num_obstacles=num_obstacles)
+    settings = {"diameter": 3.0, "horizon": 50, "num_obstacles": num_obstacles, "goal_speed": INF}
+    return make_problem("circle", num_robots=num_robots, **settings)
 
 
 def planner_settings() -> list[Any]:
@@ -261,7 +265,7 @@ def executed(name: str, settings: dict[str, Any]) -> bytes:
     own = {"lifelong": False, "max_cycles": 40, "scenario": None, "disturbances": ()}
     env = {key: settings.get(key, value) for key, value in own.items()}
     scenario = env.pop("scenario")
-    problem = crossing() if scenario is None else make_problem(scenario, num_robots=4, horizon=50)
+    problem = crossing() if scenario is None else make_problem(scenario, num_robots=4, horizon=50, goal_speed=INF)
     settings = {key: value for key, value in settings.items() if key not in own}
     return run_episode(
         navigation_v0.parallel_env(problem=problem, **env), make_policy(name, **settings), seed=0

@@ -85,10 +85,11 @@ def test_no_node_goes_on_beyond_the_limit(inner: str, mode: str, clock: None) ->
 
 def test_what_an_iteration_has_by_then_is_a_candidate(clock: None) -> None:
     problem = make_problem("circle", num_robots=2)
-    planner = make_planner("mppi", engine="cpu", num_samples=64, num_steps=STEPS)
+    own = {"engine": "cpu", "num_samples": 64, "final_approach": False}
+    planner = make_planner("mppi", **own, num_steps=STEPS)
     plan = planner.solve(problem, time_limit=LOOKS)
     # An iteration of the steps that there was time for comes to the same.
-    same = make_planner("mppi", engine="cpu", num_samples=64, num_steps=plan.denoising_steps)
+    same = make_planner("mppi", **own, num_steps=plan.denoising_steps)
     assert 0 < plan.denoising_steps < STEPS
     assert plan.iterations == 1
     np.testing.assert_array_equal(plan.controls, same.solve(problem, max_iterations=1).controls)

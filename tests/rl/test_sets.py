@@ -207,7 +207,7 @@ def test_the_network_of_a_training_answers_in_numpy_as_in_torch(trained: Path) -
     set_network(model, normalization, network)
     np.testing.assert_allclose(network(features), model.predict(features, deterministic=True)[0], atol=1e-5)
     header = network.header.model_dump(
-        include={"algorithm", "model", "dimension", "num_neighbors", "num_obstacles", "training"}
+        include={"algorithm", "model", "dimension", "num_neighbors", "num_obstacles", "brakes", "training"}
     )
     back = network_of(header, model, normalization)
     assert back.header == network.header

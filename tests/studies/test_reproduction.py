@@ -94,7 +94,10 @@ def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(pa
     assert all(str(Path("examples", "output", folder.name, file)) in out for file in written)
     with (folder / f"{name}.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["section"], row["scenario"], row["label"], float(row["control_noise_std"])) for row in rows] == [
+    assert [
+        (row["section"], row["scenario"].partition(" (")[0], row["label"], float(row["control_noise_std"]))
+        for row in rows
+    ] == [
         (section.title, scenario, label, noise)
         for section in chosen.sections
         for _ in section.nodes or (None,)
@@ -112,7 +115,7 @@ def test_the_quick_version_writes_its_tables_and_picture_and_is_not_run_twice(pa
 
     stored = TrialStore.existing(folder).trials()
     assert len(stored) == len(rows)
-    assert paper(name, "--quick", "--quiet") == (0, "", "")
+    assert paper(name, "--quick")[::2] == (0, "")
     assert TrialStore.existing(folder).trials() == stored, "the same command runs nothing again"
 
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal
 
-from examples.studies import AS_IN_THE_PAPER
-
 from d4orm_planners.base.planner_registry import list_planners
 from d4orm_planners.evaluation.store import Trial, TrialKey
 from d4orm_planners.evaluation.study import Study
@@ -54,7 +52,6 @@ class Section(Study):
     scenarios: tuple[str, ...]
     num_robots: tuple[int | None, ...] = (None,)
     control_noise_std: tuple[float, ...] = (0.0,)
-    scenario_settings: Mapping[str, object] = field(default_factory=lambda: AS_IN_THE_PAPER)
     quick_robots: tuple[int | None, ...] = (2,)
     nodes: tuple[int, ...] = ()
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
+from examples.studies import AS_IN_THE_PAPER
 from examples.studies.paper.figure import Figure, Section
 
 from d4orm_planners.d_d4orm.selection import SELECTIONS
@@ -122,7 +123,14 @@ def _big_teams() -> Figure:
         sections=(
             *_sections(policies, *ENVIRONMENTS, num_robots=SIZES, time_limit=30.0),
             *_sections(policies, random, num_robots=(16, 32, 64), quick_robots=(3,), time_limit=60.0),
-            *_sections(policies, hundred, num_robots=(100,), quick_robots=(3,), time_limit=60.0),
+            *_sections(
+                policies,
+                hundred,
+                num_robots=(100,),
+                quick_robots=(3,),
+                time_limit=60.0,
+                scenario_settings=AS_IN_THE_PAPER,
+            ),
         ),
         across="num_robots",
         metrics=("success", "runtime", "travel_time", "step_time"),
