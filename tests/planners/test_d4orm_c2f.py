@@ -234,6 +234,42 @@ def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.Monk
     assert_verified(problem, executed)
 
 
+def test_no_loop_waits_for_a_new_coarse_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, env = controller(deadline=0.2, replan_distance=2.0), navigation_v0.parallel_env(problem=circle(4))
+    plan, asked, released = CoarsePlanTracker.plan, threading.Event(), threading.Event()
+
+    def late(self: CoarsePlanTracker, joint: JointState, *rest: Any) -> Any:
+        if joint.steps:
+            asked.set()
+            assert released.wait(60)
+        return plan(self, joint, *rest)
+
+    monkeypatch.setattr(CoarsePlanTracker, "plan", late)
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    first = policy.guidance
+
+    def steps(count: int) -> None:
+        nonlocal observations
+        for _ in range(count):
+            observations = env.step(policy.act(observations, env.state()))[0]
+
+    steps(5)
+    states = split_state(env.problem, env.state()).states.copy()
+    states[:, :2] += [0.6, 0.6]
+    env.set_state(states)
+    steps(10)
+    assert asked.is_set()
+    assert policy.guidance is first
+    assert len(policy.loops) == 15
+    assert not any(loop.replanned for loop in policy.loops)
+    released.set()
+    policy._replanning._job.result()
+    steps(1)
+    assert policy.guidance is not first
+    assert policy.loops[-1].replanned
+
+
 def test_ample_deadlines_change_nothing() -> None:
     problem = circle(4)
     waiting, pressed = (episode(controller(deadline=deadline), problem) for deadline in (None, 60.0))
