@@ -24,7 +24,7 @@ class RobotType:
         max_acceleration: [m/s^2]; of no use to first-order models.
         max_turn_rate: [rad/s]; of no use to models without a heading.
         margin: Distance for what tracking is off [m].
-        lag: Time constant of its actuators [s], for :class:`~d4orm_planners.Controller`.
+        lag: Time constant of its actuators [s], for :class:`~d4orm_planners.base.controller.Controller`.
         sources: Where the numbers come from, by attribute.
     """
 

@@ -42,7 +42,7 @@ def approach_goals(
         robots: ``(R,)`` their numbers in the team.
         part: The problem of these robots alone.
         trajectory: Their motion in it.
-        or_longer: See :meth:`WorkingPlan.take_best`.
+        or_longer: See :meth:`~d4orm_planners.base.working_plan.WorkingPlan.take_best`.
     """
     gap = np.linalg.norm(trajectory.positions - part.goal, axis=2)
     nearest = np.where(trajectory.arrived.any(axis=0), trajectory.arrived.argmax(axis=0), gap.argmin(axis=0))

@@ -13,6 +13,7 @@ HEAVY = ("torch", "ray", "casadi", "matplotlib", "jax", "stable_baselines3", "su
 CONTRACT = (
     "navigation_v0",
     "make_problem",
+    "make_team",
     "load_problem",
     "save_problem",
     "list_scenarios",
