@@ -120,7 +120,7 @@ class _Repair:
         return robots, "robot"
 
     def take_over(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
-        """Let robots do as in the trajectory, see :func:`~d4orm_planners.base.final_approach.approach_goals`, and count the failures."""
+        """Let robots do as in the trajectory, or turn to their goals in time, and count the failures."""
         index = np.array(robots)
         approach_goals(self.team, index, part, trajectory, or_longer=True)
         faults, _ = self.team.faults(index)

@@ -44,9 +44,9 @@ class SamplingConfig(PlannerConfig):
         short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
             each other takes, by rewards that make up for the shortness (:mod:`d4orm_planners.sampling.short_paths`).
             The paper always samples all steps.
-        final_approach: Whether robots that must slow down to dock (:attr:`~d4orm_env.core.problem.Problem.goal_speed`) turn straight to their
-            goals after an iteration, and brake there, where that makes nothing worse. Samples hardly ever stop
-            anywhere. The paper's robots need not.
+        final_approach: Whether robots that must slow down to dock
+            (:attr:`~d4orm_env.core.problem.Problem.goal_speed`) turn straight to their goals after an iteration, and
+            brake there, where that makes nothing worse. Samples hardly ever stop anywhere. The paper's robots need not.
     """
 
     num_samples: Samples = 1024
