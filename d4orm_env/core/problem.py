@@ -33,7 +33,7 @@ from d4orm_env.core.problem_checks import (
     goal_speeds,
     unwound_states,
 )
-from d4orm_env.core.summary_line import Row, count, joined, team_text
+from d4orm_env.core.summary_line import KeyFigure, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
@@ -322,7 +322,7 @@ class Problem(Frozen):
         return hash(self.digest)
 
     @property
-    def key_figures(self) -> list[Row]:
+    def key_figures(self) -> list[KeyFigure]:
         """Return its key figures, in a few words each."""
         world = self.world
         bounds = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-Row = tuple[str, str]
+KeyFigure = tuple[str, str]
 """A key figure: what it is, and its value."""
 
 
@@ -19,7 +19,7 @@ def team_text(models: Iterable[str]) -> str:
     return ", ".join(f"{number} {name}" for name, number in Counter(models).most_common())
 
 
-def outcome_rows(metrics: dict[str, float], num_robots: int) -> list[Row]:
+def outcome_rows(metrics: dict[str, float], num_robots: int) -> list[KeyFigure]:
     """The key figures of a motion: what arrived, what went wrong, and how long it took.
 
     Args:
@@ -39,6 +39,6 @@ def outcome_rows(metrics: dict[str, float], num_robots: int) -> list[Row]:
     return [(text, form.format(metrics[name])) for name, (text, form) in texts.items() if name in metrics]
 
 
-def joined(rows: Iterable[Row]) -> str:
+def joined(rows: Iterable[KeyFigure]) -> str:
     """Key figures in a line."""
     return ", ".join(f"{name} {value}" for name, value in rows)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.summary_line import Row, count, joined
+from d4orm_env.core.summary_line import KeyFigure, count, joined
 
 if TYPE_CHECKING:
     from d4orm_env.render import notebook
@@ -38,7 +38,7 @@ class Trajectory:
     margin_violated: BoolArray
 
     @property
-    def key_figures(self) -> list[Row]:
+    def key_figures(self) -> list[KeyFigure]:
         """Robots at their goals at the end, and those that were ever too near anything."""
         robots = self.arrived.shape[1]
         return [

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary_line import Row, joined
+from d4orm_env.core.summary_line import KeyFigure, joined
 from d4orm_env.core.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class _HasMotion(Protocol):
     @property
     def title(self) -> str: ...
     @property
-    def key_figures(self) -> list[Row]: ...
+    def key_figures(self) -> list[KeyFigure]: ...
     def motion(self, title: str | None = None, denoising: Denoising | None = None) -> ReplayMotion: ...
     def animate(self) -> Replay: ...
 

@@ -13,7 +13,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
 from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary_line import Row, count, outcome_rows
+from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.disturbances.recorded_events import marks_of
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -58,7 +58,7 @@ class Episode(DisplayMixin):
         return f"{self.problem.name}, {count(self.problem.num_robots, 'robot')}, {seconds:.1f} s"
 
     @property
-    def key_figures(self) -> list[Row]:
+    def key_figures(self) -> list[KeyFigure]:
         """Return the team's key figures."""
         return outcome_rows(self.metrics, self.problem.num_robots)
 

@@ -16,7 +16,7 @@ from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.metrics import mean_stretch
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary_line import Row, count, outcome_rows
+from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.conflict_groups import conflicts
@@ -251,7 +251,7 @@ class Plan(DisplayMixin):
         return f"{team} by {self.planner}: {self.status.replace('_', ' ')} after {spent}"
 
     @property
-    def key_figures(self) -> list[Row]:
+    def key_figures(self) -> list[KeyFigure]:
         """Return the plan's key figures."""
         return outcome_rows(self.metrics, self.problem.num_robots)
 

@@ -13,14 +13,14 @@ from pathlib import Path
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.machine import commit, describe_machine, versions
 from d4orm_planners.benchmark.settings import BenchmarkSettings
-from d4orm_planners.benchmark.timing import Row, Spread
+from d4orm_planners.benchmark.timing import Measurement, Spread
 from d4orm_planners.evaluation.tables import table
 
 FORMAT = "d4orm-bench-1"
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")
 
 
-def circumstances(command: str) -> Row:
+def circumstances(command: str) -> Measurement:
     """Under which a benchmark runs that begins now: date, command, commit, machine with its load, and libraries."""
     load = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
     machine = {**describe_machine(), "load_average": load, "libraries": versions(LIBRARIES)}
@@ -29,7 +29,7 @@ def circumstances(command: str) -> Row:
 
 
 def write_report(
-    folder: Path, settings: BenchmarkSettings, begun: Row, results: dict[str, list[Row]]
+    folder: Path, settings: BenchmarkSettings, begun: Measurement, results: dict[str, list[Measurement]]
 ) -> tuple[Path, Path]:
     """Write ``bench.json`` and ``bench.md``.
 
@@ -53,7 +53,7 @@ def write_report(
     return folder / "bench.json", folder / "bench.md"
 
 
-def markdown(settings: BenchmarkSettings, begun: Row, results: dict[str, list[Row]]) -> str:
+def markdown(settings: BenchmarkSettings, begun: Measurement, results: dict[str, list[Measurement]]) -> str:
     """The results as Markdown tables. Times are medians, with quartiles in brackets."""
     machine = begun["machine"]
     libraries = ", ".join(f"{name} {version}" for name, version in machine["libraries"].items())
@@ -84,7 +84,7 @@ def seconds(spread: Spread) -> str:
     return f"{spread.median:.2f} ({spread.lower_quartile:.2f}-{spread.upper_quartile:.2f})"
 
 
-def _denoising(rows: list[Row]) -> str:
+def _denoising(rows: list[Measurement]) -> str:
     plain = {(row["model"], row["num_robots"]): row["step"].median for row in rows if row["engine"] == "plain"}
     lines = []
     for row in rows:
@@ -106,16 +106,18 @@ def _denoising(rows: list[Row]) -> str:
     return table("Denoising", header, lines)
 
 
-def _tabulated(title: str, columns: Mapping[str, Callable[[Row], object]]) -> Callable[[list[Row]], str]:
+def _tabulated(
+    title: str, columns: Mapping[str, Callable[[Measurement], object]]
+) -> Callable[[list[Measurement]], str]:
     """Draws a table of measurements, with what to write in a column by its name."""
 
-    def draw(rows: list[Row]) -> str:
+    def draw(rows: list[Measurement]) -> str:
         return table(title, tuple(columns), [[str(text(row)) for text in columns.values()] for row in rows])
 
     return draw
 
 
-_SECTIONS: dict[str, Callable[[list[Row]], str]] = {
+_SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
     "denoising": _denoising,
     "threads": _tabulated("Threads", {
         "robots": itemgetter("num_robots"),

@@ -29,7 +29,7 @@ from d4orm_planners.benchmark.env_steps import (
 from d4orm_planners.benchmark.probes import measure_memory, measure_startup
 from d4orm_planners.benchmark.robots import measure_robots
 from d4orm_planners.benchmark.settings import BenchmarkSettings
-from d4orm_planners.benchmark.timing import Row, Spread, in_turn, measure
+from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn, measure
 from d4orm_planners.benchmark.walls import Where, measure_index, measure_obstacles
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.engine.select import get_sampling_engine
@@ -43,7 +43,7 @@ FIRST_STEPS = 5
 Run: TypeAlias = Callable[[FloatArray, bool], object]
 """``(noise_scale, collisions)`` to what is timed."""
 
-Part = tuple[str, str, Callable[[], Row]]
+Part = tuple[str, str, Callable[[], Measurement]]
 
 
 def circle(num_robots: int, model: str, horizon: int) -> Problem:
@@ -107,9 +107,9 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
             yield "plans", f"first plans of {num_robots} robots", partial(_measure_plans, settings, preset, num_robots)
 
 
-def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], object]) -> dict[str, list[Row]]:
+def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], object]) -> dict[str, list[Measurement]]:
     """Measurements by section; ``progress(what, number done, number in all)`` is called before each."""
-    results: dict[str, list[Row]] = {section: [] for section, _, _ in todo}
+    results: dict[str, list[Measurement]] = {section: [] for section, _, _ in todo}
     for done, (section, what, work) in enumerate(todo):
         progress(what, done, len(todo))
         results[section].append(work())
@@ -125,7 +125,7 @@ def _d4orm(preset: str | None = None, **settings: object) -> D4orm:
 
 def _measure_denoising(
     settings: BenchmarkSettings, engine: str, preset: str | None, num_robots: int, model: str
-) -> Row:
+) -> Measurement:
     problem = circle(num_robots, model, settings.horizon)
     run = _plain_run(problem, settings) if engine == "plain" else _engine_run(problem, settings, engine, preset)
     planner = _d4orm(num_steps=settings.num_steps)
@@ -177,7 +177,7 @@ def _plain_run(problem: Problem, settings: BenchmarkSettings) -> Run:
     )
 
 
-def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int) -> Row:
+def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int) -> Measurement:
     """An iteration by the rules of D4orm's defaults on several threads, beside one on a single thread."""
     problem = circle(num_robots, "holonomic2d", settings.horizon)
     noise_scale = _d4orm(num_steps=settings.num_steps).noise_scale()
@@ -194,7 +194,7 @@ def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int)
     }
 
 
-def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> Row:
+def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> Measurement:
     """An iteration of the paper's planner among boxes, beside one in the open."""
     planner = _d4orm(preset="paper", num_steps=settings.num_steps)
     noise_scale = planner.noise_scale()
@@ -205,7 +205,7 @@ def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where
     return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
 
 
-def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> Row:
+def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> Measurement:
     """Planning time to the first feasible plan; a seed without one counts with the time it took to give up."""
     planner = make_planner("d4orm", preset=preset)
     problem = make_problem("circle", num_robots=num_robots)

@@ -15,7 +15,7 @@ from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.benchmark.settings import BenchmarkSettings
-from d4orm_planners.benchmark.timing import Row, Spread, measure
+from d4orm_planners.benchmark.timing import Measurement, Spread, measure
 from d4orm_planners.benchmark.walls import boxed_problem
 
 if TYPE_CHECKING:
@@ -35,13 +35,15 @@ RIGID = ("holonomic2d", "differential_drive")
 """Models that are stepped as rigid bodies, where MuJoCo is installed."""
 
 
-def measure_env(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
+def measure_env(
+    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()
+) -> Measurement:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
     env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"), disturbances=disturbances)
     return _rate("parallel_env", 1, num_boxes, disturbances, _measure_steps(settings, env, settings.env_steps))
 
 
-def measure_rigid(settings: BenchmarkSettings, model: str) -> Row:
+def measure_rigid(settings: BenchmarkSettings, model: str) -> Measurement:
     """The same of rigid bodies in MuJoCo."""
     env = open_env(make_problem("circle", num_robots=8, model=model, horizon=settings.horizon), "mujoco")
     seconds = _measure_steps(settings, env, max(1, settings.env_steps // 10))
@@ -69,14 +71,16 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
     return spread.times(1 / count)
 
 
-def measure_worlds(settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()) -> Row:
+def measure_worlds(
+    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()
+) -> Measurement:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
     size, problem = settings.num_worlds, boxed_problem(num_boxes, "near")
     seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances)
     return _rate("make_vec", size, num_boxes, disturbances, seconds)
 
 
-def measure_rooms(settings: BenchmarkSettings) -> Row:
+def measure_rooms(settings: BenchmarkSettings) -> Measurement:
     """The same in eight rooms that worlds draw from, where robots see their paths and are paid along them."""
     size = max(1, settings.num_worlds // 8)
     along = {"observed_path": True, "progress": "path", "reward": "training"}
@@ -105,7 +109,7 @@ def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Sp
     return spread.times(1 / (calls * size))
 
 
-def measure_functional(settings: BenchmarkSettings) -> Row:
+def measure_functional(settings: BenchmarkSettings) -> Measurement:
     """Worlds of 8 robots as pure functions of JAX, all in one program: random controls, observations, auto-reset."""
     size, calls = settings.num_worlds, max(1, settings.env_steps // 10)
     env = functional_env.FunctionalEnv(problem=boxed_problem(0, "near"))
@@ -133,7 +137,7 @@ def measure_functional(settings: BenchmarkSettings) -> Row:
 
 def _rate(
     environment: str, num_worlds: int, num_boxes: int, disturbances: Sequence[AnyDisturbance], seconds: Spread
-) -> Row:
+) -> Measurement:
     """Seconds per environment step, and steps per second at the median."""
     return {
         "environment": environment,

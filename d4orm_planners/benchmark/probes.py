@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 
-from d4orm_planners.benchmark.timing import Row, Spread
+from d4orm_planners.benchmark.timing import Measurement, Spread
 
 _FIRST_PLAN = """
 import json, sys, time
@@ -48,7 +48,7 @@ print(json.dumps({"imported": imported, "peak": peak()}))
 """
 
 
-def _run(code: str, *arguments: object, cache: str | None = None) -> tuple[float, Row]:
+def _run(code: str, *arguments: object, cache: str | None = None) -> tuple[float, Measurement]:
     """Seconds from start to exit of a fresh interpreter, and what it printed.
 
     Raises:
@@ -62,11 +62,11 @@ def _run(code: str, *arguments: object, cache: str | None = None) -> tuple[float
     seconds = time.perf_counter() - begin
     if process.returncode != 0:
         raise RuntimeError(f"a measurement in a process of its own failed: {process.stderr.strip().splitlines()[-1:]}")
-    result: Row = json.loads(process.stdout.splitlines()[-1])
+    result: Measurement = json.loads(process.stdout.splitlines()[-1])
     return seconds, result
 
 
-def measure_startup(num_robots: int, repetitions: int) -> Row:
+def measure_startup(num_robots: int, repetitions: int) -> Measurement:
     """First plan of a process: once with an empty kernel cache, then with a full one.
 
     Returns:
@@ -80,7 +80,7 @@ def measure_startup(num_robots: int, repetitions: int) -> Row:
     return {"num_robots": num_robots, "cold": cold, "compiling": compiling, "warm": Spread.of(warm)}
 
 
-def measure_memory(num_robots: int, num_samples: int, horizon: int, diameter: float) -> Row:
+def measure_memory(num_robots: int, num_samples: int, horizon: int, diameter: float) -> Measurement:
     """Peak resident memory of a process that plans, in bytes: after importing, and in all."""
     _, result = _run(_MEMORY, num_robots, num_samples, horizon, diameter)
     return {"num_robots": num_robots, "num_samples": num_samples, "horizon": horizon, **result}

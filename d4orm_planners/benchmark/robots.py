@@ -9,14 +9,14 @@ import numpy as np
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.benchmark.timing import Row, Spread, measure
+from d4orm_planners.benchmark.timing import Measurement, Spread, measure
 
 NUM_ROBOTS = 10
 WARMUP = 10
 """Loops at the beginning that do not count: they may compile."""
 
 
-def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Row:
+def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Measurement:
     """Seconds of a control loop of D4orm-C2F for ten robots, and of :meth:`Plan.sample` at 100 Hz for as many."""
     problem = make_problem("circle", num_robots=NUM_ROBOTS, goal_speed=0.1, horizon=150)
     plan = make_planner().solve(problem, seed=0)

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-Row: TypeAlias = dict[str, Any]
+Measurement: TypeAlias = dict[str, Any]
 """Measurement of one case, by column: numbers, texts and :class:`Spread`."""
 
 

@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.geometry.world_index import build_index
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.benchmark.timing import Row, Spread, in_turn
+from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn
 
 Where = Literal["near", "far"]
 
@@ -39,7 +39,7 @@ def boxed_problem(num_boxes: int, where: Where, horizon: int = 100) -> Problem:
 
 def measure_obstacles(
     iterate: Callable[[Problem], object], num_boxes: int, where: Where, repetitions: int, time_limit: float
-) -> Row:
+) -> Measurement:
     """Seconds of an iteration among boxes and in the open, in turn, and of verify().
 
     Args:
@@ -65,7 +65,7 @@ def measure_obstacles(
     }
 
 
-def measure_index(cells: int) -> Row:
+def measure_index(cells: int) -> Measurement:
     """Seconds and bytes of the index of a square map of so many cells along a side."""
     blocked = np.argwhere(np.random.default_rng(0).random((cells, cells)) < BLOCKED) * CELL
     shapes = World(boxes=np.hstack([blocked, blocked + CELL])).shapes
