@@ -77,7 +77,7 @@ def position_error(task: SamplingTask, controls: np.ndarray, control_error: floa
 def _step(problem: Any, states: Any, docked: Any, controls: Any) -> tuple[Any, Any]:
     """States ``(M, K, n)`` after a step, and ``(M, K)`` how far each robot is from docking; ``docked`` is updated."""
     states, short = states.copy(), np.full(docked.shape, np.inf)
-    docking_speed = problem.goal_speed + problem.team.max_speed / 2**15
+    docking_speed = problem.goal_speed + problem.team.max_speed / 2**13
     for k, name in enumerate(problem.team.models):
         after, speed = _MOVES[name](states[:, k], controls[:, k], problem.team.limits[k].astype(np.float64), problem.dt)
         gap = np.linalg.norm(after[:, : problem.dimension] - problem.goal[k], axis=1)

@@ -12,7 +12,7 @@ from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops,
 
 __all__ = ["TimeStep", "advance", "arrives"]
 
-SPEED_ALLOWANCE = 2**-15
+SPEED_ALLOWANCE = 2**-13
 """Share of the speed limit by which a robot may exceed its goal speed: many come down to just that and a rounding."""
 
 

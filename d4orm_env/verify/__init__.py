@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
-from d4orm_env.verify.docking import SPEED_TOLERANCE, Docking, find_docking
+from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
@@ -94,7 +94,7 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
         min((watch.minimum for watch in obstacles), default=np.inf),
         docking.arrival_times,
         docking.arrival_speeds,
-        not (docking.arrival_speeds > (1 + SPEED_TOLERANCE) * _braked_away(problem)).any(),
+        not (docking.arrival_speeds > _braked_away(problem)).any(),
         sorted(violations, key=lambda violation: violation.time),
     )
 
@@ -150,9 +150,10 @@ def _left_out(problem: Problem, violations: list[Violation]) -> VerificationRepo
 
 
 def _braked_away(problem: Problem) -> Floats:
-    """``(K,)`` what robots brake away in a step [m/s], infinite for those without inertia."""
+    """``(K,)`` what robots brake away in a step, and the allowance [m/s]; infinite for those without inertia."""
     first_order = np.array([model.first_order for model in problem.team.robot_models])
-    return np.where(first_order, np.inf, problem.team.max_acceleration.astype(np.float64) * problem.dt)
+    braking = problem.team.max_acceleration * problem.dt + SPEED_ALLOWANCE * problem.team.max_speed
+    return np.where(first_order, np.inf, braking.astype(np.float64))
 
 
 def _non_finite(controls: Floats, dt: float) -> list[Violation]:

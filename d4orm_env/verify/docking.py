@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 RADIUS_TOLERANCE, SPEED_TOLERANCE = 1 / 7500, 1e-5
 """Least distance to the goal radius, as a share of it, and to the goal speed, as a share of the speed limit, that
 rounding does not bridge."""
-SPEED_ALLOWANCE = 2.0**-15
+SPEED_ALLOWANCE = 2.0**-13
 """Share of the speed limit by which a robot may exceed its goal speed."""
 ROUNDING = 32 * 2.0**-23
 """The same, as a share of the coordinates; 20 units in float32's last place were measured."""

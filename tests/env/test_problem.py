@@ -328,7 +328,7 @@ def test_the_arrays_that_engines_read() -> None:
     assert arrays.docks
     assert arrays.bounds.tolist() == [[-4, -4], [4, 4]]
     assert (arrays.margin, arrays.squared_goal_radius) == (0.125, 0.25)
-    np.testing.assert_allclose(arrays.squared_goal_speed, 0.0625, rtol=1e-3)  # with an allowance for rounding
+    np.testing.assert_allclose(arrays.squared_goal_speed, 0.0625, rtol=3e-3)  # with an allowance for rounding
     assert (arrays.squared_goal_speed > 0.0625).all()
     open_world = two_robots(world=None).arrays
     assert open_world.bounds.tolist() == [[-np.inf] * 2, [np.inf] * 2]

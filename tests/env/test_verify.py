@@ -407,7 +407,7 @@ def test_a_robot_that_docks_at_the_edge_may_be_in_the_way_there():
 
 
 def test_speed_at_the_goal_speed_is_decided_by_rounding_too():
-    problem = make(["holonomic2d"], [(0, 0, 0.5, 0)], [(0.5, 0)], horizon=20, goal_speed=0.5 - 2**-15 - 5e-6)
+    problem = make(["holonomic2d"], [(0, 0, 0.5, 0)], [(0.5, 0)], horizon=20, goal_speed=0.5 - 2**-13 - 5e-6)
     coasting = hold(problem, (0, 0))
     report = verify(problem, coasting)
     assert kinds(report) == ["not arrived"]
