@@ -32,7 +32,7 @@ from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [
-    pytest.param({"scenario": "circle", "num_robots": 16}, id="circle-16"),
+    pytest.param({"scenario": "circle", "num_robots": 16, "horizon": 150}, id="circle-16"),
     pytest.param({"scenario": "four_obstacles", "num_robots": 12}, id="four-obstacles-12"),
     pytest.param({"scenario": "random", "num_robots": 16}, id="random-16"),
     pytest.param({"scenario": "swap", "num_robots": 8}, id="swap-8"),
