@@ -83,7 +83,7 @@ def test_obstacles_in_the_plane(seed: int) -> None:
 
 
 def test_the_papers_algorithm_solves_too() -> None:
-    problem = make_problem("circle", num_robots=4)
+    problem = make_problem("circle", num_robots=4, goal_speed=np.inf)
     plan = make_planner("d4orm", preset="paper", engine="cpu").solve(problem, seed=0, max_iterations=BUDGET)
     assert plan.solved
     assert verify(problem, plan.controls).ok
@@ -92,7 +92,7 @@ def test_the_papers_algorithm_solves_too() -> None:
 
 @pytest.mark.slow
 def test_the_papers_algorithm_solves_what_the_paper_does() -> None:
-    assert_solves({"scenario": "circle", "num_robots": 16}, 0, 2 * BUDGET, preset="paper")
+    assert_solves({"scenario": "paper_circle", "num_robots": 16}, 0, 2 * BUDGET, preset="paper")
 
 
 def test_a_team_of_one() -> None:

@@ -110,7 +110,9 @@ def test_the_first_iteration_of_the_paper_preset_minds_no_collisions() -> None:
 
 
 def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
-    search = search_of(make_problem("random", num_robots=16, size=6.0, seed=3), iterations=1, start="straight")
+    search = search_of(
+        make_problem("random", num_robots=16, size=6.0, seed=3, goal_speed=np.inf), iterations=1, start="straight"
+    )
     repairs = 0
     while search.current.failed.any() and repairs < 8:
         before = search.current
