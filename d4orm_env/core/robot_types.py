@@ -9,7 +9,7 @@ from types import MappingProxyType
 from d4orm_env.core.arrays import shown, whole_number
 from d4orm_env.core.team import Team
 
-_BITCRAZE = "data sheet: 92 mm between motors, 47 mm propellers"
+_BITCRAZE = "92 mm between motors, 47 mm propellers; not looked up, measure yours"
 _MEASURED = "flown in crazyflow 0.4.0 with the Mellinger controller: largest tracking error 0.07 m, 0.12 m with gusts"
 
 
@@ -117,10 +117,10 @@ ROBOTS: Mapping[str, RobotType] = MappingProxyType(
             margin=0.1,
             lag=0.2,
             sources={
-                "radius": "Clearpath Jackal: 508 x 430 mm, half of the diagonal",
-                "max_speed": "ours; Clearpath: 2.0 m/s",
+                "radius": "Clearpath Jackal: 508 x 430 mm, half of the diagonal; not looked up",
+                "max_speed": "ours; 2.0 m/s at most, not looked up",
                 "max_acceleration": "ours, for skid steering",
-                "max_turn_rate": "ours; jackal_control allows 4 rad/s",
+                "max_turn_rate": "ours, not measured",
                 "margin": "ours, not measured",
                 "lag": "ours, not measured",
             },

@@ -1,4 +1,4 @@
-"""What an environment is: its problem or its scenario's instances, and its options checked."""
+"""Definition of an environment: its problem or its scenario's instances, and its options checked."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         return np.empty_like(self._observations) if self._copy else self._observations
 
     def _drawn(self, mask: BoolArray) -> dict[int, int]:
-        """What each world in ``mask`` has drawn for its next episode, from a generator of its own."""
+        """Problems that each world in ``mask`` has drawn for its next episode, from a generator of its own."""
         drawn = dict.fromkeys(np.flatnonzero(mask).tolist(), 0)
         for world in drawn if self._setup.draws else ():
             generator = self._generators[world]

@@ -18,7 +18,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import DisturbanceObserver
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Actions, Policy
-from d4orm_planners.tracking.steering import by_model, track_velocities
+from d4orm_planners.tracking.steering import by_model, present_velocities, track_velocities
 
 Mode = Literal["nominal", "measured"]
 
@@ -30,7 +30,7 @@ SAME_PERIOD = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ControlSetpoint:
-    """What the team is to do until the next step.
+    """Setpoint of a team until the next step.
 
     Attributes:
         position: ``(K, d)`` where robots are to be at the end of the period [m].
@@ -243,13 +243,7 @@ class Controller:
 
     def _velocities(self, joint: JointState) -> Floats:
         """``(K, d)`` velocities; of first-order models those that were commanded."""
-        velocities = np.zeros((self.problem.num_robots, self.problem.dimension))
-        for model, robots in by_model(self.problem):
-            rows = (joint.states, joint.controls, self.problem.team.limits)
-            x, u, limits = (tuple(row[robots].T) for row in rows)
-            parts = model.functions.velocity(x, u, limits, NUMPY_OPS)
-            velocities[robots] = np.stack(np.broadcast_arrays(*parts), axis=1)
-        return velocities
+        return present_velocities(self.problem, joint.states, joint.controls).astype(np.float64)
 
     def _described(self, before: JointState, controls: FloatArray, held: bool) -> ControlSetpoint:
         joint = self._joint
