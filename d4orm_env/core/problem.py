@@ -173,8 +173,9 @@ class Problem(Frozen):
         self._set(start=unwound_states(team, self.start))
         check_resolution(team, np.concatenate([places, self.goal], axis=1), self.dt, self.goal_radius)
         check_turning(team, self.dt, self.goal_radius)
-        for what, positions in (("start", places), ("goal", self.goal)):
-            fault = check_places(team, self.world, what, positions, self.margin)
+        open_states = np.full_like(self.start, np.nan)
+        for what, positions, states in (("start", places, self.start), ("goal", self.goal, open_states)):
+            fault = check_places(team, self.world, what, positions, self.margin, team.headings(states))
             if fault:
                 warnings.warn(
                     f"problem {self.name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=3
@@ -221,6 +222,11 @@ class Problem(Frozen):
         return float(np.max(self.team.radius)) + self.margin
 
     @property
+    def _within(self) -> float:
+        """The distance within which all obstacles count [m]: of a disc none but the nearest does."""
+        return self._reach if len(self.team.footprint_arrays.inner) else 0.0
+
+    @property
     def stride(self) -> float:
         """Distance that the fastest robot drives in a step at full speed [m], the unit of planners' settings."""
         return self.dt * float(self.team.max_speed.max())
@@ -245,7 +251,7 @@ class Problem(Frozen):
             ),
             boxes=self.world.shapes.boxes,
             triangles=self.world.shapes.triangles,
-            grid=self.world.index(self._reach),
+            grid=self.world.index(self._reach, within=self._within),
             bounds=self.world.bounds,
             time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
             margin=np.float32(self.margin),
@@ -253,6 +259,7 @@ class Problem(Frozen):
             squared_goal_speed=np.square(docking_speed(self.goal_speed, self.team.max_speed)),
             docks=np.bool_(self.docks),
             collision_penalty=np.float32(self.collision_penalty),
+            footprints=self.team.footprint_arrays,
         )
         for array in arrays:
             if isinstance(array, np.ndarray):
@@ -262,7 +269,7 @@ class Problem(Frozen):
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
         places = np.concatenate([self.start[:, : self.dimension], self.goal])
-        grid = self.world.index(self._reach, max(num_obstacles, 1), places)
+        grid = self.world.index(self._reach, max(num_obstacles, 1), places, self._within)
         return self.arrays._replace(grid=grid)
 
     @cached_property
@@ -311,6 +318,8 @@ class Problem(Frozen):
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {goal_speed!r}".encode())
         if not self.docks:
             sha.update(self.arrival.encode())
+        if len(arrays.footprints.inner):
+            sha.update(repr(self.team.shapes).encode())
         if self.collision_penalty != 1:
             sha.update(f"collision_penalty {self.collision_penalty!r}".encode())
         return sha.hexdigest()

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.footprints import FootprintArrays
 from d4orm_env.geometry.world_index import WorldIndex
 
 
@@ -31,6 +32,7 @@ class ProblemArrays(NamedTuple):
         squared_goal_speed: ``(K,)`` with the allowance for rounding; infinite without a limit.
         docks: ``()`` bool: a robot that has arrived stays there for good.
         collision_penalty: ``()``.
+        footprints: Of robots that are no discs; their radii are those of discs round them.
     """
 
     model_codes: NDArray[np.int32]
@@ -49,6 +51,7 @@ class ProblemArrays(NamedTuple):
     squared_goal_speed: FloatArray
     docks: np.bool_
     collision_penalty: np.float32
+    footprints: FootprintArrays
 
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:

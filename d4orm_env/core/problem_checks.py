@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, IntArray, as_float32, shown
+from d4orm_env.core.footprint_gaps import pair_gap, world_gap
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
+from d4orm_env.footprints import Disc
 
 MAX_HEADING = 1000.0
 """Largest heading that is given as a state [rad]; float32 resolves it to 6e-5 rad. What is taken is unwound."""
@@ -128,20 +130,39 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
             )
 
 
-def check_places(team: Team, world: World, what: str, places: FloatArray, margin: float) -> str:
+def check_places(
+    team: Team, world: World, what: str, places: FloatArray, margin: float, headings: FloatArray | None = None
+) -> str:
     """Refuse starts or goals (``what``) ``(K, d)`` outside the world, or that touch something.
+
+    Args:
+        team: The robots.
+        world: The world.
+        what: "start" or "goal".
+        places: Where they are [m].
+        margin: The margin [m].
+        headings: ``(K,)`` what turns their footprints [rad], NaN where it is not known: such a footprint counts as the
+            disc within it. All are unknown by default.
 
     Returns:
         What is nearest within the margin, for an error or a warning: the empty string if nothing is.
     """
     radius = team.radius.astype(np.float64)
     gaps = world.clearance(places) - radius
+    shaped = bool(len(team.footprint_arrays.inner))
+    poses = np.column_stack([places, np.full(len(places), np.nan) if headings is None else headings]).astype(np.float64)
+    for robot in np.flatnonzero(gaps <= margin) if shaped else ():
+        gaps[robot] = world_gap(world, team.footprint[robot], poses[robot])
     for robot in np.flatnonzero(gaps <= 0):
         raise ValueError(
             f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an "
-            f"obstacle or outside the bounds (robot radius {radius[robot]:g} m); move it, or change the world"
+            f"obstacle or outside the bounds ({_size(team, int(robot))}); move it, or change the world"
         )
     first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
+    if shaped:
+        pairs = zip(first.tolist(), second.tolist(), strict=True)
+        gap_of = [pair_gap(team.footprint[i], poses[i], team.footprint[j], poses[j]) for i, j in pairs]
+        between = np.array(gap_of, np.float64)
     overlapping = np.flatnonzero(between <= 0)
     if len(overlapping):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]
@@ -149,7 +170,8 @@ def check_places(team: Team, world: World, what: str, places: FloatArray, margin
         one, other = int(first[pair]), int(second[pair])
         raise ValueError(
             f"{what}s of robot_{one} at {_point(places[one])} and robot_{other} at {_point(places[other])} "
-            f"overlap by {0 - between[pair]:.3g} m; move them more than {radius[one] + radius[other]:g} m apart"
+            f"overlap by {0 - between[pair]:.3g} m; move them "
+            + ("apart" if shaped else f"more than {radius[one] + radius[other]:g} m apart")
         )
     least = int(np.argmin(gaps))
     gap, nearest = gaps[least], "an obstacle or the bounds"
@@ -159,6 +181,11 @@ def check_places(team: Team, world: World, what: str, places: FloatArray, margin
     if gap > margin:
         return ""
     return f"the {what} of robot_{least} is {gap:.3g} m from {nearest}, and the margin is {margin:g} m"
+
+
+def _size(team: Team, robot: int) -> str:
+    footprint = team.footprint[robot]
+    return f"robot radius {footprint.radius:g} m" if isinstance(footprint, Disc) else f"footprint {footprint}"
 
 
 def _near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray, IntArray, Floats]:

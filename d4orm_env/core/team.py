@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import FloatArray, Frozen, frozen_per_robot, shown
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
+from d4orm_env.footprints import Disc, Footprint, FootprintArrays, as_arrays
 
 DEFAULT_RADIUS = 0.15
 """Radius of a robot [m]."""
@@ -28,17 +30,19 @@ class Team(Frozen):
 
     Attributes:
         models: ``K`` model names.
-        radius: ``(K,)`` body radius [m].
+        radius: ``(K,)`` body radius [m]; of a footprint that is no disc, its outer radius.
         max_speed: ``(K,)`` speed limit [m/s].
         max_acceleration: ``(K,)`` acceleration limit [m/s^2]; no use to a first-order robot.
         max_turn_rate: ``(K,)`` turn rate limit [rad/s]; of use to differential drives and unicycles. How far a robot
             may turn in a time step is bounded; see :class:`~d4orm_env.core.problem.Problem`.
         own_limits: ``(K,)`` by name for every limit that a model of the team has for itself, such as the ``wheelbase``
             of a car; of use to its robots only. What is left out has the model's default.
+        shapes: ``K`` :mod:`footprints <d4orm_env.footprints>`, given as ``footprint``, one for all or one each; empty
+            for discs.
 
     Raises:
         ValueError: For an unknown model, an empty or mixed-dimension team, a limit that is not positive or out of
-            range, or one that no model of the team has.
+            range, one that no model of the team has, a footprint of another dimension, or a radius that is not its.
     """
 
     models: tuple[str, ...]
@@ -47,15 +51,17 @@ class Team(Frozen):
     max_acceleration: FloatArray
     max_turn_rate: FloatArray
     own_limits: Mapping[str, FloatArray]
+    shapes: tuple[Footprint, ...]
 
     def __init__(
         self,
         models: Sequence[str],
-        radius: ArrayLike = DEFAULT_RADIUS,
+        radius: ArrayLike | None = None,
         max_speed: ArrayLike = DEFAULT_LIMITS[SPEED],
         max_acceleration: ArrayLike = DEFAULT_LIMITS[ACCELERATION],
         max_turn_rate: ArrayLike = DEFAULT_LIMITS[TURN_RATE],
         own_limits: Mapping[str, ArrayLike] = MappingProxyType({}),
+        footprint: Footprint | Sequence[Footprint] | None = None,
     ) -> None:
         if isinstance(models, str) or not isinstance(models, Sequence):
             raise ValueError(f"models must be a sequence of model names, not {models!r}")
@@ -66,8 +72,56 @@ class Team(Frozen):
         self._set(models=tuple(models))
         for name, value in zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True):
             self._set(**{name: frozen_per_robot(value, name, len(models))})
-        self._set(radius=frozen_per_robot(radius, "radius", len(models)))
+        self._set_footprints(radius, footprint)
         self._set(own_limits=self._complete_own_limits(own_limits))
+
+    def _set_footprints(self, radius: ArrayLike | None, given: Footprint | Sequence[Footprint] | None) -> None:
+        """Set shapes and radius, of which one follows from the other."""
+        count = len(self.models)
+        if given is None:
+            radii = frozen_per_robot(DEFAULT_RADIUS if radius is None else radius, "radius", count)
+            self._set(radius=radii, shapes=())
+            return
+        footprints = (given,) * count if isinstance(given, Footprint) else tuple(given)
+        if len(footprints) != count:
+            raise ValueError(f"footprint has {len(footprints)} entries for {count} robots; give one each, or one")
+        for robot, footprint in enumerate(footprints):
+            if not isinstance(footprint, Footprint):
+                raise ValueError(f"footprint of robot_{robot} is {shown(footprint)}; give one such as Box(0.5, 0.25)")
+            if footprint.dimension != self.dimension and not isinstance(footprint, Disc):
+                raise ValueError(
+                    f"footprint of robot_{robot}, {footprint}, lies in {footprint.dimension} dimensions and the team "
+                    f"moves in {self.dimension}; choose another"
+                )
+        radii = frozen_per_robot([footprint.outer_radius for footprint in footprints], "radius", count)
+        if radius is not None and (frozen_per_robot(radius, "radius", count) != radii).any():
+            raise ValueError(f"radius {shown(radius)} is not that of the footprints, {radii.tolist()}; leave it out")
+        discs = all(isinstance(footprint, Disc) for footprint in footprints)
+        self._set(radius=radii, shapes=() if discs else footprints)
+
+    def replace(self, **changes: object) -> Team:
+        """A copy with some attributes changed, checked again; of radius and footprint, what is not given follows."""
+        given: dict[str, Any] = self.__getstate__()
+        shapes = given.pop("shapes")
+        if shapes or "footprint" in changes:
+            given |= {"radius": None, "footprint": None if "radius" in changes else shapes}
+        return Team(**given | changes)
+
+    @property
+    def footprint(self) -> tuple[Footprint, ...]:
+        """``K`` footprints."""
+        return self.shapes or tuple(Disc(radius) for radius in self.radius.tolist())
+
+    def headings(self, states: FloatArray) -> FloatArray:
+        """``(..., K)`` what turns the robots' footprints in states ``(..., K, n)`` [rad]; zero without a heading."""
+        columns = [model.heading_index for model in self.robot_models]
+        turned = np.stack([states[..., robot, column or 0] for robot, column in enumerate(columns)], axis=-1)
+        return np.where([column is None for column in columns], np.float32(0), turned)
+
+    @cached_property
+    def footprint_arrays(self) -> FootprintArrays:
+        """The footprints as the engines read them; without rows where all robots are discs."""
+        return as_arrays(self.shapes, [model.heading_index for model in self.robot_models])
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):
@@ -159,11 +213,12 @@ class Team(Frozen):
         index = list(robots)
         return Team(
             tuple(self.models[robot] for robot in index),
-            self.radius[index],
+            None if self.shapes else self.radius[index],
             self.max_speed[index],
             self.max_acceleration[index],
             self.max_turn_rate[index],
             self._own_limits_of(index),
+            [self.shapes[robot] for robot in index] if self.shapes else None,
         )
 
     def _own_limits_of(self, robots: list[int]) -> dict[str, FloatArray]:

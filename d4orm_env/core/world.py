@@ -162,7 +162,7 @@ class World(Frozen):
         return Shapes(boxes, angular)
 
     @cached_property
-    def _indices(self) -> dict[tuple[float, int, float, int], WorldIndex]:
+    def _indices(self) -> dict[tuple[float, int, float, int, float], WorldIndex]:
         return {}
 
     @property
@@ -171,7 +171,9 @@ class World(Frozen):
         lower, upper = self.shapes.extent()
         return max(float((upper - lower).max()), SMALLEST) / 32
 
-    def index(self, reach: float, nearest: int = 1, places: FloatArray | None = None) -> WorldIndex:
+    def index(
+        self, reach: float, nearest: int = 1, places: FloatArray | None = None, within: float = 0.0
+    ) -> WorldIndex:
         """The grid that finds obstacles, made once for distances of about the same size.
 
         Args:
@@ -179,6 +181,7 @@ class World(Frozen):
             nearest: Number of nearest obstacles that it is to find.
             places: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m], and in
                 wider grids farther away.
+            within: Distance within which it is to find all obstacles, not only the nearest [m].
         """
         reach = margin = _rounded_up(reach)
         levels = 1
@@ -186,12 +189,12 @@ class World(Frozen):
             lower, upper = self.shapes.extent()
             margin = _rounded_up(max(reach, float(np.max([lower - places, places - upper]))))
             levels = _LEVELS if self.shapes.count <= _FEW else 1
-        key = (reach, nearest, margin, levels)
+        key = (reach, nearest, margin, levels, within)
         if key not in self._indices:
             # Cells of a quarter of a reach leave few points undecided, which pays for thousands of samples. Who
             # observes asks once per robot and time step, and in ever new worlds.
             cell = reach / 4 if places is None else reach
-            self._indices[key] = build_index(self.shapes, cell, margin, nearest, levels)
+            self._indices[key] = build_index(self.shapes, cell, margin, nearest, levels, within)
         return self._indices[key]
 
     def clearance(self, positions: ArrayLike) -> np.ndarray:

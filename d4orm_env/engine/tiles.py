@@ -16,14 +16,15 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
-from d4orm_env.engine.simd import TILE, at_most, use_wide_registers, within_2, within_3
+from d4orm_env.engine.footprint_contacts import refine_pair
+from d4orm_env.engine.simd import NOWHERE, TILE, at_most, use_wide_registers, within_2, within_3
 from d4orm_env.engine.stepping import Docking, dispatch, make_stepper
 from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
 
@@ -112,12 +113,24 @@ def near_pair(reach: np.float32, a: int, b: int, dimension: int, w: FloatArray) 
 
 
 @inlined
-def mark_pairs(arrays: ProblemArrays, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]) -> None:
-    """Flag every two robots closer than their radii plus ``extra``."""
+def turn_row(arrays: ProblemArrays, k: Whole) -> Whole:
+    """Return where the row of the state component that turns the footprint of robot ``k`` begins."""
+    return k * STRIDE + (STATE + max(arrays.footprints.heading[k], 0)) * TILE
+
+
+@inlined
+def mark_pairs(
+    arrays: ProblemArrays, extra: np.float32, w: FloatArray, buffer: FloatArray, near: NDArray[np.uint64]
+) -> None:
+    """Flag every two robots closer than their footprints plus ``extra``; ``buffer`` is two rows to overwrite."""
     for k in range(1, arrays.radius.shape[0]):
         for other in range(k):
             reach = arrays.radius[k] + arrays.radius[other] + extra
-            touch = near_pair(reach, k * STRIDE, other * STRIDE, arrays.goal.shape[1], w)
+            a, b, dimension = k * STRIDE, other * STRIDE, arrays.goal.shape[1]
+            touch = near_pair(reach, a, b, dimension, w)
+            if touch != NOWHERE and arrays.footprints.inner.shape[0] > 0:
+                turns = turn_row(arrays, k), turn_row(arrays, other)
+                touch = refine_pair(arrays, k, other, touch, extra, dimension, w, a, b, w, turns[0], turns[1], buffer)
             near[k, ROBOT] |= touch
             near[other, ROBOT] |= touch
 

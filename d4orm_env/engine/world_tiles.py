@@ -12,6 +12,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import reward
 from d4orm_env.engine import obstacles
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
+from d4orm_env.engine.footprint_contacts import angle_of, bodies_within, refine_static
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
     BUFFER,
@@ -26,6 +27,7 @@ from d4orm_env.engine.tiles import (
     STATE,
     STRIDE,
     mark_pairs,
+    turn_row,
 )
 from d4orm_env.engine.types import ObservationInputs, WorldBatch
 
@@ -90,6 +92,17 @@ def store_world(worlds: WorldArrays | WorldBatch, b: int, s: Whole, w: FloatArra
         worlds.docked[b, k] = w[o + DOCKED * TILE] > ZERO
 
 
+@compiled
+def _meets_body(arrays: ProblemArrays, body: FloatArray, k: int, s: int, extra: np.float32, w: FloatArray) -> bool:
+    """Check whether robot ``k`` in lane ``s`` is within ``extra`` of a round body ``(2 d + 1,)``."""
+    f, dimension, place = arrays.footprints, arrays.goal.shape[1], k * STRIDE + STATE * TILE + s
+    x, y = body[0] - w[place], body[1] - w[place + TILE]
+    z = body[2] - w[place + 2 * TILE] if dimension == 3 else ZERO
+    angle, buffer = angle_of(f, k, w, turn_row(arrays, k) + s), w[k * STRIDE + BUFFER * TILE : k * STRIDE + ROWS * TILE]
+    radius = body[2 * dimension]
+    return bodies_within(f, k, arrays.radius[k], angle, f, -1, radius, ZERO, x, y, z, dimension == 2, extra, buffer)
+
+
 @inlined
 def _mark_bodies(
     arrays: ProblemArrays, bodies: FloatArray, first: int, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]
@@ -104,7 +117,9 @@ def _mark_bodies(
                     gap = bodies[first + s, i, axis] - w[k * STRIDE + (STATE + axis) * TILE + s]
                     gap2 += gap * gap
                 distance = arrays.radius[k] + bodies[first + s, i, 2 * dimension] + extra
-                if gap2 <= distance * distance:
+                if gap2 <= distance * distance and (
+                    arrays.footprints.inner.shape[0] == 0 or _meets_body(arrays, bodies[first + s, i], k, s, extra, w)
+                ):
                     near[k, DYNAMIC] |= np.uint64(1) << np.uint64(s)
 
 
@@ -124,11 +139,14 @@ def check_contacts(
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
-        mark_pairs(arrays, extra, w, near)
+        mark_pairs(arrays, extra, w, w[BUFFER * TILE : ROWS * TILE], near)
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
-            near[k, OBSTACLE] |= obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
+            touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
+            if touch != NOWHERE and arrays.footprints.inner.shape[0] > 0:
+                touch = refine_static(arrays, k, touch, extra, places, 0, w, turn_row(arrays, k), buffer)
+            near[k, OBSTACLE] |= touch
         _mark_bodies(arrays, worlds.bodies, first, extra, w, near)
         flags = worlds.collided if level == 0 else worlds.violated
         for s in range(count):

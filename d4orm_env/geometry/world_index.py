@@ -91,7 +91,9 @@ class _Cells(NamedTuple):
     item: NDArray[np.int64]
 
 
-def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1, levels: int = 1) -> WorldIndex:
+def build_index(
+    shapes: Shapes, cell: float, reach: float, nearest: int = 1, levels: int = 1, within: float = 0.0
+) -> WorldIndex:
     """The index of some obstacles.
 
     Args:
@@ -100,6 +102,7 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1, lev
         reach: Distance from the obstacles that the grid covers [m]; at least to where none of them counts.
         nearest: Number of nearest obstacles of any point that a cell's list is sure to hold.
         levels: Number of grids, one round the other.
+        within: Distance of all those that a cell's list is sure to hold [m]; zero for the nearest only.
     """
     if not shapes.count:
         nothing = np.zeros(0)
@@ -108,7 +111,7 @@ def build_index(shapes: Shapes, cell: float, reach: float, nearest: int = 1, lev
         return _frozen(corner, 1.0, ends, corner, 0.0, nothing, nothing, nothing, 0, nearest, levels)
     while True:
         low, size, cell = _layout(shapes, cell, reach)
-        index = _filled(shapes, low, size, cell, nearest, levels)
+        index = _filled(shapes, low, size, cell, nearest, levels, within)
         if index.num_bytes <= MAX_BYTES or index.size.max() == 1:
             return index
         cell *= 1.5
@@ -170,7 +173,9 @@ def _layout(shapes: Shapes, cell: float, reach: float) -> tuple[Floats, NDArray[
         cell *= 1.1 * max(1.0, (size.prod() / most) ** (1 / len(lower)))
 
 
-def _filled(shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, nearest: int, levels: int) -> WorldIndex:
+def _filled(
+    shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, nearest: int, levels: int, within: float
+) -> WorldIndex:
     middle, half = low + size * cell / 2, size * cell / 2
     largest = np.abs([middle - half, middle + half]).max()
     rounding = 1e-3 * cell + 16 * _EPSILON * largest
@@ -180,7 +185,7 @@ def _filled(shapes: Shapes, low: Floats, size: NDArray[np.int64], cell: float, n
         wider = WIDER**level
         # What the grid inside this one answers need not be worked out again.
         hole = half * wider / WIDER - 0.01 * cell if level else np.zeros(len(low))
-        grids.append(_grid(shapes, middle, hole, size, cell * wider, rounding * wider, nearest))
+        grids.append(_grid(shapes, middle, hole, size, cell * wider, rounding * wider, nearest, within))
     clearance, counts = grids[0].clearance, np.concatenate([grid.counts for grid in grids])
     first, items = np.concatenate([[0], np.cumsum(counts)]), np.concatenate([grid.items for grid in grids])
     ends = np.stack([low, low + size * cell])
@@ -199,9 +204,10 @@ class _Grid(NamedTuple):
 
 
 def _grid(
-    shapes: Shapes, middle: Floats, hole: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int
-) -> _Grid:
-    leaves = list(_refined(shapes, middle, hole, size, cell, rounding, nearest))
+    shapes: Shapes, middle: Floats, hole: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int,
+    within: float,
+) -> _Grid:  # fmt: skip
+    leaves = list(_refined(shapes, middle, hole, size, cell, rounding, nearest, within))
     number = [np.ravel_multi_index(tuple(part.place.T), tuple(size)) for part, _ in leaves]
     clearance, counts = np.empty(size.prod()), np.empty(size.prod(), np.int64)
     for own, (part, gap) in zip(number, leaves, strict=True):
@@ -215,8 +221,9 @@ def _grid(
 
 
 def _refined(
-    shapes: Shapes, middle: Floats, hole: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int
-) -> Iterator[tuple[_Cells, Floats]]:
+    shapes: Shapes, middle: Floats, hole: Floats, size: NDArray[np.int64], cell: float, rounding: float, nearest: int,
+    within: float,
+) -> Iterator[tuple[_Cells, Floats]]:  # fmt: skip
     """All cells of a grid with the obstacles that count there, and the clearance at their centres, part by part.
 
     Cells no farther than ``hole`` from the middle get hardly any.
@@ -239,13 +246,14 @@ def _refined(
         bounds = np.searchsorted(cells.cell, np.arange(len(cells.place)))
         clearance, diagonal = np.minimum.reduceat(distance, bounds), width * np.sqrt(len(size))
         bar = _smallest(distance, cells.cell, bounds, nearest) + diagonal * turn.at_most(centre, diagonal / 2)
+        bar = np.maximum(bar, within + diagonal / 2) if within else bar
         unasked: NDArray[np.bool_] = np.all(np.abs(centre - middle) <= hole - width / 2, axis=1)
         bar = np.where(unasked, clearance, bar) + 2 * rounding
         near = np.flatnonzero(distance <= bar.take(cells.cell))
         cells = _Cells(cells.place, cells.cell.take(near), cells.item.take(near))
         if level == 0:
             distance = distance.take(near)
-            if nearest == 1:
+            if nearest == 1 and not within:
                 keep = ~_hidden(shapes, centre, cells, distance, width, 2 * rounding)
                 cells, distance = _Cells(cells.place, cells.cell[keep], cells.item[keep]), distance[keep]
             # Most cells have one only.

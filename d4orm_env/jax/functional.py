@@ -113,7 +113,7 @@ def step(
     d = arrays.goal.shape[1]
     worlds = Worlds(state.states[..., None], state.arrived[..., None], jnp.zeros_like(controls)[..., None])
     worlds = advance_worlds(problem.team.models, arrays, worlds, controls[..., None])
-    collided, margin_violated, rewards = check_contacts(arrays, worlds.state[:, :d])
+    collided, margin_violated, rewards = check_contacts(arrays, worlds.state)
     before, after = (goal_distance(arrays, states[:, :d])[:, 0] for states in (state.states[..., None], worlds.state))
     steps = state.steps + 1
     happened = Step(
@@ -212,6 +212,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "squared_goal_speed": transition.docking_speed(goal_speed, jnp.asarray(team.max_speed)) ** 2,
         "docks": problem.arrival == "dock",
         "collision_penalty": penalty,
+        "footprints": team.footprint_arrays,
     }
     return ProblemArrays(**arrays)
 
@@ -248,7 +249,7 @@ def _limits(team: Team) -> jax.Array:
     return jnp.stack(columns, axis=1)
 
 
-_STATIC = {Problem: ("horizon", "arrival", "name"), Team: ("models",), World: ("dimension", "triangles")}
+_STATIC = {Problem: ("horizon", "arrival", "name"), Team: ("models", "shapes"), World: ("dimension", "triangles")}
 
 
 def _register(kind: type) -> None:

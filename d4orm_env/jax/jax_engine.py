@@ -27,6 +27,8 @@ from d4orm_env.engine.types import (
     StepResult,
     checked_controls,
 )
+from d4orm_env.jax import jax_footprints as footprints
+from d4orm_env.jax.jax_footprints import MovingBodies
 
 OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 BIT_OPS = noise.BitOps(
@@ -93,25 +95,37 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
     return Worlds(state, docked, executed)
 
 
-def robot_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
-    """``(K, S)`` bool: whether a robot at ``place`` ``(K, d, S)`` is within the radii plus ``extra`` of another."""
+def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
+    """``(K, S)`` bool: whether a robot in ``state`` ``(K, n, S)`` is within ``extra`` of another."""
+    place = state[:, : arrays.goal.shape[1]]
     gaps = (place[:, None] - place[None, :]) ** 2
     reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
     reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, reach * reach)
-    return (gaps.sum(axis=2) <= reach2[..., None]).any(axis=1)
+    near = gaps.sum(axis=2) <= reach2[..., None]
+    if len(arrays.footprints.inner):
+        bodies = footprints.place_robots(arrays.footprints, state, arrays.goal.shape[1])
+        near &= footprints.pairs_within(bodies, bodies, extra)
+    return near.any(axis=1)
 
 
-def moving_contacts(
-    arrays: ProblemArrays, place: Array, obstacle: Given, radius: Given, extra: Array | np.float32
-) -> Array:
-    """``(K, S)`` bool: the same towards bodies at ``obstacle`` ``(O, d)`` of ``radius`` ``(O,)``."""
-    gaps = (place[:, None] - obstacle[None, :, :, None]) ** 2
-    reach = arrays.radius[:, None] + radius[None, :] + extra
-    return (gaps.sum(axis=2) <= (reach * reach)[..., None]).any(axis=1)
+def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, extra: Array | np.float32) -> Array:
+    """``(K, S)`` bool: the same towards other bodies."""
+    d = arrays.goal.shape[1]
+    place = state[:, :d]
+    gaps = (place[:, None] - others.places[None, :, :, None]) ** 2
+    reach = arrays.radius[:, None] + others.radius[None, :] + extra
+    near = gaps.sum(axis=2) <= (reach * reach)[..., None]
+    if len(arrays.footprints.inner) or len(others.footprints.inner):
+        bodies = footprints.place_robots(arrays.footprints, state, d, arrays.radius)
+        near &= footprints.pairs_within(bodies, footprints.place_bodies(others), extra)
+    return near.any(axis=1)
 
 
-def obstacle_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
+def obstacle_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` bool: the same towards static obstacles and bounds."""
+    place = state[:, : arrays.goal.shape[1]]
+    if len(arrays.footprints.inner):
+        return footprints.static_contacts(arrays, state, extra)
     reach = (arrays.radius + extra)[:, None]
     hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
     for axis in range(place.shape[1]):
@@ -189,18 +203,18 @@ def rewards_of(arrays: ProblemArrays, place: Array, pair_violation: Array, obsta
     )
 
 
-def check_contacts(arrays: ProblemArrays, place: Array) -> Contacts:
-    """``(collided, margin violated, reward)`` of teams at rest at ``place`` ``(K, d, S)``, each ``(K, S)``."""
+def check_contacts(arrays: ProblemArrays, state: Array) -> Contacts:
+    """``(collided, margin violated, reward)`` of teams in ``state`` ``(K, n, S)``, each ``(K, S)``."""
     zero = jnp.float32(0)
-    contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
-    pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)
-    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle)
+    contact = robot_contacts(arrays, state, zero) | obstacle_contacts(arrays, state, zero)
+    pair, obstacle = robot_contacts(arrays, state, arrays.margin), obstacle_contacts(arrays, state, arrays.margin)
+    return contact, pair | obstacle, rewards_of(arrays, state[:, : arrays.goal.shape[1]], pair, obstacle)
 
 
 @partial(jax.jit, static_argnums=0)
 def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> tuple[Worlds, Contacts]:
     worlds = advance_worlds(models, arrays, worlds, control)
-    return worlds, check_contacts(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    return worlds, check_contacts(arrays, worlds.state)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -211,7 +225,7 @@ def _rollout(
         worlds, contacts = _step(models, arrays, worlds, control)
         return worlds, (worlds, contacts)
 
-    first = check_contacts(arrays, worlds.state[:, : arrays.goal.shape[1]])
+    first = check_contacts(arrays, worlds.state)
     return first, jax.lax.scan(advance, worlds, controls)[1]
 
 

@@ -6,17 +6,19 @@ The public description is the documented example ``examples/scenarios/mixed_team
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from d4orm_env import footprints
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Arrival, Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
+from d4orm_env.footprints import Disc
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
@@ -54,10 +56,13 @@ class RobotEntry(Entry):
     max_acceleration: Number = 1.0
     max_turn_rate: Number = float(np.float32(np.pi / 2))
     own_limits: dict[str, Number] = Field(default_factory=dict)
+    footprint: dict[str, Any] | None = None
 
     @model_validator(mode="after")
     def _fits_model(self) -> RobotEntry:
         model = get_model(self.model)
+        if self.footprint is not None and "radius" in self.model_fields_set:
+            raise ValueError("give either a radius or a footprint, from which the radius follows")
         for name in ("start", "goal", "velocity"):
             value = getattr(self, name)
             if value is not None and len(value) != model.dimension:
@@ -169,10 +174,12 @@ class ProblemFile(Entry):
     world: WorldEntry = WorldEntry()
 
     def build(self) -> Problem:
-        limits = ("radius", "max_speed", "max_acceleration", "max_turn_rate")
-        columns: dict[str, list[float]] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
+        shaped = any(robot.footprint for robot in self.robots)
+        limits = (*(() if shaped else ("radius",)), "max_speed", "max_acceleration", "max_turn_rate")
+        columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
         models = tuple(robot.model for robot in self.robots)
-        team = Team(models, **columns, own_limits=self._own_limits())
+        shapes = [*map(_footprint, self.robots)] if shaped else None
+        team = Team(models, **columns, own_limits=self._own_limits(), footprint=shapes)
         size = team.state_size  # asks every robot
         start = [state + [0.0] * (size - len(state)) for state in (robot.start_state for robot in self.robots)]
         return Problem(
@@ -304,13 +311,21 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
         entry["state"] = state[dimension:]
     else:
         entry |= dict(zip(start_fields(model), state[dimension:], strict=True))
-    for name in ("radius", "max_speed", "max_acceleration", "max_turn_rate"):
+    footprint = team.footprint[robot]
+    shape = {"radius": team.radius[[robot]]} if isinstance(footprint, Disc) else {}
+    if not shape:
+        entry["footprint"] = footprints.described(footprint)
+    for name in (*shape, "max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
     if model.own_limits:
         names = [limit.name for limit in model.own_limits]
         values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])
         entry["own_limits"] = dict(zip(names, values, strict=True))
     return entry
+
+
+def _footprint(entry: RobotEntry) -> footprints.Footprint:
+    return Disc(entry.radius) if entry.footprint is None else footprints.parsed(entry.footprint)
 
 
 def _describe_world(problem: Problem) -> dict[str, object]:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
+from d4orm_env.verify.footprints import Shapes, TurningPairs, turning_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
@@ -71,14 +72,13 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     sub_steps = np.ceil(problem.dt * np.sqrt(motion.bend / (8 * CHORD_ERROR * problem.team.radius.astype(np.float64))))
     if sub_steps.max() > MAX_SUB_STEPS:
         return _left_out(problem, list(_too_violent(sub_steps, motion, problem)))
-    course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem.start.astype(np.float64))
+    course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem)
     return _report(problem, motion, course)
 
 
 def _report(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
-    radius = problem.team.radius.astype(np.float64)
-    pairs, obstacles = Pairs(docking.robot, radius), surroundings(problem.world, docking.robot, radius)
+    pairs, obstacles = make_watches(problem, docking.robot)
     watches: list[Watch] = [pairs, *obstacles]
     for stretch in course.stretches(docking, max(len(watch.rows) for watch in watches)):
         for watch in watches:
@@ -99,15 +99,32 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
     )
 
 
+def make_watches(problem: Problem, robot: NDArray[np.intp]) -> tuple[Pairs, list[Watch]]:
+    """Return the watch over bodies, those of ``robot`` ``(B,)``, and those over their surroundings."""
+    if problem.team.shapes:
+        shapes = Shapes.of(problem.team)
+        return TurningPairs(robot, shapes), turning_watches(problem.world, robot, shapes)
+    radius = problem.team.radius.astype(np.float64)
+    return Pairs(robot, radius), surroundings(problem.world, robot, radius)
+
+
 class _Course:
     """Positions of all robots over the whole horizon, some steps at a time."""
 
-    def __init__(self, motion: TeamMotion, sub_steps: int, start: Floats) -> None:
-        self._motion, self._sub_steps = motion, sub_steps
+    def __init__(self, motion: TeamMotion, sub_steps: int, problem: Problem) -> None:
+        self._motion, self._sub_steps, start = motion, sub_steps, problem.start.astype(np.float64)
+        self._shapes = Shapes.of(problem.team) if problem.team.shapes else None
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
         displacements = [self._displacement(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]
         self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *displacements]), axis=0)
+
+    def _turns(self, steps: slice, docking: Docking, stop: NDArray[np.intp]) -> tuple[Floats, Floats]:
+        """``(T, S+1, B)`` headings, a docked robot's as it docked, and by how much ``(T, B)`` they change [rad]."""
+        headings, ends = self._motion.headings(steps, self._sub_steps), self._motion.end_headings
+        stands = np.arange(len(ends))[steps, None] >= docking.steps
+        turn = np.where(stands[:, None], ends[stop - 1, docking.robot], headings[:, :, docking.robot])
+        return turn, np.abs(turn - turn[:, :1]).max(axis=1)
 
     def _displacement(self, steps: slice) -> Floats:
         return self._motion.displacement(steps, self._sub_steps)
@@ -128,7 +145,11 @@ class _Course:
             stands = np.arange(horizon)[steps, None] >= docking.steps
             displacement[np.broadcast_to(stands[:, None], displacement.shape[:3])] = 0.0
             place = np.where(stands[..., None], docked, place)
-            yield Stretch(place[:, None] + displacement, norm(displacement).max(axis=1), steps.start * dt, dt)
+            reach, turn = norm(displacement).max(axis=1), np.zeros((0, 0, 0))
+            if self._shapes is not None:
+                turn, turned = self._turns(steps, docking, stop)
+                reach = self._shapes.stretch[robot] * (reach + self._shapes.outer[robot] * turned)
+            yield Stretch(place[:, None] + displacement, reach, steps.start * dt, dt, turn)
 
 
 def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:

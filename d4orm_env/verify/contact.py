@@ -48,15 +48,17 @@ class Stretch:
 
     Attributes:
         path: ``(T, S+1, B, d)`` positions at the ends of the sub-steps [m].
-        reach: ``(T, B)`` how far from where it began a body gets in each step [m].
+        reach: ``(T, B)`` how far from where it began a body, or any point of it, gets in each step [m].
         start: Time at which it begins [s].
         dt: Length of a step [s].
+        turn: ``(T, S+1, B)`` headings at the ends of the sub-steps [rad]; of size zero where all bodies are discs.
     """
 
     path: Floats
     reach: Floats
     start: float
     dt: float
+    turn: Floats
 
     def of(self, steps: Indices, bodies: Indices) -> Floats:
         """``(N, S+1, d)`` the path of one body in one step each."""
@@ -184,7 +186,7 @@ class Pairs(Watch):
         order = np.argsort(lower[:, axis], kind="stable")
         # Who is further apart than any two are known to come does not matter.
         a, b = order[:-1], order[1:]
-        gap = norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
+        gap = self.near_gap(stretch, a, b)
         least = min(self.minimum, float(gap[self._robot[a] != self._robot[b]].min(initial=np.inf)))
         widening = (_WIDER * self._radius + max(least, 0.0) / 2)[:, None]
         lower, upper = lower - widening, upper + widening
@@ -200,6 +202,11 @@ class Pairs(Watch):
         key = np.sort(np.minimum(a, b)[near] * len(order) + np.maximum(a, b)[near])
         self.rows, self.columns = np.divmod(key, len(order))
         self._size = self._radius[self.rows] + self._radius[self.columns]
+
+    def near_gap(self, stretch: Stretch, a: Indices, b: Indices) -> Floats:
+        """``(N,)`` gap of bodies ``a`` and ``b`` when the stretch begins [m]."""
+        gap: Floats = norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
+        return gap
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
         place = stretch.path[:, 0]

@@ -23,7 +23,8 @@ def verify_curves(
 ) -> VerificationReport:
     """Judge curves: does everybody end at its goal, and does nobody touch anything at any time?
 
-    As :func:`d4orm_env.verify.verify` judges controls, known to ``CHORD_ERROR`` of the radius for each robot. Of
+    As :func:`d4orm_env.verify.verify` judges controls, known to ``CHORD_ERROR`` of the radius for each robot. Curves
+    have no headings: a footprint counts as the disc or ball round it, which may refuse what is fine. Of
     control limits it says nothing, nor when robots arrive.
 
     Args:
@@ -47,7 +48,7 @@ def verify_curves(
         path = position(times.ravel()).reshape(*times.shape, len(radius), problem.dimension)
         reach = norm(path - path[:, :1]).max(axis=1)
         for watch in watches:
-            watch.observe(Stretch(path, reach, first * dt, dt))
+            watch.observe(Stretch(path, reach, first * dt, dt, np.zeros((0, 0, 0))))
     violations = [violation for watch in watches for violation in watch.violations()]
     violations += _not_arrived(problem, position, duration)
     nearest = min((watch.minimum for watch in obstacles), default=np.inf)

@@ -6,7 +6,7 @@ Runge-Kutta in many sub-steps of a control step, with the same bits on every pro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,6 +45,7 @@ class Integrated:
         sizes: ``(H, R, m)`` limit plus what is cut off of each component.
         pace: ``(H, R)`` speed after each step [m/s].
         bend: ``(H, R)`` acceleration within each step [m/s^2].
+        end_headings: ``(H, R)`` headings after each step [rad]; zero for a model without one.
         step_error: ``(H, R)`` what one step of Runge-Kutta per control step is off by [m].
     """
 
@@ -63,6 +64,8 @@ class Integrated:
         self.sizes: Floats = self.limits + np.moveaxis(np.abs(asked - self._commands), 0, 2)
         states = self._states(start[robots, : model.state_size].T)
         self._begins = states[:, :-1]
+        column = model.heading_index
+        self.end_headings: Floats = np.zeros_like(states[0, 1:]) if column is None else states[column, 1:]
         velocity = self._call(model.functions.velocity, states[:, 1:], self._commands)
         self.pace: Floats = norm(np.moveaxis(velocity, 0, 2))
         displacement = self.displacement(slice(None), SUB_STEPS)
@@ -155,13 +158,25 @@ class Integrated:
 
     def displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S+1, R, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""
+        begin = self._begins[: self._model.dimension, steps]
+        displacements = [x[: self._model.dimension] - begin for x in self._within(steps, sub_steps)]
+        return np.moveaxis(np.stack(displacements), (0, 1), (1, 3))
+
+    def headings(self, steps: slice, sub_steps: int) -> Floats:
+        """``(T, S+1, R)`` headings at the ends of sub-steps [rad]; zero for a model without one."""
+        column = self._model.heading_index
+        headings: Floats = np.stack(
+            [np.zeros_like(x[0]) if column is None else x[column] for x in self._within(steps, sub_steps)], axis=1
+        )
+        return headings
+
+    def _within(self, steps: slice, sub_steps: int) -> Iterator[Floats]:
+        """``(n, T, R)`` states at the ends of sub-steps, the beginning of each step first."""
         x, u = self._begins[:, steps], self._commands[:, steps]
-        begin = x[: self._model.dimension]
-        displacements = [np.zeros_like(begin)]
+        yield x
         for _ in range(sub_steps):
             x = self._advanced(x, u, self._dt / sub_steps)
-            displacements.append(x[: self._model.dimension] - begin)
-        return np.moveaxis(np.stack(displacements), (0, 1), (1, 3))
+            yield x
 
 
 def _ops() -> Any:

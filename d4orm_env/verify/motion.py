@@ -136,6 +136,22 @@ class TeamMotion:
             displacement[:, :, group.robots] = group.displacement(steps, sub_steps)
         return displacement
 
+    def headings(self, steps: slice, sub_steps: int) -> Floats:
+        """``(T, S+1, K)`` headings at the ends of sub-steps [rad]; zero of robots without one."""
+        time = np.linspace(0.0, self.dt, sub_steps + 1)[:, None]
+        headings: Floats = self._heading[:-1][steps, None] + self._turn_rate[steps, None] * time
+        for group in self.groups:
+            headings[:, :, group.robots] = group.headings(steps, sub_steps)
+        return headings
+
+    @property
+    def end_headings(self) -> Floats:
+        """``(H, K)`` headings after each step [rad]."""
+        ends: Floats = self._heading[1:].copy()
+        for group in self.groups:
+            ends[:, group.robots] = group.end_headings
+        return ends
+
     def _wheeled_displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S, ., 2)`` the differential drives' part of :meth:`displacement`, but for its beginning."""
         turn_rate, thrust, speed, heading = (

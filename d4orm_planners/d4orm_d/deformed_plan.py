@@ -15,7 +15,7 @@ from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingTask
+from d4orm_planners.engine.sampling_types import SamplingTask, moving_robots
 from d4orm_planners.sampling.d4orm import DeformingPlanner
 
 
@@ -53,8 +53,7 @@ class DeformedPlan(WorkingPlan):
         others = np.setdiff1d(np.arange(problem.num_robots), robots)
         moving = None
         if len(others):
-            radius = np.asarray(problem.team.radius)[others]
-            moving = MovingObstacles(self.positions[1 : horizon + 1, others], radius)
+            moving = moving_robots(problem.team.select(others.tolist()), self.states[1 : horizon + 1, others])
         base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
         task = SamplingTask(part.with_state(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
         self._runs += 1

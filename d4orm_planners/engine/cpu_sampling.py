@@ -94,9 +94,10 @@ class Sampling:
         self.scoring = score.Scoring(
             docked=np.ascontiguousarray(docked, bool),
             collisions=task.collisions,
-            bodies=make_bodies(*moving, self.arrays.margin),
+            bodies=make_bodies(moving, self.arrays.margin),
             bounds=bound_boxes(self.arrays),
         )
+        self.shaped = bool(len(self.arrays.footprints.inner) or len(moving.footprints.inner))
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
         num_tiles, pairs = -(-num_samples // TILE), (problem.control_size + 1) // 2
@@ -105,7 +106,7 @@ class Sampling:
     def space(self, first: int) -> score.Workspace:
         """The workspace of the thread whose tiles begin with this number."""
         if first not in self.spaces:
-            self.spaces[first] = score.make_workspace(self.base.shape, self.arrays.goal.shape[1])
+            self.spaces[first] = score.make_workspace(self.base.shape, self.arrays.goal.shape[1], self.shaped)
         return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:

@@ -28,6 +28,7 @@ from d4orm_env.jax.jax_engine import (
     rewards_of,
     robot_contacts,
 )
+from d4orm_env.jax.jax_footprints import MovingBodies
 from d4orm_planners.engine.sampling_types import (
     MovingObstacles,
     SamplingResult,
@@ -82,7 +83,7 @@ def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Ar
     num_robots = arrays.goal.shape[0]
 
     def advance(
-        carry: tuple[Worlds, Array], xs: tuple[Array, Array, Array, Array, FloatArray | None]
+        carry: tuple[Worlds, Array], xs: tuple[Array, Array, Array, Array, tuple[FloatArray, FloatArray | None] | None]
     ) -> tuple[tuple[Worlds, Array], Array]:
         worlds, total = carry
         time, base, mean_now, scale_now, obstacle = xs
@@ -91,10 +92,11 @@ def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Ar
         place = worlds.state[:, :d]
         near_robot = jnp.zeros((num_robots, static.num_samples), bool)
         if static.collisions:
-            near_robot = robot_contacts(arrays, place, arrays.margin)
+            near_robot = robot_contacts(arrays, worlds.state, arrays.margin)
             if inputs.moving is not None and obstacle is not None:
-                near_robot |= moving_contacts(arrays, place, obstacle, inputs.moving.radius, arrays.margin)
-        near_obstacle = obstacle_contacts(arrays, place, arrays.margin)
+                bodies = MovingBodies(obstacle[0], obstacle[1], inputs.moving.radius, inputs.moving.footprints)
+                near_robot |= moving_contacts(arrays, worlds.state, bodies, arrays.margin)
+        near_obstacle = obstacle_contacts(arrays, worlds.state, arrays.margin)
         return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle)), deformation
 
     worlds = Worlds(
@@ -103,7 +105,7 @@ def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Ar
         jnp.zeros((num_robots, mean.shape[2], static.num_samples), jnp.float32),
     )
     times = jnp.arange(len(mean), dtype=jnp.uint32)
-    obstacles = None if inputs.moving is None else inputs.moving.positions
+    obstacles = None if inputs.moving is None else (inputs.moving.positions, inputs.moving.headings)
     carry = (worlds, jnp.zeros((num_robots, static.num_samples), jnp.float32))
     (_, total), deformations = jax.lax.scan(advance, carry, (times, inputs.base, mean, scale, obstacles))
     return total / len(mean), deformations

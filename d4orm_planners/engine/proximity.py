@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import simd
-from d4orm_env.engine.compiling import aligned_zeros, compiled, inlined
+from d4orm_env.engine.compiling import ZERO, aligned_zeros, compiled, inlined
+from d4orm_env.engine.footprint_contacts import angle_of, bodies_within, refine_pair
 from d4orm_env.engine.obstacles import may_touch
 from d4orm_env.engine.simd import (
     BLOCK,
@@ -35,6 +36,8 @@ from d4orm_env.engine.simd import (
     worlds_overlap_3,
 )
 from d4orm_env.engine.tiles import near_round
+from d4orm_env.footprints import FootprintArrays
+from d4orm_planners.engine.sampling_types import MovingObstacles
 
 WIDER = np.float32(1 + 2.0**-6)
 """Factor by which robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
@@ -71,11 +74,15 @@ class Bodies(NamedTuple):
         radius: ``(O,)``.
         boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
             margin.
+        footprints: Theirs.
+        headings: ``(H, O)``, or ``(0, 0)`` where all are discs.
     """
 
     places: FloatArray
     radius: FloatArray
     boxes: FloatArray
+    footprints: FootprintArrays
+    headings: FloatArray
 
 
 def make_scratch(num_robots: int, dimension: int) -> Scratch:
@@ -99,15 +106,16 @@ def bound_boxes(arrays: ProblemArrays) -> FloatArray:
     return _widened(low, high, arrays.margin)
 
 
-def make_bodies(places: FloatArray, radius: FloatArray, margin: np.float32) -> Bodies:
-    """Bodies of this radius ``(O,)`` at ``places`` ``(H, O, d)``, with their boxes."""
-    places, radius = np.ascontiguousarray(places, np.float32), np.ascontiguousarray(radius, np.float32)
+def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
+    """The bodies, with their boxes."""
+    places, radius = (np.ascontiguousarray(values, np.float32) for values in (moving.positions, moving.radius))
     num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
     # A last block that is short goes on with its last place.
     blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
     blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
     boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
-    return Bodies(places, radius, boxes)
+    headings = np.zeros((0, 0)) if moving.headings is None else moving.headings
+    return Bodies(places, radius, boxes, moving.footprints, np.ascontiguousarray(headings, np.float32))
 
 
 def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
@@ -119,6 +127,12 @@ def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArra
 def place_of(k: Whole, step: int, dimension: int) -> Whole:
     """Return where the rows of robot ``k``'s positions after a step of the block begin: a row an axis."""
     return (k * BLOCK + step) * dimension * TILE
+
+
+@inlined
+def turn_of(k: Whole, step: int) -> Whole:
+    """Return where the row of robot ``k``'s headings after a step of the block begins."""
+    return (k * BLOCK + step) * TILE
 
 
 @inlined
@@ -180,8 +194,9 @@ def _list_near(dimension: int, s: Scratch) -> None:
 
 
 @compiled
-def _mark_listed(radius: FloatArray, margin: np.float32, dimension: int, places: FloatArray, s: Scratch) -> None:
+def _mark_listed(arrays: ProblemArrays, places: FloatArray, turns: FloatArray, s: Scratch) -> None:
     """Flag robots within the margin of those on their lists."""
+    radius, margin, dimension = arrays.radius, arrays.margin, arrays.goal.shape[1]
     use_wide_registers()
     for k in range(radius.shape[0]):
         for i in range(s.num_robots[k]):
@@ -193,16 +208,23 @@ def _mark_listed(radius: FloatArray, margin: np.float32, dimension: int, places:
                     continue
                 for step in range(BLOCK):
                     a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
-                    touch = _near_pair(reach, a, b, dimension, places) << np.uint64(chunk)
+                    touch = _near_pair(reach, a, b, dimension, places)
+                    if turns.shape[0] > 0 and touch != NOWHERE:
+                        own, its = turn_of(k, step) + chunk, turn_of(other, step) + chunk
+                        touch = refine_pair(
+                            arrays, k, other, touch, margin, dimension, places, a, b, turns, own, its, s.buffer
+                        )
+                    touch <<= np.uint64(chunk)
                     s.near[k, step] |= touch
                     s.near[other, step] |= touch
 
 
 @compiled
 def _mark_bodies(
-    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
+    arrays: ProblemArrays, bodies: Bodies, first: int, count: int, places: FloatArray, turns: FloatArray, s: Scratch
 ) -> None:
     """Flag robots within the margin of moving bodies."""
+    radius, margin = arrays.radius, arrays.margin
     _, num_bodies, dimension = bodies.places.shape
     limits, before = bodies.boxes.reshape(-1), first // BLOCK * num_bodies
     for k in range(radius.shape[0]):
@@ -210,31 +232,60 @@ def _mark_bodies(
             if _meets(k, before + body, dimension, s.boxes, limits):
                 reach = radius[k] + bodies.radius[body] + margin
                 for step in range(count):
-                    rows = places[place_of(k, step, dimension) : place_of(k, step + 1, dimension)]
-                    s.near[k, step] |= near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
+                    begin = place_of(k, step, dimension)
+                    rows = places[begin : place_of(k, step + 1, dimension)]
+                    touch = near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
+                    if turns.shape[0] > 0 and touch != NOWHERE:
+                        touch = _refine_body(
+                            arrays, bodies, body, first + step, k, touch, rows, turns, turn_of(k, step), s
+                        )
+                    s.near[k, step] |= touch
+
+
+@compiled
+def _refine_body(
+    arrays: ProblemArrays, bodies: Bodies, body: int, t: int, k: int, near: np.uint64, rows: FloatArray,
+    turns: FloatArray, turn: Whole, s: Scratch,
+) -> np.uint64:  # fmt: skip
+    """Return where, of the samples ``near``, robot ``k`` is within the margin of a body at time ``t``."""
+    sure, dimension = near, arrays.goal.shape[1]
+    angle = bodies.headings[t, body] if bodies.headings.shape[0] > 0 else ZERO
+    for sample in range(TILE):
+        bit = np.uint64(1) << np.uint64(sample)
+        if near & bit == NOWHERE:
+            continue
+        x, y = bodies.places[t, body, 0] - rows[sample], bodies.places[t, body, 1] - rows[TILE + sample]
+        z = bodies.places[t, body, 2] - rows[2 * TILE + sample] if dimension == 3 else ZERO
+        own_angle = angle_of(arrays.footprints, k, turns, turn + sample)
+        if not bodies_within(
+            arrays.footprints, k, arrays.radius[k], own_angle, bodies.footprints, body, bodies.radius[body], angle,
+            x, y, z, dimension == 2, arrays.margin, s.buffer,
+        ):  # fmt: skip
+            sure &= ~bit
+    return sure
 
 
 @inlined
 def mark_robots(
-    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
+    arrays: ProblemArrays, bodies: Bodies, first: int, count: int, places: FloatArray, turns: FloatArray, s: Scratch
 ) -> None:
     """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
 
     Args:
-        radius: ``(K,)``.
-        margin: The margin.
+        arrays: The problem.
         bodies: The :class:`Bodies`.
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
         places: Rows of places, see :func:`place_of`.
+        turns: Rows of headings, see :func:`turn_of`; of size zero where all bodies are discs.
         s: Scratch with the boxes of the robots in this block.
     """
     s.near[:] = NOWHERE
     dimension = bodies.places.shape[2]
     _list_near(dimension, s)
-    _mark_listed(radius, margin, dimension, places, s)
+    _mark_listed(arrays, places, turns, s)
     if bodies.places.shape[1] > 0:
-        _mark_bodies(radius, margin, bodies, first, count, places, s)
+        _mark_bodies(arrays, bodies, first, count, places, turns, s)
 
 
 @inlined

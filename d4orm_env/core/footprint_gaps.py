@@ -1,0 +1,103 @@
+"""Gaps between footprints, and from them to a world, in float64: for checks of a problem, a few robots at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from d4orm_env.core.arrays import Floats
+from d4orm_env.core.world import World
+from d4orm_env.footprints import Core, Footprint
+
+WEIGHTS = np.linspace(0, 1, 257)[1:-1]
+"""Weights of two ellipsoids among which the best is taken."""
+
+
+def pair_gap(one: Footprint, pose: Floats, other: Footprint, its_pose: Floats) -> float:
+    """Signed gap of two footprints [m]; in space that along the line of their centres.
+
+    Args:
+        one: A footprint.
+        pose: ``(d + 1,)`` its place and heading. Where the heading is NaN, the disc counts that it covers anyhow.
+        other: Another.
+        its_pose: Its place and heading.
+    """
+    if len(pose) == 4:
+        return _ball_gap(its_pose[:3] - pose[:3], _semi_axes(one), _semi_axes(other))
+    return _core_gap(_placed(one, pose), _placed(other, its_pose))
+
+
+def world_gap(world: World, footprint: Footprint, pose: Floats) -> float:
+    """Signed gap of a footprint to the nearest obstacle or bound [m]; see :func:`pair_gap`."""
+    dimension, bounds = world.dimension, world.bounds.astype(np.float64)
+    if dimension == 3:
+        low = high = _semi_axes(footprint)
+        gaps = list(_ball_gaps(world, pose[:3], low))
+    else:
+        core = _placed(footprint, pose)
+        low, high = pose[:2] - core.corners.min(axis=0), core.corners.max(axis=0) - pose[:2]
+        low, high = low + core.rounding, high + core.rounding
+        gaps = [_core_gap(core, obstacle) for obstacle in _obstacles(world)]
+    ends = np.concatenate([pose[:dimension] - low - bounds[0], bounds[1] - pose[:dimension] - high])
+    return float(min([*ends.tolist(), *gaps]))
+
+
+def _semi_axes(footprint: Footprint) -> Floats:
+    return np.array(footprint.semi_axes)  # type: ignore[attr-defined] # all in space have them
+
+
+def _placed(footprint: Footprint, pose: Floats) -> Core:
+    if np.isnan(pose[2]):
+        return Core(pose[None, :2], footprint.inner_radius)
+    corners, rounding = footprint.core  # type: ignore[attr-defined] # all in the plane have one
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    turned = np.stack([cosine * corners[:, 0] - sine * corners[:, 1], sine * corners[:, 0] + cosine * corners[:, 1]], 1)
+    return Core(pose[:2] + turned, rounding)
+
+
+def _obstacles(world: World) -> Iterator[Core]:
+    for circle in world.circles.astype(np.float64):
+        yield Core(circle[None, :2], float(circle[2]))
+    for left, low, right, high in world.boxes.astype(np.float64):
+        yield Core(np.array([[left, low], [right, low], [right, high], [left, high]]), 0.0)
+    for triangle in world.shapes.triangles.astype(np.float64):
+        yield Core(triangle.reshape(3, 2), 0.0)
+
+
+def _core_gap(a: Core, b: Core) -> float:
+    apart = max(_separation(a, b), _separation(b, a))
+    if not -np.inf < apart <= 0:
+        apart = min(_corner_distance(a, b), _corner_distance(b, a))
+    return apart - a.rounding - b.rounding
+
+
+def _separation(a: Core, b: Core) -> float:
+    axes, extents = a.axes
+    return float(((axes[:, None] * b.corners).sum(axis=2).min(axis=1) - extents).max(initial=-np.inf))
+
+
+def _corner_distance(a: Core, b: Core) -> float:
+    """Least distance from a corner of ``a`` to an edge of ``b``."""
+    along, offset = np.roll(b.corners, -1, axis=0) - b.corners, a.corners[:, None] - b.corners
+    square = (along * along).sum(axis=1)
+    share = np.clip((offset * along).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)
+    return float(np.linalg.norm(offset - share[..., None] * along, axis=2).min())
+
+
+def _ball_gaps(world: World, place: Floats, axes: Floats) -> Iterator[float]:
+    for ball in world.spheres.astype(np.float64):
+        yield _ball_gap(ball[:3] - place, axes, np.full(3, ball[3]))
+    for x, y, radius in world.cylinders.astype(np.float64):
+        yield _ball_gap(np.array([x - place[0], y - place[1], 0.0]), axes, np.full(3, radius))
+    for box in world.boxes.astype(np.float64):
+        offset = np.clip(place, box[:3], box[3:]) - place
+        stretch = float(np.linalg.norm(offset / axes))
+        yield float(np.linalg.norm(offset)) * (1 - 1 / stretch) if stretch > 0 else -float(axes.min())
+
+
+def _ball_gap(offset: Floats, a: Floats, b: Floats) -> float:
+    """Gap of two ellipsoids along the line of their centres (Perram and Wertheim, 1985)."""
+    s = WEIGHTS[:, None]
+    stretch = np.sqrt((s * (1 - s) * offset**2 / ((1 - s) * a * a + s * b * b)).sum(axis=1).max())
+    return float(np.linalg.norm(offset) * (1 - 1 / stretch)) if stretch > 0 else -float(min(a.min(), b.min()))

@@ -1,0 +1,331 @@
+"""Footprints of robots: what of the plane, or of space, a robot covers round its reference point.
+
+A planar footprint is a convex core, a point, a segment or a polygon, widened by a rounding radius. It turns with the
+heading of the robot; a robot without a heading keeps it along x. All lengths are metres, in the robot's frame.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Ints, positive_number, shown
+from d4orm_env.core.errors import unknown
+
+__all__ = ["Box", "Capsule", "Disc", "Ellipsoid", "Footprint", "Polygon"]
+
+MAX_CORNERS = 8
+"""Most corners of a polygon."""
+
+
+class Core(NamedTuple):
+    """A footprint's convex core and how far it is widened.
+
+    Attributes:
+        corners: ``(n, 2)`` float64, counterclockwise; one for a point, two for a segment.
+        rounding: Distance by which the core is widened [m].
+    """
+
+    corners: Floats
+    rounding: float
+
+    @property
+    def axes(self) -> tuple[Floats, Floats]:
+        """``(m, 2)`` unit vectors along which two cores can be told apart, and how far the core reaches along each.
+
+        Those of a polygon are normal to its edges, outward; a segment has its ends' too, a point has none.
+        """
+        corners = self.corners
+        if len(corners) == 1:
+            return np.zeros((0, 2)), np.zeros(0)
+        edges = np.roll(corners, -1, axis=0) - corners
+        edges /= np.hypot(edges[:, 0], edges[:, 1])[:, None]
+        axes = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+        axes = np.concatenate([axes, edges]) if len(corners) == 2 else axes
+        return axes, (axes[:, None] * corners).sum(axis=2).max(axis=1)
+
+
+class Footprint(ABC):
+    """The region that a robot covers, in its own frame."""
+
+    dimension: int = 2
+    """Dimensions of the space it lies in; a disc is a ball in space."""
+
+    @property
+    @abstractmethod
+    def outer_radius(self) -> float:
+        """Radius of the smallest disc or ball about the reference point that holds it [m]."""
+
+    @property
+    @abstractmethod
+    def inner_radius(self) -> float:
+        """Radius of the largest disc or ball about the reference point within it, zero if there is none [m]."""
+
+    def _check(self) -> None:
+        for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
+            if name == "offset":
+                if not (isinstance(value, int | float) and abs(value) <= LARGEST):
+                    raise ValueError(f"offset of {type(self).__name__} must be a number of metres, not {shown(value)}")
+                continue
+            positive_number(value, f"{name} of {type(self).__name__}", least=SMALLEST, most=LARGEST)
+
+
+@dataclass(frozen=True)
+class Disc(Footprint):
+    """A disc, or a ball in space.
+
+    Attributes:
+        radius: Radius [m].
+    """
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        self._check()
+
+    @property
+    def outer_radius(self) -> float:
+        return self.radius
+
+    @property
+    def inner_radius(self) -> float:
+        return self.radius
+
+    @property
+    def semi_axes(self) -> tuple[float, float, float]:
+        """Its radius along each axis, as an ellipsoid's."""
+        return self.radius, self.radius, self.radius
+
+    @property
+    def core(self) -> Core:
+        """The centre, widened by the radius."""
+        return Core(np.zeros((1, 2)), self.radius)
+
+
+class _Planar(Footprint):
+    """A footprint that turns with the robot."""
+
+    @property
+    @abstractmethod
+    def core(self) -> Core:
+        """Its convex core."""
+
+    @property
+    def outer_radius(self) -> float:
+        corners, rounding = self.core
+        return float(np.hypot(corners[:, 0], corners[:, 1]).max()) + rounding
+
+    @property
+    def inner_radius(self) -> float:
+        return max(0.0, self.core.rounding + float(self.core.axes[1].min()))
+
+
+@dataclass(frozen=True)
+class Box(_Planar):
+    """A rectangle, its length along the heading.
+
+    Attributes:
+        length: Along the heading [m].
+        width: Across it [m].
+        offset: How far ahead of the reference point its centre lies [m]; half of the length less the rear overhang
+            for a car, whose reference point is its rear axle.
+    """
+
+    length: float
+    width: float
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._check()
+
+    @property
+    def core(self) -> Core:
+        """Its four corners."""
+        front, back, side = self.offset + self.length / 2, self.offset - self.length / 2, self.width / 2
+        return Core(np.array([[front, -side], [front, side], [back, side], [back, -side]]), 0.0)
+
+
+@dataclass(frozen=True)
+class Capsule(_Planar):
+    """A rectangle with round ends: all within a radius of a segment along the heading.
+
+    Attributes:
+        length: Length of the segment [m]; with both ends the capsule is longer by twice the radius.
+        radius: Half of its width [m].
+        offset: How far ahead of the reference point its centre lies [m].
+    """
+
+    length: float
+    radius: float
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._check()
+
+    @property
+    def core(self) -> Core:
+        """Its segment."""
+        return Core(np.array([[self.offset - self.length / 2, 0.0], [self.offset + self.length / 2, 0.0]]), self.radius)
+
+
+@dataclass(frozen=True)
+class Polygon(_Planar):
+    """A convex polygon.
+
+    Attributes:
+        corners: ``(n, 2)``, three to eight corners in order, either way round, x along the heading [m].
+
+    Raises:
+        ValueError: If there are fewer or more, two coincide, or the polygon is not convex.
+    """
+
+    corners: tuple[tuple[float, float], ...]
+
+    def __init__(self, corners: ArrayLike) -> None:
+        try:
+            table = np.array(corners, np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"corners of Polygon must be rows of two numbers, not {shown(corners)}") from None
+        if table.ndim != 2 or table.shape[1] != 2 or not 3 <= len(table) <= MAX_CORNERS:
+            raise ValueError(f"corners of Polygon have shape {table.shape}; expected (n, 2), n from 3 to {MAX_CORNERS}")
+        if not np.isfinite(table).all() or np.abs(table).max() > LARGEST:
+            raise ValueError(f"corners of Polygon must be finite and at most {LARGEST:g} in magnitude")
+        edges = np.roll(table, -1, axis=0) - table
+        turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
+        # A star turns one way at every corner too, but more than once round.
+        headings = np.arctan2(edges[:, 1], edges[:, 0])
+        round_trip = np.abs(np.sum((np.roll(headings, -1) - headings + np.pi) % (2 * np.pi) - np.pi))
+        if not ((turns > 0).all() or (turns < 0).all()) or round_trip > 3 * np.pi:
+            corner = int(np.argmax(turns * np.sign(turns.sum()) <= 0) + 1) % len(table)
+            raise ValueError(
+                f"Polygon is not convex at corner {corner}, {table[corner].tolist()}; give the corners of its convex "
+                f"hull, in order and each once"
+            )
+        object.__setattr__(self, "corners", tuple(map(tuple, (table if turns[0] > 0 else table[::-1]).tolist())))
+
+    @property
+    def core(self) -> Core:
+        """Its corners."""
+        return Core(np.array(self.corners), 0.0)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Footprint):
+    """An ellipsoid in space, its axes along those of the world: the room that a multirotor's downwash needs.
+
+    Attributes:
+        x: Semi-axis along x [m].
+        y: Semi-axis along y [m].
+        z: Semi-axis along z [m].
+    """
+
+    x: float
+    y: float
+    z: float
+    dimension = 3
+
+    def __post_init__(self) -> None:
+        self._check()
+
+    @property
+    def semi_axes(self) -> tuple[float, float, float]:
+        """Along x, y and z."""
+        return self.x, self.y, self.z
+
+    @property
+    def outer_radius(self) -> float:
+        return max(self.x, self.y, self.z)
+
+    @property
+    def inner_radius(self) -> float:
+        return min(self.x, self.y, self.z)
+
+
+KINDS: dict[str, type[Footprint]] = {kind.__name__.lower(): kind for kind in (Disc, Box, Capsule, Polygon, Ellipsoid)}
+"""Footprints by their names in files."""
+
+
+class FootprintArrays(NamedTuple):
+    """A team's footprints as the engines read them, float32 unless said; without rows where all robots are discs.
+
+    Attributes:
+        corners: ``(K, 8, 2)`` of the cores, the last one repeated.
+        num_corners: ``(K,)`` int32.
+        axes: ``(K, 8, 2)`` see :attr:`Core.axes`, zeros on padding.
+        extents: ``(K, 8)`` how far the core reaches along each.
+        num_axes: ``(K,)`` int32.
+        rounding: ``(K,)``.
+        inner: ``(K,)`` inner radii, a little less for rounding.
+        heading: ``(K,)`` int32 number of the state component that turns the footprint, -1 for none.
+        semi_axes: ``(K, 3)`` of ellipsoids and balls; zero in the plane.
+    """
+
+    corners: FloatArray
+    num_corners: Ints
+    axes: FloatArray
+    extents: FloatArray
+    num_axes: Ints
+    rounding: FloatArray
+    inner: FloatArray
+    heading: Ints
+    semi_axes: FloatArray
+
+
+def as_arrays(footprints: tuple[Footprint, ...], headings: list[int | None]) -> FootprintArrays:
+    """The arrays of these; ``headings`` are the numbers of the state components that are headings."""
+    size = len(footprints)
+    arrays = FootprintArrays(
+        np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros(size, np.int32),
+        np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros((size, MAX_CORNERS), np.float32),
+        np.zeros(size, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32),
+        np.full(size, -1, np.int32), np.zeros((size, 3), np.float32),
+    )  # fmt: skip
+    for robot, footprint in enumerate(footprints):
+        arrays.inner[robot] = footprint.inner_radius * (1 - 2.0**-20)
+        if isinstance(footprint, Disc | Ellipsoid):
+            arrays.semi_axes[robot] = footprint.semi_axes
+        if not isinstance(footprint, Disc | _Planar):
+            continue
+        corners, rounding = footprint.core
+        axes, extents = footprint.core.axes
+        arrays.corners[robot, : len(corners)] = corners
+        arrays.corners[robot, len(corners) :] = corners[-1]
+        arrays.num_corners[robot], arrays.num_axes[robot] = len(corners), len(axes)
+        arrays.axes[robot, : len(axes)], arrays.extents[robot, : len(axes)] = axes, extents
+        arrays.rounding[robot] = rounding
+        heading = headings[robot]
+        arrays.heading[robot] = -1 if heading is None else heading
+    for array in arrays:
+        array.setflags(write=False)
+    return arrays
+
+
+def described(footprint: Footprint) -> dict[str, Any]:
+    """The content of a file that means a footprint; the inverse of :func:`parsed`."""
+    fields = asdict(footprint)  # type: ignore[call-overload] # all are dataclasses
+    if "corners" in fields:
+        fields["corners"] = [list(corner) for corner in fields["corners"]]
+    return {"shape": type(footprint).__name__.lower()} | fields
+
+
+def parsed(content: object) -> Footprint:
+    """The footprint that a file means, such as ``{"shape": "box", "length": 0.5, "width": 0.25}``.
+
+    Raises:
+        ValueError: If the shape is unknown, or a size is missing, unknown or out of range.
+    """
+    if not isinstance(content, dict) or not isinstance(content.get("shape"), str):
+        example = "{shape: box, length: 0.5, width: 0.25}"
+        raise ValueError(f"footprint must be a mapping such as {example}, not {shown(content)}")
+    kind = KINDS.get(content["shape"])
+    if kind is None:
+        raise unknown("footprint", content["shape"], KINDS)
+    sizes = {name: value for name, value in content.items() if name != "shape"}
+    try:
+        return kind(**sizes)
+    except TypeError as error:
+        raise ValueError(f"footprint {content['shape']}: {error}") from None

@@ -1,0 +1,196 @@
+"""Exact contacts of footprints in JAX, as :mod:`d4orm_env.engine.footprint_contacts` finds them.
+
+Robots' axes come first, samples last; the corners or axes of a core, or x, y and z, are one more axis in front.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine.footprint_contacts import BISECTIONS
+from d4orm_env.footprints import FootprintArrays
+
+Given: TypeAlias = Array | FloatArray | np.float32
+"""Numbers of the problem: inside a compiled function they are traced."""
+
+
+class MovingBodies(NamedTuple):
+    """Bodies that are not simulated, at one time.
+
+    Attributes:
+        places: ``(O, d)``.
+        headings: ``(O,)``, or ``None`` where all are discs.
+        radius: ``(O,)`` outer radii.
+        footprints: Theirs, with ``O`` rows or none.
+    """
+
+    places: Array | FloatArray
+    headings: Array | FloatArray | None
+    radius: Array | FloatArray
+    footprints: FootprintArrays
+
+
+class Bodies(NamedTuple):
+    """Placed bodies: ``R`` robots in ``S`` samples, or one.
+
+    Attributes:
+        place: ``(d, R, S)`` reference points.
+        corners: ``(2, n, R, S)`` of the cores, relative to them; ``None`` in space.
+        axes: ``(2, m, R, S)``; zeros tell nothing.
+        extents: ``(m, R, S)`` how far the cores reach along them.
+        rounding: ``(R, 1)``.
+        semi_axes: ``(3, R, 1)`` of ellipsoids.
+    """
+
+    place: Array
+    corners: Array
+    axes: Array
+    extents: Array
+    rounding: Array
+    semi_axes: Array
+
+
+def place_robots(f: FootprintArrays, state: Array, dimension: int, radius: Given | None = None) -> Bodies:
+    """Robots in ``state`` ``(K, n, S)``; discs of this ``radius`` ``(K,)`` if there are no footprints."""
+    place = jnp.moveaxis(state[:, :dimension], 1, 0)
+    if not len(f.inner):
+        return _discs(place, jnp.asarray(radius))
+    heading = state[jnp.arange(len(state)), jnp.maximum(jnp.asarray(f.heading), 0)]
+    return _bodies(f, place, jnp.where(jnp.asarray(f.heading)[:, None] >= 0, heading, 0))
+
+
+def place_bodies(bodies: MovingBodies) -> Bodies:
+    """Other bodies, the same in all samples."""
+    place = jnp.asarray(bodies.places).T[..., None]
+    if not len(bodies.footprints.inner) or bodies.headings is None:
+        return _discs(place, jnp.asarray(bodies.radius))
+    return _bodies(bodies.footprints, place, jnp.asarray(bodies.headings)[:, None])
+
+
+def _discs(place: Array, radius: Array) -> Bodies:
+    size = radius[:, None]
+    nothing = jnp.zeros((2, 1, *size.shape), jnp.float32)
+    return Bodies(place, nothing, nothing, nothing[0], size, jnp.broadcast_to(size, (3, *size.shape)))
+
+
+def _bodies(f: FootprintArrays, place: Array, heading: Array) -> Bodies:
+    turns = jnp.asarray(f.heading)[:, None] >= 0
+    cosine, sine = jnp.where(turns, jnp.cos(heading), 1), jnp.where(turns, jnp.sin(heading), 0)
+
+    def turned(vectors: Given) -> Array:
+        x, y = jnp.moveaxis(jnp.asarray(vectors), (2, 1), (0, 1))[..., None]
+        return jnp.stack([cosine * x - sine * y, sine * x + cosine * y])
+
+    extents = jnp.asarray(f.extents).T[..., None]
+    rounding, semi_axes = jnp.asarray(f.rounding)[:, None], jnp.asarray(f.semi_axes).T[..., None]
+    return Bodies(place, turned(f.corners), turned(f.axes), extents, rounding, semi_axes)
+
+
+def pairs_within(bodies: Bodies, others: Bodies, reach: Given) -> Array:
+    """``(R, O, S)`` whether bodies are within ``reach`` of others."""
+    a = Bodies(*(jnp.expand_dims(part, part.ndim - 1) for part in bodies))
+    b = Bodies(*(jnp.expand_dims(part, part.ndim - 2) for part in others))
+    offset, reach = b.place - a.place, jnp.asarray(reach)
+    if len(offset) == 3:
+        return _balls_within(offset, a.semi_axes + reach / 2, b.semi_axes + reach / 2)
+    return _cores_within(a, b, offset, reach)
+
+
+def _cores_within(a: Bodies, b: Bodies, offset: Array, reach: Array) -> Array:
+    """Whether cores, those of ``b`` offset by ``offset`` ``(2, ...)``, are within reach of each other."""
+    total = a.rounding + b.rounding + reach
+    corners = b.corners + offset[:, None]
+    apart = jnp.maximum(
+        _separation(a.axes, a.extents, corners), _separation(b.axes, b.extents, a.corners - offset[:, None])
+    )
+    near = _corner_near_edge(a.corners, corners, total) | _corner_near_edge(corners, a.corners, total)
+    return (apart <= total) & (((apart <= 0) & (apart > -jnp.inf)) | near)
+
+
+def _separation(axes: Array, extents: Array, corners: Array) -> Array:
+    """The most by which an axis tells the corners from the core that it is of."""
+    widest = jnp.full((), -jnp.inf, jnp.float32)
+    for i in range(axes.shape[1]):
+        least = (axes[0, i] * corners[0] + axes[1, i] * corners[1]).min(axis=0)
+        tells = axes[0, i] ** 2 + axes[1, i] ** 2 > 0
+        widest = jnp.where(tells, jnp.maximum(widest, least - extents[i]), widest)
+    return widest
+
+
+def _corner_near_edge(corners: Array, others: Array, reach: Array) -> Array:
+    """Whether one of the first corners is within reach of an edge between the others."""
+    near = jnp.zeros((), bool)
+    for j in range(others.shape[1]):
+        begin, along = others[:, j], others[:, (j + 1) % others.shape[1]] - others[:, j]
+        square, offset = (along * along).sum(axis=0), corners - begin[:, None]
+        share = jnp.clip((offset * along[:, None]).sum(axis=0), 0, square) / jnp.where(square > 0, square, 1)
+        gap = offset - share * along[:, None]
+        near = near | ((gap * gap).sum(axis=0) <= reach * reach).any(axis=0)
+    return near
+
+
+def _balls_within(offset: Array, a: Array, b: Array) -> Array:
+    """Whether ellipsoids with these semi-axes touch (Perram and Wertheim, 1985)."""
+    square, a2, b2 = offset * offset, a * a, b * b
+
+    def halve(_: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        low, high, most = carry
+        s = (low + high) / 2
+        mixed = (1 - s) * a2 + s * b2
+        value = (s * (1 - s) * square / mixed).sum(axis=0)
+        rising = (square * ((1 - s) ** 2 * a2 - s * s * b2) / (mixed * mixed)).sum(axis=0) > 0
+        return jnp.where(rising, s, low), jnp.where(rising, high, s), jnp.maximum(most, value)
+
+    zero = jnp.zeros(jnp.broadcast_shapes(offset.shape[1:], a.shape[1:], b.shape[1:]), jnp.float32)
+    return jax.lax.fori_loop(0, BISECTIONS, halve, (zero, zero + 1, zero))[2] <= 1
+
+
+def static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
+    """``(K, S)`` whether robots in ``state`` ``(K, n, S)`` come within ``extra`` of an obstacle or a bound."""
+    dimension, extra = arrays.goal.shape[1], jnp.asarray(extra)
+    bodies = place_robots(arrays.footprints, state, dimension)
+    if dimension == 3:
+        low, high = bodies.semi_axes, bodies.semi_axes
+    else:
+        low, high = bodies.rounding - bodies.corners.min(axis=1), bodies.rounding + bodies.corners.max(axis=1)
+    lower, upper = (bound[:, None, None] for bound in jnp.asarray(arrays.bounds))
+    hit = ((bodies.place - (low + extra) <= lower) | (bodies.place + (high + extra) >= upper)).any(axis=0)
+    boxes, triangles = jnp.asarray(arrays.boxes), jnp.asarray(arrays.triangles).reshape(-1, 3, 2)
+    hit = jax.lax.fori_loop(0, len(boxes), lambda i, hit: hit | _meets_box(bodies, boxes[i], extra), hit)
+
+    def meet(i: Array, hit: Array) -> Array:
+        return hit | _cores_within(bodies, _polygon(triangles[i].T, jnp.float32(0)), -bodies.place, extra)
+
+    return jax.lax.fori_loop(0, len(triangles), meet, hit)
+
+
+def _meets_box(bodies: Bodies, box: Array, extra: Array) -> Array:
+    """``(R, S)`` whether bodies are within ``extra`` of a rounded box."""
+    dimension = len(bodies.place)
+    lower, upper, rounding = box[:dimension], box[dimension:-1], box[-1]
+    if dimension == 2:
+        corners = jnp.stack([lower, jnp.stack([upper[0], lower[1]]), upper, jnp.stack([lower[0], upper[1]])], axis=1)
+        return _cores_within(bodies, _polygon(corners, rounding), -bodies.place, extra)
+    gap = jnp.clip(bodies.place, lower[:, None, None], upper[:, None, None]) - bodies.place
+    axes = bodies.semi_axes + extra
+    sharp = ((gap / axes) ** 2).sum(axis=0) <= 1
+    ball = jnp.where(rounding > 0, rounding, 1)
+    return jnp.where(rounding > 0, _balls_within(gap, axes, jnp.broadcast_to(ball, (3, 1, 1))), sharp)
+
+
+def _polygon(corners: Array, rounding: Array) -> Bodies:
+    """A polygon of these corners ``(2, n)``, counterclockwise, in all samples; of no size it is a point."""
+    edges = jnp.roll(corners, -1, axis=1) - corners
+    length = jnp.sqrt((edges * edges).sum(axis=0))
+    axes = jnp.stack([edges[1], -edges[0]]) / jnp.where(length > 0, length, 1)
+    extents = (axes[:, :, None] * corners[:, None]).sum(axis=0).max(axis=1)
+    parts = corners[..., None, None], axes[..., None, None], extents[:, None, None]
+    nowhere = jnp.zeros((2, 1, 1), jnp.float32)
+    return Bodies(nowhere, *parts, jnp.full((1, 1), rounding, jnp.float32), nowhere)
