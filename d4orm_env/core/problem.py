@@ -19,17 +19,20 @@ from d4orm_env.core.arrays import (
     Floats,
     Frozen,
     frozen_array,
+    frozen_per_robot,
     positive_number,
     shown,
     whole_number,
 )
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
+from d4orm_env.core.problem_arrays import ProblemArrays, goal_directions, inverse_initial_distance, squared_chords
 from d4orm_env.core.problem_checks import (
     check_places,
     check_resolution,
     check_states,
+    check_tolerances,
     check_turning,
+    goal_headings,
     goal_speeds,
     unwound_states,
 )
@@ -95,6 +98,8 @@ class Problem(Frozen):
         goal_speed: ``(K,)`` speed at which each robot may still dock [m/s]; one number is for all. By default what it
             brakes away in a time step, ``max_acceleration * dt``, and infinite for first-order models. Infinite is the
             paper's convention: robots stop dead at their goals, as no real one can.
+        goal_heading: ``(K,)`` heading with which each robot must arrive [rad], NaN for any; one number is for all.
+        goal_heading_tolerance: ``(K,)`` by how much it may be missed [rad], from 0.001 to pi.
         name: Origin of the problem, for tables and pictures.
         collision_penalty: Taken off a robot's reward per step within the margin of another robot, and of an obstacle
             or a bound; 1 in the paper.
@@ -120,6 +125,8 @@ class Problem(Frozen):
     margin: float
     goal_radius: float
     goal_speed: FloatArray
+    goal_heading: FloatArray
+    goal_heading_tolerance: FloatArray
     name: str
     arrival: Arrival
     collision_penalty: float
@@ -138,6 +145,8 @@ class Problem(Frozen):
         name: str = "custom",
         arrival: Arrival = "dock",
         collision_penalty: float = 1.0,
+        goal_heading: ArrayLike | None = None,
+        goal_heading_tolerance: ArrayLike = 0.1,
     ) -> None:
         world = World(dimension=team.dimension) if world is None else world
         if world.dimension != team.dimension:
@@ -154,6 +163,8 @@ class Problem(Frozen):
             margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
             goal_radius=positive_number(goal_radius, "goal_radius", least=SMALLEST, most=LARGEST),
             goal_speed=goal_speeds(team, dt, goal_speed),
+            goal_heading=goal_headings(team, goal_heading),
+            goal_heading_tolerance=frozen_per_robot(goal_heading_tolerance, "goal_heading_tolerance", team.num_robots),
             name=name,
             arrival=arrival,
             collision_penalty=positive_number(collision_penalty, "collision_penalty", most=LARGEST),
@@ -173,9 +184,10 @@ class Problem(Frozen):
         self._set(start=unwound_states(team, self.start))
         check_resolution(team, np.concatenate([places, self.goal], axis=1), self.dt, self.goal_radius)
         check_turning(team, self.dt, self.goal_radius)
-        open_states = np.full_like(self.start, np.nan)
-        for what, positions, states in (("start", places, self.start), ("goal", self.goal, open_states)):
-            fault = check_places(team, self.world, what, positions, self.margin, team.headings(states))
+        check_tolerances(self.goal_heading_tolerance)
+        at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, self.goal_heading)
+        for what, positions, headings in (("start", places, team.headings(self.start)), ("goal", self.goal, at_goals)):
+            fault = check_places(team, self.world, what, positions, self.margin, headings)
             if fault:
                 warnings.warn(
                     f"problem {self.name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=3
@@ -259,6 +271,8 @@ class Problem(Frozen):
             squared_goal_speed=np.square(docking_speed(self.goal_speed, self.team.max_speed)),
             docks=np.bool_(self.docks),
             collision_penalty=np.float32(self.collision_penalty),
+            goal_direction=goal_directions(self.goal_heading),
+            squared_goal_chord=squared_chords(self.goal_heading, self.goal_heading_tolerance),
             footprints=self.team.footprint_arrays,
         )
         for array in arrays:
@@ -318,6 +332,8 @@ class Problem(Frozen):
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {goal_speed!r}".encode())
         if not self.docks:
             sha.update(self.arrival.encode())
+        if not np.isnan(self.goal_heading).all():
+            sha.update(arrays.goal_direction.tobytes() + arrays.squared_goal_chord.tobytes())
         if len(arrays.footprints.inner):
             sha.update(repr(self.team.shapes).encode())
         if self.collision_penalty != 1:
@@ -397,6 +413,8 @@ class Problem(Frozen):
             start=self.start[index, : team.state_size],
             goal=self.goal[index],
             goal_speed=self.goal_speed[index],
+            goal_heading=self.goal_heading[index],
+            goal_heading_tolerance=self.goal_heading_tolerance[index],
         )
 
     def _unchecked(self, **changes: object) -> Problem:

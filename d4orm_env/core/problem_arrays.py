@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.footprints import FootprintArrays
 from d4orm_env.geometry.world_index import WorldIndex
@@ -32,6 +33,8 @@ class ProblemArrays(NamedTuple):
         squared_goal_speed: ``(K,)`` with the allowance for rounding; infinite without a limit.
         docks: ``()`` bool: a robot that has arrived stays there for good.
         collision_penalty: ``()``.
+        goal_direction: ``(K, 2)`` goal headings as unit vectors, zero for none.
+        squared_goal_chord: ``(K,)`` square of the chord by which they may be missed, infinite for none.
         footprints: Of robots that are no discs; their radii are those of discs round them.
     """
 
@@ -51,7 +54,22 @@ class ProblemArrays(NamedTuple):
     squared_goal_speed: FloatArray
     docks: np.bool_
     collision_penalty: np.float32
+    goal_direction: FloatArray
+    squared_goal_chord: FloatArray
     footprints: FootprintArrays
+
+
+def goal_directions(headings: FloatArray) -> FloatArray:
+    """``(K, 2)`` goal headings ``(K,)`` as unit vectors; zero for none."""
+    known = ~np.isnan(headings)
+    sine, cosine = portable.sin_cos(np.where(known, headings, 0).astype(np.float64))
+    return (np.stack([cosine, sine], axis=1) * known[:, None]).astype(np.float32)
+
+
+def squared_chords(headings: FloatArray, tolerance: FloatArray) -> FloatArray:
+    """``(K,)`` squares of the chords by which unit vectors may miss goal headings; infinite for none."""
+    half = portable.sin_cos(tolerance.astype(np.float64) / 2)[0]
+    return np.where(np.isnan(headings), np.inf, 4 * half * half).astype(np.float32)
 
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:

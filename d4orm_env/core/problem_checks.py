@@ -16,6 +16,8 @@ from d4orm_env.footprints import Disc
 
 MAX_HEADING = 1000.0
 """Largest heading that is given as a state [rad]; float32 resolves it to 6e-5 rad. What is taken is unwound."""
+LEAST_TOLERANCE = 1e-3
+"""Smallest tolerance of a goal heading [rad]."""
 RESOLUTION = 100
 """The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
 STEP_RESOLUTION = 10
@@ -43,6 +45,36 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
             f"goal_speed of robot_{robot} is {speeds[robot]:g}; it must be from 0 to {LARGEST:g}, or inf for no limit"
         )
     return speeds
+
+
+def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
+    """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
+    count = team.num_robots
+    headings = as_float32(np.full(count, np.nan) if given is None else given)
+    headings = np.repeat(headings, count) if headings.ndim == 0 else headings
+    if headings.shape != (count,):
+        raise ValueError(f"goal_heading has shape {headings.shape}; expected one number, or ({count},), NaN for any")
+    for robot in np.flatnonzero(~np.isnan(headings)).tolist():
+        if team.robot_models[robot].heading_index is None:
+            raise ValueError(
+                f"goal_heading of robot_{robot} is {headings[robot]:g}, and a {team.models[robot]} has no heading; "
+                f"give NaN"
+            )
+        if not abs(headings[robot]) <= MAX_HEADING:
+            raise ValueError(
+                f"goal_heading of robot_{robot} is {headings[robot]:g} rad; it must be at most {MAX_HEADING:g} in "
+                f"magnitude, so take whole turns off"
+            )
+    return headings
+
+
+def check_tolerances(tolerance: FloatArray) -> None:
+    """Refuse tolerances of goal headings ``(K,)`` that float32 does not resolve, or that allow any."""
+    for robot in np.flatnonzero((tolerance < LEAST_TOLERANCE) | (tolerance > np.float32(np.pi)))[:1].tolist():
+        raise ValueError(
+            f"goal_heading_tolerance of robot_{robot} is {tolerance[robot]:g} rad; it must be from {LEAST_TOLERANCE:g} "
+            f"to pi"
+        )
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start") -> None:

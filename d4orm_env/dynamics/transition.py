@@ -1,14 +1,15 @@
 """One time step of one robot, in scalar style: clip, integrate, limit the speed, dock.
 
 The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
-over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed has arrived.
+over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed, at its goal
+heading where it has one, has arrived.
 From then on it is at rest where it docked (paper, section III; docking as in the paper's reference code), unless the
 problem says that a robot may be moved again: then it has arrived for as long as it is there.
 """
 
 from __future__ import annotations
 
-from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth
+from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth, Vector
 
 __all__ = ["TimeStep", "advance", "arrives"]
 
@@ -28,6 +29,12 @@ def arrives(
 ) -> Flag:
     """Check whether a robot at this distance from its goal, at this speed, arrives there."""
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
+
+
+def faces(cosine: Number, sine: Number, goal_direction: Vector, squared_chord: Number) -> Flag:
+    """Check whether a heading differs from the goal's, both as unit vectors, by no more than this chord."""
+    gap_x, gap_y = cosine - goal_direction[0], sine - goal_direction[1]
+    return gap_x * gap_x + gap_y * gap_y <= squared_chord
 
 
 def docking_speed(goal_speed: N, max_speed: N) -> N:

@@ -53,6 +53,7 @@ for _function in (
     winding.unwound,
     transition.advance,
     transition.arrives,
+    transition.faces,
     transition.stands,
     collision.axis_gap,
     collision.leaves,

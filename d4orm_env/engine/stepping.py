@@ -7,6 +7,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from d4orm_env.core.arrays import Whole
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.winding import Unwinding, unwinding
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, MODELS, model_digest
@@ -22,13 +24,22 @@ from d4orm_env.dynamics.robot_model import (
     runge_kutta,
 )
 from d4orm_env.engine.compiling import ZERO, inlined
-from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.tile_layout import PICK, SQUARED_GAP, SQUARED_NORM, Row
 
-Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_]
-"""Squares of the goal radius and of the goal speed, and whether a robot that has arrived stays there for good."""
+Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_, Row, np.float32]
+"""Squares of the goal radius and of the goal speed, whether a robot that has arrived stays there for good, the goal
+heading as a unit vector, and the square of the chord by which it may be missed, infinite without a goal heading."""
 Mover: TypeAlias = Callable[[bool, Row, Row, Row, TimeStep], Row]
 Docker: TypeAlias = Callable[[bool, Row, Row, Row, Row, Docking], tuple[Row, np.float32, bool]]
+
+
+@inlined
+def docking_of(arrays: ProblemArrays, k: Whole) -> Docking:
+    """Return how robot ``k`` docks."""
+    direction = (arrays.goal_direction[k, 0], arrays.goal_direction[k, 1])
+    chord2 = arrays.squared_goal_chord[k]
+    return arrays.squared_goal_radius, arrays.squared_goal_speed[k], arrays.docks, direction, chord2
 
 
 def models_of_kernel(models: tuple[str, ...]) -> tuple[str, ...]:
@@ -72,6 +83,7 @@ def make_stepper(model: Model) -> tuple[Mover, Docker]:
     functions = ModelFunctions(*(inlined(_in_scalar_style(function)) for function in model.functions))
     pick_x = PICK[model.state_size]
     squared_norm, squared_gap = SQUARED_NORM[model.dimension], SQUARED_GAP[model.dimension]
+    faces = _facing(model)
 
     @inlined
     def move(standing: bool, x: Row, u: Row, limits: Row, h: TimeStep) -> Row:
@@ -81,11 +93,30 @@ def make_stepper(model: Model) -> tuple[Mover, Docker]:
     def dock(standing: bool, x: Row, u: Row, limits: Row, goal: Row, docking: Docking) -> tuple[Row, np.float32, bool]:
         gap2 = squared_gap(x, goal)
         speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
-        arrives = transition.arrives(gap2, speed2, docking[0], docking[1])
+        arrives = transition.arrives(gap2, speed2, docking[0], docking[1]) & faces(x, docking[3], docking[4])
         docks = transition.stands(arrives, docking[2])
         return pick_x(docks, functions.rest(x, ZERO), x), gap2, standing | arrives
 
     return move, dock
+
+
+def _facing(model: Model) -> Callable[[Row, Row, np.float32], bool]:
+    """``faces(x, direction, squared chord)``: whether the robot faces its goal heading, if it has one."""
+    index = model.heading_index
+    if index is None:
+
+        @inlined
+        def anyhow(x: Row, direction: Row, chord2: np.float32) -> bool:
+            return True
+
+        return anyhow
+
+    @inlined
+    def faces(x: Row, direction: Row, chord2: np.float32) -> bool:
+        # Without a goal heading nothing is computed.
+        return chord2 == np.float32(np.inf) or transition.faces(cosine(x[index]), sine(x[index]), direction, chord2)
+
+    return faces
 
 
 def dispatch(branches: Mapping[str, Callable[..., None]]) -> Callable[..., None]:

@@ -25,7 +25,7 @@ from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tu
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.footprint_contacts import refine_pair
 from d4orm_env.engine.simd import NOWHERE, TILE, at_most, use_wide_registers, within_2, within_3
-from d4orm_env.engine.stepping import Docking, dispatch, make_stepper
+from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_stepper
 from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
@@ -85,8 +85,7 @@ def robot_mover(names: tuple[str, ...]) -> RobotMover:
     @inlined
     def move_robot(arrays: ProblemArrays, k: int, w: FloatArray) -> None:
         h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
-        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed[k], arrays.docks)
-        move(arrays.model_codes[k], arrays.limits[k], h, docking, w[k * STRIDE : (k + 1) * STRIDE])
+        move(arrays.model_codes[k], arrays.limits[k], h, docking_of(arrays, k), w[k * STRIDE : (k + 1) * STRIDE])
 
     return move_robot
 

@@ -62,6 +62,8 @@ class EnvSetup:
         self.disturbances = options.disturbances_of(problem)
         self.slack = total_slack(self.disturbances, problem).joined(slack(problem))
         self.lifelong = options.lifelong
+        if self.lifelong and not np.isnan(problem.goal_heading).all():
+            raise ValueError("lifelong mode draws goals without headings; leave goal_heading out")
         # In an open world the two are the same.
         self.along_paths = options.progress == "path" and problem.world.num_obstacles > 0
         self.reward = find_reward(options.reward) or (paper_reward if self.along_paths else None)

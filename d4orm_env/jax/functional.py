@@ -189,6 +189,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
     start, goal, dt, margin, goal_radius, goal_speed, penalty = (
         jnp.asarray(value, jnp.float32) for value in (problem.start, problem.goal, *numbers)
     )
+    heading, tolerance = jnp.asarray(problem.goal_heading), jnp.asarray(problem.goal_heading_tolerance)
     gap2 = ((start[:, : team.dimension] - goal) ** 2).sum(axis=-1)
     distance = jnp.sqrt(jnp.maximum(gap2, goal_radius**2))
     if world.lower is None:
@@ -212,6 +213,8 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "squared_goal_speed": transition.docking_speed(goal_speed, jnp.asarray(team.max_speed)) ** 2,
         "docks": problem.arrival == "dock",
         "collision_penalty": penalty,
+        "goal_direction": jnp.nan_to_num(jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)),
+        "squared_goal_chord": jnp.where(jnp.isnan(heading), jnp.inf, 4 * jnp.sin(tolerance / 2) ** 2),
         "footprints": team.footprint_arrays,
     }
     return ProblemArrays(**arrays)

@@ -84,6 +84,10 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
         speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
         slow2 = arrays.squared_goal_speed[robots][:, None]
         arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, slow2)
+        if model.heading_index is not None:
+            heading, aim = y[model.heading_index], jnp.asarray(arrays.goal_direction)[robots]
+            missed = jnp.asarray(arrays.squared_goal_chord)[robots][:, None]
+            arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), tuple(aim.T[..., None]), missed)
         standing = transition.stands(worlds.docked[robots], arrays.docks)
         docks = transition.stands(arrives, arrays.docks)
         zero = jnp.zeros_like(gap2)

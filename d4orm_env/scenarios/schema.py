@@ -57,6 +57,8 @@ class RobotEntry(Entry):
     max_turn_rate: Number = float(np.float32(np.pi / 2))
     own_limits: dict[str, Number] = Field(default_factory=dict)
     footprint: dict[str, Any] | None = None
+    goal_heading: Number | None = None
+    goal_heading_tolerance: Number = 0.1
 
     @model_validator(mode="after")
     def _fits_model(self) -> RobotEntry:
@@ -194,6 +196,8 @@ class ProblemFile(Entry):
             goal_speed=self.goal_speed,
             arrival=self.arrival,
             collision_penalty=self.collision_penalty,
+            goal_heading=[np.nan if robot.goal_heading is None else robot.goal_heading for robot in self.robots],
+            goal_heading_tolerance=[robot.goal_heading_tolerance for robot in self.robots],
             name=self.name,
         )
 
@@ -317,6 +321,9 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
         entry["footprint"] = footprints.described(footprint)
     for name in (*shape, "max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
+    if not np.isnan(problem.goal_heading[robot]):
+        for name in ("goal_heading", "goal_heading_tolerance"):
+            (entry[name],) = _decimals(getattr(problem, name)[[robot]])
     if model.own_limits:
         names = [limit.name for limit in model.own_limits]
         values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])

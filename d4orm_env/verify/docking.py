@@ -27,6 +27,8 @@ RADIUS_TOLERANCE, SPEED_TOLERANCE = 1 / 7500, 1e-5
 rounding does not bridge."""
 SPEED_ALLOWANCE = 2.0**-13
 """Share of the speed limit by which a robot may exceed its goal speed."""
+HEADING_DOUBT = 1e-4
+"""Angle by which rounding may shift a heading [rad]; integrated models turn nearly as exactly as they move."""
 ROUNDING = 32 * 2.0**-23
 """The same, as a share of the coordinates; 20 units in float32's last place were measured."""
 MAX_READINGS = 8
@@ -81,7 +83,7 @@ def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:
         times.append(readings[0] * problem.dt if arrives else np.inf)
         speeds.append(motion.pace[readings[0] - 1, robot] if arrives else np.nan)
         if not arrives:
-            detail = "".join(_failure(problem, robot, distance[:, robot], motion.pace[:, robot], unsure.tolist()))
+            detail = "".join(_failure(problem, motion, robot, distance[:, robot], unsure.tolist()))
             violations.append(Violation("not arrived", (robot,), problem.dt * problem.horizon, detail))
     return Docking(np.array(robots), np.array(steps), np.array(times), np.array(speeds), np.array(last), violations)
 
@@ -95,7 +97,7 @@ def _staying(problem: Problem, motion: TeamMotion, distance: Floats, certain: ND
     violations = [
         Violation(
             "not arrived", (robot,), problem.dt * horizon,
-            "".join(_failure(problem, robot, distance[:, robot], motion.pace[:, robot], [])),
+            "".join(_failure(problem, motion, robot, distance[:, robot], [])),
         )
         for robot in np.flatnonzero(~certain[-1]).tolist()
     ]  # fmt: skip
@@ -112,13 +114,29 @@ def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats)
     goal_speed = problem.goal_speed + SPEED_ALLOWANCE * motion.max_speed
     slow = (motion.pace <= goal_speed - speed_doubt) | (motion.pace == 0)
     possible = (distance <= problem.goal_radius + doubt) & (motion.pace <= goal_speed + speed_doubt)
-    return possible, (distance <= problem.goal_radius - doubt) & slow
+    missed = heading_errors(problem, motion)
+    tolerance = problem.goal_heading_tolerance.astype(np.float64)
+    certain = (distance <= problem.goal_radius - doubt) & slow & (missed <= tolerance - HEADING_DOUBT)
+    return possible & (missed <= tolerance + HEADING_DOUBT), certain
 
 
-def _failure(problem: Problem, robot: int, distance: Floats, pace: Floats, unsure: list[int]) -> Iterator[str]:
+def heading_errors(problem: Problem, motion: TeamMotion) -> Floats:
+    """``(H, K)`` angle to the goal heading after each step [rad]; minus infinity without one."""
+    wanted = problem.goal_heading.astype(np.float64)
+    if np.isnan(wanted).all():
+        return np.full((1, len(wanted)), -np.inf)
+    turns = (motion.end_headings - wanted) / (2 * np.pi)
+    return np.where(np.isnan(wanted), -np.inf, 2 * np.pi * np.abs(turns - np.round(turns)))
+
+
+def _failure(problem: Problem, motion: TeamMotion, robot: int, distance: Floats, unsure: list[int]) -> Iterator[str]:
+    pace, missed = motion.pace[:, robot], heading_errors(problem, motion)[-1, robot]
     yield f"{distance[-1]:.4g} m from its goal (goal radius {problem.goal_radius:g} m) at the horizon"
     if np.isfinite(problem.goal_speed[robot]):
         yield f", at {pace[-1]:.4g} m/s (goal speed {problem.goal_speed[robot]:g} m/s)"
+    if np.isfinite(missed):
+        tolerance = problem.goal_heading_tolerance[robot]
+        yield f", {missed:.4g} rad from its goal heading (tolerance {tolerance:g} rad)"
     if unsure:
         yield (
             f", unless it docks at {unsure[0] * problem.dt:.3f} s, {distance[unsure[0] - 1]:.8g} m from its goal at "

@@ -29,7 +29,7 @@ from d4orm_env.engine.footprint_contacts import refine_static
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.sample_noise import TURN, VECTOR, Drawing, draw_block, fill_keys
 from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
-from d4orm_env.engine.stepping import Docking, dispatch, make_stepper, models_key, models_of_kernel
+from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_stepper, models_key, models_of_kernel
 from d4orm_env.engine.tile_layout import READ, WRITE, Row
 from d4orm_planners.engine.proximity import (
     Bodies,
@@ -234,7 +234,6 @@ def _score_tile(
     codes, all_limits, goals, inverse = arrays.model_codes, arrays.limits, arrays.goal, arrays.inverse_initial_distance
     h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
     docks, dimension = arrays.docks, goals.shape[1]
-    goal_radius2, goal_speed2 = arrays.squared_goal_radius, arrays.squared_goal_speed
     radius, margin = arrays.radius, arrays.margin
     standing[:] = False
     _begin_tile(arrays, scoring.docked, w)
@@ -255,7 +254,7 @@ def _score_tile(
                 enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
                 continue
             goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
-            last, docking = first + count, (goal_radius2, goal_speed2[k], docks)
+            last, docking = first + count, docking_of(arrays, k)
             run_robot(
                 codes[k], all_limits[k], h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k],
                 draws, controls, moved, own_places, own_turns, robot,

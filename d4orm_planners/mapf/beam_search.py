@@ -22,7 +22,7 @@ from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
-from d4orm_env.engine.stepping import models_key
+from d4orm_env.engine.stepping import docking_of, models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_checks import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
@@ -206,7 +206,7 @@ def search_kernel(name: str) -> Search:
         for r in range(part[0], part[1]):
             robot, begin = queries.robots[r], queries.blocks[r]
             goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
-            docking = (arrays.squared_goal_radius, arrays.squared_goal_speed[robot], arrays.docks)
+            docking = docking_of(arrays, robot)
             at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
             for i in range(n):
                 beam.states[0, i] = queries.states[r, i]

@@ -28,6 +28,8 @@ else:
     thread_counts = LazyModule("d4orm_env.engine.threads")
     drive_kernels = LazyModule("d4orm_planners.tracking.straight_drives")
 
+CREEPING = np.float32(2.0**-20)
+"""Share of its speed limit with which a robot at its goal heads for its goal heading: it turns in place."""
 NEAR_VIA = 10 / 3
 """Distance to a point on its way at which a robot turns to its goal, in radii of the largest robot."""
 
@@ -46,13 +48,23 @@ def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> Fl
 def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
     """``(K, d)`` velocities straight to the goals, from which every robot can still stop there [m/s].
 
+    At its goal a robot turns to its goal heading.
+
     Args:
         problem: Problem of the robots.
         states: ``(K, n)``.
         goals: ``(K, d)`` [m].
     """
     h = TimeStep(*problem.arrays.time_step)
-    return _by_rows(problem, goals.shape[1], (states, goals), lambda model, *rows: model.approach(*rows, h, NUMPY_OPS))
+    wanted = _by_rows(
+        problem, goals.shape[1], (states, goals), lambda model, *rows: model.approach(*rows, h, NUMPY_OPS)
+    )
+    if np.isnan(problem.goal_heading).all():
+        return wanted
+    offset = goals - states[:, : problem.dimension]
+    turning = ~np.isnan(problem.goal_heading) & ((offset * offset).sum(axis=1) <= problem.arrays.squared_goal_radius)
+    creep = problem.team.max_speed[:, None] * CREEPING * problem.arrays.goal_direction
+    return np.where(turning[:, None], creep, wanted)
 
 
 def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.stepping import make_stepper, models_key
+from d4orm_env.engine.stepping import docking_of, make_stepper, models_key
 from d4orm_env.engine.tile_layout import SQUARED_GAP, Row
 from d4orm_planners.tracking.tracker import tracker
 
@@ -55,7 +55,7 @@ def straight_kernel(name: str) -> Drives:
         u: FloatArray, x: FloatArray, arrived: BoolArray,
     ) -> None:  # fmt: skip
         for r in robots:
-            docking = (arrays.squared_goal_radius, arrays.squared_goal_speed[r], arrays.docks)
+            docking = docking_of(arrays, r)
             limits, goal = to_fixed_tuple(arrays.limits[r], num_limits), to_fixed_tuple(arrays.goal[r], d)
             for v in range(switch.shape[1]):
                 first, at_goal = switch[r, v], False

@@ -10,15 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
-from d4orm_env.dynamics.robot_model import Model, TimeStep
+from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
 from d4orm_env.engine.compiling import ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.stepping import Docking, make_stepper
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Docking, docking_of, make_stepper
+from d4orm_env.engine.tile_layout import SQUARED_GAP, Row
 
+CREEPING = np.float32(2.0**-20)
+"""Share of its speed limit with which a robot at its goal heads for its goal heading: it turns in place."""
 Guide: TypeAlias = Callable[[Any, Any, int, Row, Row, Row, TimeStep], tuple[Row, Any, bool]]
 """``(reference, memory, step, state, goal, limits, h) -> (velocity, memory, is_at_end)``: the velocity that is wanted,
 what the guide remembers for the next step, and whether the reference ends here: only there does a robot arrive that may
@@ -28,15 +32,19 @@ VelocityStep: TypeAlias = Callable[[Row, Row, Row, Row, Docking, TimeStep], tupl
 
 
 def velocity_step(model: Model) -> VelocityStep:
-    """The compiled step of a robot of this model towards a velocity.
+    """The compiled step of a robot of this model towards a velocity; at its goal it turns to its goal heading.
 
     ``(state, velocity, limits, goal, docking, h) -> (control, state, has_arrived)``.
     """
     move, dock = make_stepper(model)
     track, limit_control = inlined(model.functions.track), inlined(model.functions.limit_control)
+    squared_gap, turns = SQUARED_GAP[model.dimension], model.heading_index is not None
 
     @inlined
     def step(x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep) -> tuple[Row, Row, bool]:
+        if turns and docking[4] < np.inf and squared_gap(x, goal) <= docking[0]:
+            creep = limits[SPEED] * CREEPING
+            velocity = (creep * docking[3][0], creep * docking[3][1])
         control = limit_control(track(x, velocity, limits, h, OPS), limits, OPS)
         x, _, arrived = dock(False, move(False, x, control, limits, h), control, limits, goal, docking)
         return control, x, arrived
@@ -61,7 +69,7 @@ def tracker(model: Model, guide: Guide) -> Tracker:
         controls: FloatArray, states: FloatArray,
     ) -> int:  # fmt: skip
         dt = arrays.time_step
-        docking = (arrays.squared_goal_radius, arrays.squared_goal_speed[robot], arrays.docks)
+        docking = docking_of(arrays, robot)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
         limits, goal = to_fixed_tuple(arrays.limits[robot], num_limits), to_fixed_tuple(arrays.goal[robot], d)
         horizon = controls.shape[0]
