@@ -19,14 +19,14 @@ from d4orm_env.verify import VerificationReport, verify
 if TYPE_CHECKING:
     from d4orm_env import navigation_v0
     from d4orm_env.jax import functional
-    from d4orm_env.scenarios import load_problem, save_problem
+    from d4orm_env.scenarios import load_dynobench, load_problem, save_problem
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Problem", "Team", "Trajectory", "VerificationReport", "World", "functional", "list_scenarios", "load_map",
-    "load_problem", "make_problem", "make_team", "navigation_v0", "register_model", "register_scenario", "rollout",
-    "save_problem", "verify",
+    "Problem", "Team", "Trajectory", "VerificationReport", "World", "functional", "list_scenarios", "load_dynobench",
+    "load_map", "load_problem", "make_problem", "make_team", "navigation_v0", "register_model", "register_scenario",
+    "rollout", "save_problem", "verify",
 ]  # fmt: skip
 
 register_environments()
@@ -34,7 +34,7 @@ register_environments()
 
 def __getattr__(name: str) -> object:
     """Load what brings PettingZoo, JAX or pydantic with it on first use only."""
-    if name in ("load_problem", "save_problem"):
+    if name in ("load_dynobench", "load_problem", "save_problem"):
         return getattr(import_module("d4orm_env.scenarios"), name)
     if name in ("functional", "navigation_v0"):
         return import_module("d4orm_env.jax.functional" if name == "functional" else "d4orm_env.navigation_v0")

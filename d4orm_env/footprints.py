@@ -22,6 +22,11 @@ MAX_CORNERS = 8
 """Most corners of a polygon."""
 
 
+_ANGLES = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+"""``(64, 2)`` unit vectors all round."""
+
+
 class Core(NamedTuple):
     """A footprint's convex core and how far it is widened.
 
@@ -65,6 +70,10 @@ class Footprint(ABC):
     def inner_radius(self) -> float:
         """Radius of the largest disc or ball about the reference point within it, zero if there is none [m]."""
 
+    @abstractmethod
+    def outline(self) -> Floats:
+        """``(n, 2)`` points round it, counterclockwise, seen from above [m]: to draw it."""
+
     def _check(self) -> None:
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
             if name == "offset":
@@ -100,6 +109,9 @@ class Disc(Footprint):
         """Its radius along each axis, as an ellipsoid's."""
         return self.radius, self.radius, self.radius
 
+    def outline(self) -> Floats:
+        return self.radius * DIRECTIONS
+
     @property
     def core(self) -> Core:
         """The centre, widened by the radius."""
@@ -108,6 +120,11 @@ class Disc(Footprint):
 
 class _Planar(Footprint):
     """A footprint that turns with the robot."""
+
+    def outline(self) -> Floats:
+        corners, rounding = self.core
+        ends: Floats = corners[(DIRECTIONS @ corners.T).argmax(axis=1)] + rounding * DIRECTIONS
+        return ends
 
     @property
     @abstractmethod
@@ -235,6 +252,9 @@ class Ellipsoid(Footprint):
     def semi_axes(self) -> tuple[float, float, float]:
         """Along x, y and z."""
         return self.x, self.y, self.z
+
+    def outline(self) -> Floats:
+        return DIRECTIONS * (self.x, self.y)
 
     @property
     def outer_radius(self) -> float:

@@ -43,19 +43,20 @@ def prove_infeasible(problem: Problem) -> dict[int, str]:
 
     Proved are starts within the margin that cannot be left in one step, goals within it or so near to each other that
     robots at rest there are within it, and walls between start and goal. Gaps that are only a little too narrow are
-    taken for wide enough, and so are those of a world many times larger than its robots. For models of users only
+    taken for wide enough, and so are those of a world many times larger than its robots. Of a footprint only the disc
+    within it counts. For models of users only
     goals and walls count, because nothing says how far their robots get in a step.
 
     Args:
         problem: The problem.
     """
-    d, reach = problem.dimension, problem.team.radius.astype(np.float64) + problem.margin
+    d, reach = problem.dimension, problem.team.inner_radius + problem.margin
     starts, goals = problem.start[:, :d].astype(np.float64), problem.goal.astype(np.float64)
     doubt = problem.rounding + ROUNDING * max(np.abs(starts).max(), np.abs(goals).max(), reach.max())
     proofs = dict(_crowded(problem, "starts", starts, _travel(problem, _start_speed(problem)) + doubt, "one step"))
     at_rest = np.full(problem.num_robots, problem.goal_radius + doubt)
     proofs |= dict(_crowded(problem, "has a goal", goals, at_rest, "the goal radius"))
-    if not proofs and problem.world.num_obstacles:
+    if not proofs and problem.world.num_obstacles and reach.min() > 0:
         robots = _walled_off(problem, starts, goals, float(doubt))
         proofs = dict.fromkeys(robots, "has no free path to its goal: walls are closed all round the one or the other")
     return proofs
@@ -83,7 +84,7 @@ def _travel(problem: Problem, speed: Floats) -> Floats:
 
 def _crowded(problem: Problem, what: str, places: Floats, freedom: Floats, within: str) -> Iterator[tuple[int, str]]:
     """Robots within the margin of something wherever they get from their places ``(K, d)`` by ``freedom`` ``(K,)``."""
-    radius, margin = problem.team.radius.astype(np.float64), problem.margin
+    radius, margin = problem.team.inner_radius, problem.margin
     clearance, needed = problem.world.clearance(places) - radius, f"the margin of {margin:g} m within {within}"
     for robot in np.flatnonzero(clearance + freedom < margin).tolist():
         gap = f"{what} {clearance[robot]:.3g} m from an obstacle or the bounds"
@@ -99,7 +100,7 @@ def _crowded(problem: Problem, what: str, places: Floats, freedom: Floats, withi
 
 def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -> list[int]:
     """Robots whose goals are not connected with their starts."""
-    d, reach = problem.dimension, problem.team.radius.astype(np.float64) + problem.margin
+    d, reach = problem.dimension, problem.team.inner_radius + problem.margin
     travel = _travel(problem, problem.team.max_speed.astype(np.float64))
     for halving in range(1 + HALVINGS):
         low, cell, clearance = _cells(problem, np.concatenate([starts, goals]), float(reach.min()) / 2**halving)

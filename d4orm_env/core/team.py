@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, Frozen, frozen_per_robot, shown
+from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, shown
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint, FootprintArrays, as_arrays
@@ -111,6 +111,11 @@ class Team(Frozen):
     def footprint(self) -> tuple[Footprint, ...]:
         """``K`` footprints."""
         return self.shapes or tuple(Disc(radius) for radius in self.radius.tolist())
+
+    @property
+    def inner_radius(self) -> Floats:
+        """``(K,)`` radii of the discs or balls that the footprints cover however they turn [m]."""
+        return (self.footprint_arrays.inner if self.shapes else self.radius).astype(np.float64)
 
     def headings(self, states: FloatArray) -> FloatArray:
         """``(..., K)`` what turns the robots' footprints in states ``(..., K, n)`` [rad]; zero without a heading."""

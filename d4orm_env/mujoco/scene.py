@@ -58,12 +58,17 @@ def check_problem(problem: Problem) -> None:
     """Refuse what has no bodies here.
 
     Raises:
-        ValueError: For a robot whose model has none, as in space, or which is too small for one.
+        ValueError: For a robot whose model has none, as in space, which is too small for one, or which is not round.
     """
     for robot, name in enumerate(problem.team.models):
         if name not in PUCKS + DRIVES:
             raise ValueError(
                 f"robot_{robot} is a {name}, which has no body in MuJoCo; use one of {', '.join(PUCKS + DRIVES)}"
+            )
+        if problem.team.shapes:
+            raise ValueError(
+                f"robot_{robot} has the footprint {problem.team.footprint[robot]}; bodies in MuJoCo are round, so use "
+                f"a team of discs"
             )
         if problem.team.radius[robot] < LEAST_RADIUS:
             raise ValueError(

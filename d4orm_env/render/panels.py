@@ -246,21 +246,39 @@ class TeamLayer:
 
     def update(self, states: Array, arrived: Array, goals: Array, trail: Array, contacts: Array) -> None:
         """Move everything; the shapes are those of :meth:`FrameRenderer.draw`, with ``(N, d)`` contacts."""
-        panel, d = self.panel, self.problem.dimension
-        positions = states[:, :d]
+        panel = self.panel
         paths = panel.flatten(trail).swapaxes(0, 1)
         self.trails.set_segments(paths)
         if panel.spatial:
             floor = panel.limits[0, 2]
             self.shadows.set_segments(np.concatenate([paths[..., :2], np.full_like(paths[..., :1], floor)], axis=-1))
         self.goals.set_verts(panel.outlines(goals, 1.5 * self.radius, _DIAMOND))
-        self.bodies.set_verts(panel.outlines(positions, self.radius))
+        self.bodies.set_verts(self.body_outlines(states))
         shade = np.where(arrived[:, None], ARRIVED_SHADE, 1.0)
         self.bodies.set_facecolor(shade * self.colors + 1 - shade)
         self.headings.set_segments(self.heading_lines(states))
         white = self.dark & ~arrived[self.drives]
         self.headings.set_color(["white" if on_dark else INK for on_dark in white])
         self.contacts.set_verts(panel.outlines(contacts, self.mark_size, _STAR))
+
+    def body_outlines(self, states: Array) -> Array:
+        """``(K, vertices, .)`` outlines of the robots in states ``(K, n)``; in space ellipsoids face the reader."""
+        team, panel = self.problem.team, self.panel
+        places = states[:, : team.dimension]
+        if not team.shapes:
+            return panel.outlines(places, self.radius)
+        if team.dimension == 3:
+            balls = panel.outlines(np.zeros_like(places), 1.0)
+            sizes = panel.flatten(team.footprint_arrays.semi_axes)
+            corners: Array = panel.flatten(places)[:, None] + balls * sizes[:, None]
+            return corners
+        turn = team.headings(states)[:, None]
+        x, y = np.moveaxis(np.stack([footprint.outline() for footprint in team.footprint]), 2, 0)
+        cosine, sine = np.cos(turn), np.sin(turn)
+        planar: Array = panel.flatten(places)[:, None] + np.stack(
+            [cosine * x - sine * y, sine * x + cosine * y], axis=-1
+        )
+        return planar
 
     def heading_lines(self, states: Array) -> Array:
         """``(., 2, 2)`` lines from the centre to the front of every robot that has a heading."""

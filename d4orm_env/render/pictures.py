@@ -131,7 +131,7 @@ def _draw_history(layer: TeamLayer, trajectory: Trajectory) -> None:
 def _draw_starts(layer: TeamLayer) -> None:
     panel, start = layer.panel, layer.problem.start
     panel.polygons(
-        panel.outlines(start[:, : layer.problem.dimension], layer.radius),
+        layer.body_outlines(start),
         **layer.hollow,
         linewidths=layer.goals.get_linewidth(),
         zorder=2.5,

@@ -175,6 +175,7 @@ def _setting(problem: Problem) -> dict[str, object]:
         "bounds": None if problem.world.lower is None else problem.world.bounds.tolist(),
         "world": _obstacles(problem),
         "radius": np.asarray(problem.team.radius).tolist(),
+        "outlines": [footprint.outline().tolist() for footprint in problem.team.shapes] or None,
         "models": [model.name for model in models],
         "names": [list(model.state_names) for model in models],
         "heading": [model.heading_index for model in models],

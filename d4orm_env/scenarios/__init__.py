@@ -10,11 +10,12 @@ from d4orm_env.scenarios.problems import make_problem
 from d4orm_env.scenarios.scenario_registry import describe_scenario, list_scenarios, register_scenario
 
 if TYPE_CHECKING:
+    from d4orm_env.scenarios.dynobench import load_dynobench
     from d4orm_env.scenarios.problem_files import load_problem, save_problem
 
 __all__ = [
-    "describe_scenario", "list_scenarios", "load_map", "load_problem", "make_problem", "register_scenario",
-    "save_problem",
+    "describe_scenario", "list_scenarios", "load_dynobench", "load_map", "load_problem", "make_problem",
+    "register_scenario", "save_problem",
 ]  # fmt: skip
 
 
@@ -22,4 +23,6 @@ def __getattr__(name: str) -> object:
     """Import the file schema on first use only: building it takes as long as importing everything else."""
     if name in ("load_problem", "save_problem"):
         return getattr(import_module("d4orm_env.scenarios.problem_files"), name)
+    if name == "load_dynobench":
+        return import_module("d4orm_env.scenarios.dynobench").load_dynobench
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.metrics import mean_stretch
@@ -24,6 +25,7 @@ from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.provenance import Provenance
 
 if TYPE_CHECKING:
+    from d4orm_env.scenarios import dynobench
     from d4orm_planners.base import plan_file
     from d4orm_planners.setpoints import export as exports
     from d4orm_planners.setpoints import setpoints, smoothing
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from d4orm_planners.setpoints.setpoints import Setpoints
     from d4orm_planners.setpoints.smoothing import SmoothMotion
 else:
+    dynobench = LazyModule("d4orm_env.scenarios.dynobench")
     plan_file = LazyModule("d4orm_planners.base.plan_file")
     exports = LazyModule("d4orm_planners.setpoints.export")
     setpoints = LazyModule("d4orm_planners.setpoints.setpoints")
@@ -254,6 +257,17 @@ class Plan(DisplayMixin):
     def key_figures(self) -> list[KeyFigure]:
         """Return the plan's key figures."""
         return outcome_rows(self.metrics, self.problem.num_robots)
+
+    def to_dynobench(self, path: str | os.PathLike[str]) -> None:
+        """Write the motion as a result file of dynobench and db-CBS: states and actions of every robot.
+
+        Raises:
+            ValueError: If a robot's model is none of theirs.
+            OSError: If it cannot be written; nothing is left behind then.
+        """
+        lines = list(dynobench.result_lines(self.problem, self.trajectory))
+        with replaced_when_done(Path(path)) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan, its problem and its trajectory to an ``.npz`` file.

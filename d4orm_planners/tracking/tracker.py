@@ -15,9 +15,9 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
-from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
+from d4orm_env.dynamics.robot_model import SPEED, TURN_RATE, Model, TimeStep
 from d4orm_env.engine.compiling import ZERO, inlined, to_fixed_tuple
-from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.stepping import Docking, docking_of, make_stepper
 from d4orm_env.engine.tile_layout import SQUARED_GAP, Row
 
@@ -38,13 +38,30 @@ def velocity_step(model: Model) -> VelocityStep:
     """
     move, dock = make_stepper(model)
     track, limit_control = inlined(model.functions.track), inlined(model.functions.limit_control)
-    squared_gap, turns = SQUARED_GAP[model.dimension], model.heading_index is not None
+    squared_gap, turns, heading = (
+        SQUARED_GAP[model.dimension],
+        model.heading_index is not None,
+        model.heading_index or 0,
+    )
+
+    @inlined
+    def towards_pose(x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep) -> Row:
+        gap2, creep = squared_gap(x, goal), limits[SPEED] * CREEPING
+        if gap2 <= docking[0]:
+            return (creep * docking[3][0], creep * docking[3][1])
+        # Nearer than it can drive round, it faces the goal first.
+        facing_x, facing_y = cosine(x[heading]), sine(x[heading])
+        along = facing_x * velocity[0] + facing_y * velocity[1]
+        across = facing_x * velocity[1] - facing_y * velocity[0]
+        near = gap2 * limits[TURN_RATE] * limits[TURN_RATE] < limits[SPEED] * limits[SPEED]
+        if near and abs(across) > along * limits[TURN_RATE] * h.full:
+            return (CREEPING * velocity[0], CREEPING * velocity[1])
+        return velocity
 
     @inlined
     def step(x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep) -> tuple[Row, Row, bool]:
-        if turns and docking[4] < np.inf and squared_gap(x, goal) <= docking[0]:
-            creep = limits[SPEED] * CREEPING
-            velocity = (creep * docking[3][0], creep * docking[3][1])
+        if turns and docking[4] < np.inf:
+            velocity = towards_pose(x, velocity, limits, goal, docking, h)
         control = limit_control(track(x, velocity, limits, h, OPS), limits, OPS)
         x, _, arrived = dock(False, move(False, x, control, limits, h), control, limits, goal, docking)
         return control, x, arrived

@@ -79,8 +79,9 @@ class Scene {
     return Math.sqrt(sum) / this.dt;
   }
 
-  /** Distance from a robot's surface to the nearest other robot, obstacle or bound. */
+  /** Distance from a robot's surface to the nearest other robot, obstacle or bound; not known unless all are round. */
   clearance(step, robot) {
+    if (this.outlines) return Infinity;
     let least = this.clearances[step * this.robots + robot] - this.radius[robot];
     for (let other = 0; other < this.robots; other++) {
       if (other === robot) continue;
@@ -147,6 +148,18 @@ class Painter {
     this.pen.arc(this.view.x(place), this.view.y(place), Math.max(radius * this.view.scale, 1), 0, 2 * Math.PI);
     if (style) { this.pen.fillStyle = style; this.pen.fill(); }
     if (edge) { this.pen.strokeStyle = edge; this.pen.stroke(); }
+  }
+
+  /** A robot: a disc, or its outline turned by its heading. */
+  body(moment, robot, place, style, edge) {
+    const { scene } = this;
+    if (!scene.outlines) return this.disc(place, scene.radius[robot], style, edge);
+    const index = scene.heading[robot], angle = index === null ? 0 : scene.between(moment, robot, index, true);
+    const c = Math.cos(angle), s = Math.sin(angle);
+    this.trace(scene.outlines[robot].map(([x, y]) => [place[0] + c * x - s * y, place[1] + s * x + c * y, place[2]]));
+    this.pen.closePath();
+    this.pen.fillStyle = style; this.pen.fill();
+    this.pen.strokeStyle = edge; this.pen.stroke();
   }
 
   /** What does not move: bounds, obstacles, and the whole ways, faintly, if they are to be seen. */
@@ -238,7 +251,7 @@ class Painter {
       const flag = denoising ? 0 : scene.flag(now, robot), red = flag & COLLIDED;
       pen.lineWidth = robot === chosen ? 3 : 1;
       pen.globalAlpha = flag & ARRIVED && !red ? 0.55 : 1;
-      this.disc(place, scene.radius[robot], red ? theme.contact : this.colors[robot],
+      this.body(moment, robot, place, red ? theme.contact : this.colors[robot],
         flag & CLOSE ? theme.contact : theme.ink);
       pen.globalAlpha = 1;
       const index = scene.heading[robot];
