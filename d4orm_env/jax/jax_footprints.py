@@ -86,7 +86,7 @@ def _bodies(f: FootprintArrays, place: Array, heading: Array) -> Bodies:
 
     def turned(vectors: Given) -> Array:
         x, y = jnp.moveaxis(jnp.asarray(vectors), (2, 1), (0, 1))[..., None]
-        return jnp.stack([cosine * x - sine * y, sine * x + cosine * y])
+        return jnp.stack([cosine[None] * x - sine[None] * y, sine[None] * x + cosine[None] * y])
 
     extents = jnp.asarray(f.extents).T[..., None]
     rounding, semi_axes = jnp.asarray(f.rounding)[:, None], jnp.asarray(f.semi_axes).T[..., None]
@@ -118,7 +118,7 @@ def _separation(axes: Array, extents: Array, corners: Array) -> Array:
     """The most by which an axis tells the corners from the core that it is of."""
     widest = jnp.full((), -jnp.inf, jnp.float32)
     for i in range(axes.shape[1]):
-        least = (axes[0, i] * corners[0] + axes[1, i] * corners[1]).min(axis=0)
+        least = (axes[0, None, i] * corners[0] + axes[1, None, i] * corners[1]).min(axis=0)
         tells = axes[0, i] ** 2 + axes[1, i] ** 2 > 0
         widest = jnp.where(tells, jnp.maximum(widest, least - extents[i]), widest)
     return widest
@@ -130,9 +130,11 @@ def _corner_near_edge(corners: Array, others: Array, reach: Array) -> Array:
     for j in range(others.shape[1]):
         begin, along = others[:, j], others[:, (j + 1) % others.shape[1]] - others[:, j]
         square, offset = (along * along).sum(axis=0), corners - begin[:, None]
-        share = jnp.clip((offset * along[:, None]).sum(axis=0), 0, square) / jnp.where(square > 0, square, 1)
-        gap = offset - share * along[:, None]
-        near = near | ((gap * gap).sum(axis=0) <= reach * reach).any(axis=0)
+        share = (
+            jnp.clip((offset * along[:, None]).sum(axis=0), 0, square[None]) / jnp.where(square > 0, square, 1)[None]
+        )
+        gap = offset - share[None] * along[:, None]
+        near = near | ((gap * gap).sum(axis=0) <= (reach * reach)[None]).any(axis=0)
     return near
 
 
@@ -142,11 +144,12 @@ def _balls_within(offset: Array, a: Array, b: Array) -> Array:
 
     def halve(_: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         low, high, most = carry
-        s = (low + high) / 2
+        middle = (low + high) / 2
+        s = middle[None]
         mixed = (1 - s) * a2 + s * b2
         value = (s * (1 - s) * square / mixed).sum(axis=0)
         rising = (square * ((1 - s) ** 2 * a2 - s * s * b2) / (mixed * mixed)).sum(axis=0) > 0
-        return jnp.where(rising, s, low), jnp.where(rising, high, s), jnp.maximum(most, value)
+        return jnp.where(rising, middle, low), jnp.where(rising, high, middle), jnp.maximum(most, value)
 
     zero = jnp.zeros(jnp.broadcast_shapes(offset.shape[1:], a.shape[1:], b.shape[1:]), jnp.float32)
     return jax.lax.fori_loop(0, BISECTIONS, halve, (zero, zero + 1, zero))[2] <= 1
@@ -159,11 +162,15 @@ def static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
     if dimension == 3:
         low, high = bodies.semi_axes, bodies.semi_axes
     else:
-        low, high = bodies.rounding - bodies.corners.min(axis=1), bodies.rounding + bodies.corners.max(axis=1)
+        rounding = bodies.rounding[None]
+        low, high = rounding - bodies.corners.min(axis=1), rounding + bodies.corners.max(axis=1)
     lower, upper = (bound[:, None, None] for bound in jnp.asarray(arrays.bounds))
     hit = ((bodies.place - (low + extra) <= lower) | (bodies.place + (high + extra) >= upper)).any(axis=0)
     boxes, triangles = jnp.asarray(arrays.boxes), jnp.asarray(arrays.triangles).reshape(-1, 3, 2)
-    hit = jax.lax.fori_loop(0, len(boxes), lambda i, hit: hit | _meets_box(bodies, boxes[i], extra), hit)
+    if len(boxes):
+        hit = jax.lax.fori_loop(0, len(boxes), lambda i, hit: hit | _meets_box(bodies, boxes[i], extra), hit)
+    if not len(triangles):
+        return hit
 
     def meet(i: Array, hit: Array) -> Array:
         return hit | _cores_within(bodies, _polygon(triangles[i].T, jnp.float32(0)), -bodies.place, extra)
@@ -189,7 +196,7 @@ def _polygon(corners: Array, rounding: Array) -> Bodies:
     """A polygon of these corners ``(2, n)``, counterclockwise, in all samples; of no size it is a point."""
     edges = jnp.roll(corners, -1, axis=1) - corners
     length = jnp.sqrt((edges * edges).sum(axis=0))
-    axes = jnp.stack([edges[1], -edges[0]]) / jnp.where(length > 0, length, 1)
+    axes = jnp.stack([edges[1], -edges[0]]) / jnp.where(length > 0, length, 1)[None]
     extents = (axes[:, :, None] * corners[:, None]).sum(axis=0).max(axis=1)
     parts = corners[..., None, None], axes[..., None, None], extents[:, None, None]
     nowhere = jnp.zeros((2, 1, 1), jnp.float32)

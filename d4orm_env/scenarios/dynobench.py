@@ -107,8 +107,12 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
         footprint=[_footprint(own) for own in parameters],
     )
     start, goal = np.zeros((2, team.num_robots, team.state_size))
-    for robot, entry in enumerate(robots):
-        start[robot, : len(entry["start"])], goal[robot, : len(entry["goal"])] = entry["start"], entry["goal"]
+    for robot, (entry, model) in enumerate(zip(robots, team.robot_models, strict=True)):
+        for what, states in (("start", start), ("goal", goal)):
+            if len(entry[what]) != model.state_size:
+                given, kind = shown(entry[what]), entry["type"]
+                raise ValueError(f"{what} of robot_{robot} is {given}; a {kind} has {model.state_size} components")
+            states[robot, : model.state_size] = entry[what]
     turning = np.array([model.heading_index is not None for model in team.robot_models])
     inertia = np.array([not model.first_order for model in team.robot_models])
     d = team.dimension

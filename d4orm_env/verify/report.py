@@ -35,7 +35,8 @@ class VerificationReport:
 
     Attributes:
         min_separation: Smallest gap between the surfaces of two robots over continuous time, negative where they
-            overlap [m]; infinite for one robot, NaN for a plan whose motion is not judged.
+            overlap [m]; infinite for one robot, NaN for a plan whose motion is not judged. Of ellipsoids it is the gap
+            along the line of their centres.
         min_clearance: Smallest gap from a robot's surface to an obstacle or the bounds, negative inside [m]; infinite
             in an empty open world, NaN for a plan whose motion is not judged.
         arrival_times: ``(K,)`` when each robot docked, in the first reading of its docking [s]; infinite for one that

@@ -38,11 +38,8 @@ def velocity_step(model: Model) -> VelocityStep:
     """
     move, dock = make_stepper(model)
     track, limit_control = inlined(model.functions.track), inlined(model.functions.limit_control)
-    squared_gap, turns, heading = (
-        SQUARED_GAP[model.dimension],
-        model.heading_index is not None,
-        model.heading_index or 0,
-    )
+    squared_gap, turns = SQUARED_GAP[model.dimension], model.heading_index is not None
+    heading = model.heading_index or 0
 
     @inlined
     def towards_pose(x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep) -> Row:
@@ -54,7 +51,7 @@ def velocity_step(model: Model) -> VelocityStep:
         along = facing_x * velocity[0] + facing_y * velocity[1]
         across = facing_x * velocity[1] - facing_y * velocity[0]
         near = gap2 * limits[TURN_RATE] * limits[TURN_RATE] < limits[SPEED] * limits[SPEED]
-        if near and abs(across) > along * limits[TURN_RATE] * h.full:
+        if near and OPS.maximum(across, -across) > along * limits[TURN_RATE] * h.full:
             return (CREEPING * velocity[0], CREEPING * velocity[1])
         return velocity
 

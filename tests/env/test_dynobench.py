@@ -1,0 +1,120 @@
+"""Instances as dynobench and db-CBS write them, and results that a checker of their kind accepts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from d4orm_env import load_dynobench
+from d4orm_env.footprints import Box, Disc
+from d4orm_planners import make_planner
+
+INSTANCE = """
+environment:
+  min: [0, 0]
+  max: [5, 4]
+  obstacles:
+    - {type: box, center: [2.5, 3.2], size: [0.4, 0.6]}
+robots:
+  - {type: unicycle_first_order_0, start: [1, 1.5, 0], goal: [4, 1.5, 0]}
+  - {type: unicycle1_v0, start: [4, 1.6, 3.14], goal: [1, 1.6, 3.14]}
+  - {type: double_integrator_0, start: [1, 3, 0, 0], goal: [4, 3, 0, 0]}
+"""
+
+
+@pytest.fixture
+def instance(tmp_path: Path) -> Path:
+    path = tmp_path / "swap.yaml"
+    path.write_text(INSTANCE)
+    return path
+
+
+def test_an_instance_means_what_it_says(instance: Path) -> None:
+    problem = load_dynobench(instance)
+    assert problem.name == "swap"
+    assert problem.team.models == ("unicycle", "unicycle", "holonomic2d")
+    assert problem.team.footprint == (Box(0.5, 0.25), Box(0.5, 0.25), Disc(0.1))
+    np.testing.assert_allclose(problem.start[1, :3], [4, 1.6, 3.14], rtol=1e-6)
+    np.testing.assert_allclose(problem.goal_heading[:2], [0, 3.14], rtol=1e-6)
+    assert np.isnan(problem.goal_heading[2])
+    np.testing.assert_allclose(problem.world.boxes, [[2.3, 2.9, 2.7, 3.5]], rtol=1e-6)
+    np.testing.assert_allclose(problem.world.bounds, [[-0.1, -0.1], [5.1, 4.1]], rtol=1e-5)
+    assert problem.arrival == "stay"
+    assert (problem.dt, problem.margin, problem.goal_radius) == (0.1, 0.0, 0.01)
+    np.testing.assert_allclose(problem.team.max_acceleration[2], 2.0)
+    np.testing.assert_allclose(problem.team.max_turn_rate[:2], 0.5)
+
+
+def test_a_solution_passes_a_check_of_their_kind(instance: Path, tmp_path: Path) -> None:
+    """Euler steps of theirs lead from each state to the next within 0.01; starts, goals and limits are kept."""
+    problem = load_dynobench(instance)
+    plan = make_planner("hybrid").solve(problem, seed=0, time_limit=60)
+    assert plan.solved
+    plan.to_dynobench(tmp_path / "result.yaml")
+    result = yaml.safe_load((tmp_path / "result.yaml").read_text())["result"]
+    for entry, given in zip(yaml.safe_load(INSTANCE)["robots"], result, strict=True):
+        states, actions = np.array(given["states"]), np.array(given["actions"])
+        assert len(states) == len(actions) + 1
+        np.testing.assert_allclose(states[0], entry["start"], atol=1e-5)
+        turns = states.shape[1] == 3
+        missed = states[-1] - entry["goal"]
+        if turns:
+            missed[2] = (missed[2] + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(missed).max() <= 0.01 + 1e-4
+        following = states[:-1].copy()
+        if turns:
+            rates = np.column_stack([actions[:, 0] * np.cos(states[:-1, 2]), actions[:, 0] * np.sin(states[:-1, 2])])
+            following += 0.1 * np.column_stack([rates, actions[:, 1]])
+            assert np.abs(actions).max() <= 0.5 + 1e-6
+        else:
+            following += 0.1 * np.column_stack([states[:-1, 2:], actions])
+            assert np.abs(actions).max() <= 2.0 + 1e-6
+        gap = states[1:] - following
+        if turns:
+            gap[:, 2] = (gap[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(gap[:-1]).max() <= 0.0101  # the last one ends at rest
+
+
+def test_own_parameters_are_taken(instance: Path) -> None:
+    wide = {"dynamics": "unicycle1", "max_vel": 1.0, "max_angular_vel": 2.0, "shape": "sphere", "radius": 0.3}
+    problem = load_dynobench(instance, models={"unicycle1_v0": wide})
+    assert problem.team.footprint[1] == Disc(0.3)
+    assert problem.team.max_speed.tolist() == [0.5, 1.0, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("unicycle1_v0", "hovercraft_7", "robot types 'hovercraft_7' are unknown; known are unicycle1_v0"),
+        ("type: box", "type: torus", "obstacle type 'torus' is unknown; known are box, sphere"),
+        ("robots:", "agents:", "no multi-robot problem of dynobench"),
+        (
+            "goal: [4, 1.5, 0]",
+            "goal: [4, 1.5]",
+            "goal of robot_0 is [4, 1.5]; a unicycle_first_order_0 has 3 components",
+        ),
+    ],
+)
+def test_what_is_wrong_is_told(instance: Path, old: str, new: str, message: str) -> None:
+    instance.write_text(INSTANCE.replace(old, new))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        load_dynobench(instance)
+
+
+def test_limits_that_are_not_symmetric_are_refused(instance: Path) -> None:
+    forward = {"dynamics": "unicycle1", "max_vel": 0.5, "min_vel": 0.25, "shape": "box", "size": [0.5, 0.25]}
+    with pytest.raises(ValueError, match=r"robot type unicycle1_v0: min_vel is 0\.25; limits here are symmetric"):
+        load_dynobench(instance, models={"unicycle1_v0": forward})
+
+
+def test_other_models_have_no_result_file(tmp_path: Path) -> None:
+    from d4orm_env import make_problem
+
+    plan = make_planner("mapf").solve(make_problem("circle", num_robots=2, model="car"), max_iterations=1)
+    with pytest.raises(ValueError, match="robot_0 is a car, which dynobench has no model for"):
+        plan.to_dynobench(tmp_path / "result.yaml")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,223 @@
+"""Footprints: what they are, and their contacts in every engine and in the judge, against an independent library."""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations
+
+import numpy as np
+import pytest
+from engine_support import ENGINE_NAMES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely import affinity
+from shapely import geometry as shapely
+
+from d4orm_env import Problem, Team, World, load_problem, make_problem, navigation_v0, rollout, save_problem, verify
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Footprint, Polygon
+
+KITE = Polygon([[0.3, 0.0], [0.0, 0.2], [-0.2, 0.1], [-0.2, -0.1]])
+SHAPES: tuple[Footprint, ...] = (Box(0.6, 0.2, 0.1), Capsule(0.4, 0.1), KITE, Disc(0.2), Box(0.3, 0.3))
+WORLD = World(
+    circles=[[1, 1, 0.2]], boxes=[[-1.2, -1, -0.8, 0.2]], polygons=[[[0.5, -1], [1.1, -1.2], [0.8, -0.5], [0.8, -0.9]]],
+    lower=[-2, -2], upper=[2, 2],
+)  # fmt: skip
+NEAR = 1e-5
+"""Closer to contact than this [m], float32 may decide."""
+
+
+def planar_problem(model: str = "unicycle", horizon: int = 1) -> Problem:
+    team = Team((model,) * len(SHAPES), footprint=SHAPES)
+    columns = np.arange(len(SHAPES)) * 0.9 - 1.8
+    start = np.zeros((len(SHAPES), team.state_size))
+    start[:, :3] = np.column_stack([columns, np.full(len(SHAPES), -1.5), np.full(len(SHAPES), np.pi / 2)])
+    return Problem(team, start, np.column_stack([columns, np.full(len(SHAPES), 1.7)]), WORLD, horizon=horizon)
+
+
+def outline(footprint: Footprint, x: float, y: float, turn: float) -> tuple[shapely.base.BaseGeometry, float]:
+    """The core as shapely has it, and its rounding."""
+    corners, rounding = footprint.core  # type: ignore[attr-defined]
+    kinds = {1: lambda: shapely.Point(corners[0]), 2: lambda: shapely.LineString(corners)}
+    core = kinds.get(len(corners), lambda: shapely.Polygon(corners))()
+    return affinity.translate(affinity.rotate(core, turn, origin=(0, 0), use_radians=True), x, y), rounding
+
+
+def gaps(states: np.ndarray) -> np.ndarray:
+    """``(K,)`` distance from every robot to the nearest thing."""
+    bodies = [outline(footprint, *state[:3]) for footprint, state in zip(SHAPES, states.astype(float), strict=True)]
+    things = [(shapely.Point(1, 1), 0.2), (shapely.box(-1.2, -1, -0.8, 0.2), 0.0)]
+    things += [(shapely.Polygon(corners), 0.0) for corners in WORLD.polygons]
+    least = np.full(len(bodies), np.inf)
+    for i, j in combinations(range(len(bodies)), 2):
+        gap = bodies[i][0].distance(bodies[j][0]) - bodies[i][1] - bodies[j][1]
+        least[[i, j]] = np.minimum(least[[i, j]], gap)
+    for robot, (core, rounding) in enumerate(bodies):
+        left, low, right, high = core.bounds
+        ends = np.array([left + 2, low + 2, 2 - right, 2 - high]) - rounding
+        others = [core.distance(thing) - rounding - size for thing, size in things]
+        least[robot] = min(least[robot], ends.min(), *others)
+    return least
+
+
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
+def test_contacts_are_those_of_shapely(engine: str) -> None:
+    problem, random = planar_problem(), np.random.default_rng(0)
+    nobody, still = np.zeros(len(SHAPES), bool), np.zeros((len(SHAPES), 2), np.float32)
+    touched = 0
+    for _ in range(150):
+        states = np.column_stack([random.uniform(-1.9, 1.9, (len(SHAPES), 2)), random.uniform(-3, 3, len(SHAPES))])
+        after = get_engine(engine).step(problem.arrays, states.astype(np.float32), nobody, still)
+        gap = gaps(states.astype(np.float32))
+        for extra, flags in ((0.0, after.collided), (problem.margin, after.margin_violated)):
+            clear = np.abs(gap - extra) > NEAR
+            np.testing.assert_array_equal(flags[clear], (gap <= extra)[clear])
+            touched += int(flags.sum())
+    assert touched > 300
+
+
+@pytest.mark.parametrize("model", ["differential_drive", "unicycle", "car"])
+def test_the_judge_finds_the_smallest_gaps(model: str) -> None:
+    """Against the least of many moments of a motion that turns."""
+    problem = planar_problem(model, horizon=8)
+    random = np.random.default_rng(3)
+    for _ in range(3):
+        states = problem.start.copy()
+        states[:, :2], states[:, 2] = random.uniform(-1.4, 1.4, (len(SHAPES), 2)), random.uniform(-3, 3, len(SHAPES))
+        moved = problem.with_state(states, problem.goal)
+        controls = random.uniform(-1, 1, (8, len(SHAPES), problem.control_size)).astype(np.float32)
+        report = verify(moved, controls)
+        # Each step again in 16: the controls are held, so that the motion is the same.
+        fine = moved._unchecked(dt=moved.dt / 16, horizon=8 * 16)
+        path = rollout(fine, np.repeat(controls, 16, axis=0)).states
+        least = np.array([gaps(moment) for moment in path]).min()
+        found = min(report.min_separation, report.min_clearance)
+        assert found <= least + 1e-4
+        assert found > 0 or least < 2e-3
+        if least > 0:
+            assert found > least - 0.02
+        contact = any(violation.kind.endswith("contact") for violation in report.violations)
+        assert contact == (found <= 0)
+
+
+def test_the_judge_sees_a_corner_that_sweeps_by_within_a_step() -> None:
+    """Two long boxes end to end: turning on the spot by a half turn in one step, one touches the other in between."""
+    team = Team(("unicycle",) * 2, footprint=Box(1.0, 0.1), max_turn_rate=[31.5, 1.0])
+    problem = Problem(team, [[0, 0, 0], [0, 0.4, 0]], [[0, 3], [3, 0.4]], horizon=1)
+    turned = np.array([[[0, np.pi / 0.1], [0, 0]]], np.float32)
+    assert not rollout(problem, turned).collided.any()
+    assert any(violation.kind == "robot contact" for violation in verify(problem, turned).violations)
+
+
+@given(
+    st.tuples(*[st.floats(0.1, 0.6)] * 6),
+    st.tuples(*[st.floats(-1.2, 1.2)] * 3),
+)
+@settings(max_examples=40, deadline=None)
+def test_ellipsoids_touch_where_no_plane_parts_them(sizes: tuple[float, ...], offset: tuple[float, ...]) -> None:
+    a, b, d = np.array(sizes[:3], np.float32), np.array(sizes[3:], np.float32), np.array(offset, np.float32)
+    team = Team(("holonomic3d",) * 2, footprint=[Ellipsoid(*map(float, a)), Ellipsoid(*map(float, b))])
+    apart = [[0] * 6, [9, 9, 9, 0, 0, 0]]
+    problem = Problem(team, apart, [[1, 0, 0], [9, 9, 8]], horizon=1)
+    states = np.array([[0] * 6, [*d, 0, 0, 0]], np.float32)
+    directions = np.random.default_rng(0).normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    reach = np.linalg.norm(directions * a, axis=1) + np.linalg.norm(directions * b, axis=1)
+    parted = float((directions @ d - reach).max())
+    after = get_engine("cpu").step(problem.arrays, states, np.zeros(2, bool), np.zeros((2, 3), np.float32))
+    report = verify(problem.with_state(states, problem.goal), np.zeros((1, 2, 3), np.float32))
+    if abs(parted) > 5e-3:
+        assert bool(after.collided[0]) == (parted < 0)
+        assert (report.min_separation <= 0) == (parted < 0)
+        assert parted < 0 or report.min_separation >= parted - 5e-3
+
+
+def test_ellipsoids_among_obstacles() -> None:
+    """Beside a sphere, a cylinder and a box, over the floor: 1 cm clear of each, and 1 cm within."""
+    obstacles = {"spheres": [[0, 0, 1, 0.2]], "cylinders": [[3, 0, 0.2]], "boxes": [[5, -1, 0, 6, 1, 2]]}
+    world = World(3, **obstacles, lower=[-9, -9, 0], upper=[9, 9, 9])
+    team = Team(("holonomic3d",), footprint=Ellipsoid(0.1, 0.1, 0.3))
+    problem = Problem(team, [[-3, 0, 1, 0, 0, 0]], [[-3, 0, 2]], world, horizon=1, margin=0.05)
+    for place in ([-0.3, 0, 1], [0, 0, 1.5], [2.7, 0, 4], [4.9, 0, 1], [-3, 0, 0.3]):
+        away = np.sign(np.array(place) - [{-0.3: 0, 0: 0, 2.7: 3, 4.9: 5.5, -3: -3}[place[0]], 0, 1]) * 0.01
+        if place[0] in (2.7, 4.9, -3):
+            away[2] = 0.01 if place[0] == -3 else 0
+        for sign, collides in ((1, False), (-1, True)):
+            states = np.array([[*(np.array(place) + sign * away), 0, 0, 0]], np.float32)
+            for engine in ENGINE_NAMES:
+                after = get_engine(engine).step(problem.arrays, states, np.zeros(1, bool), np.zeros((1, 3), np.float32))
+                assert bool(after.collided[0]) == collides, (place, sign, engine)
+                assert after.margin_violated[0]
+            report = verify(problem.with_state(states, problem.goal), np.zeros((1, 1, 3), np.float32))
+            assert (report.min_clearance <= 0) == collides
+
+
+def test_discs_given_as_footprints_are_the_same_team() -> None:
+    problem = make_problem("circle", num_robots=4)
+    other = problem.replace(team=problem.team.replace(footprint=Disc(0.15)))
+    assert other == problem
+    assert not other.team.shapes
+    assert other.team.footprint == (Disc(float(np.float32(0.15))),) * 4
+
+
+def test_radius_and_footprint_follow_from_each_other() -> None:
+    team = Team(("unicycle",) * 2, footprint=[Box(0.8, 0.6), Disc(0.2)])
+    np.testing.assert_allclose(team.radius, [0.5, 0.2])
+    np.testing.assert_allclose(team.inner_radius, [0.3, 0.2], rtol=1e-5)
+    assert team.replace(max_speed=0.5).footprint == team.footprint
+    assert not team.replace(radius=0.3).shapes
+    assert team.select([0]).footprint == (Box(0.8, 0.6),)
+    with pytest.raises(ValueError, match="is not that of the footprints"):
+        Team(("unicycle",), radius=0.3, footprint=Box(0.8, 0.6))
+
+
+def test_files_keep_footprints(tmp_path: object) -> None:
+    problem = planar_problem()
+    path = f"{tmp_path}/problem.yaml"
+    save_problem(problem, path)
+    assert load_problem(path) == problem
+    assert load_problem(path).team.footprint == problem.team.footprint
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Box(0, 1), "length of Box is 0; it must be positive"),
+        (lambda: Disc(float("nan")), "radius of Disc is nan"),
+        (lambda: Capsule(1, 1, offset="x"), "offset of Capsule must be a number of metres, not 'x'"),
+        (lambda: Polygon([[0, 0], [1, 0]]), "corners of Polygon have shape (2, 2); expected (n, 2), n from 3 to 8"),
+        (
+            lambda: Polygon([[0, 0], [1, 0], [0.2, 0.2], [0, 1]]),
+            "Polygon is not convex at corner 2, [0.2, 0.2]; give the corners of its convex hull",
+        ),
+        (lambda: Polygon([[np.cos(4 * np.pi * i / 5), np.sin(4 * np.pi * i / 5)] for i in range(5)]), "not convex"),
+        (lambda: Team(("unicycle",) * 2, footprint=[Disc(1)]), "footprint has 1 entries for 2 robots"),
+        (lambda: Team(("unicycle",), footprint=Ellipsoid(1, 1, 1)), "lies in 3 dimensions and the team moves in 2"),
+        (lambda: Team(("holonomic3d",), footprint=Box(1, 1)), "lies in 2 dimensions and the team moves in 3"),
+        (lambda: Team(("unicycle",), footprint=["box"]), "footprint of robot_0 is 'box'; give one such as Box"),
+    ],
+)
+def test_what_is_wrong_is_told(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()  # type: ignore[operator]
+
+
+def test_a_footprint_that_does_not_fit_its_start_is_told() -> None:
+    team = Team(("unicycle",) * 2, footprint=Box(1.0, 0.2))
+    Problem(team, [[0, 0, 0], [0, 0.3, 0]], [[0, 3], [3, 0.3]])
+    with pytest.raises(ValueError, match=r"starts of robot_0 .* and robot_1 .* overlap by 0.4 m; move them apart"):
+        Problem(team, [[0, 0, 0], [0, 0.2, np.pi / 2]], [[0, 3], [3, 0.3]])
+    world = World(boxes=[[0.45, -1, 2, 1]])
+    with pytest.raises(ValueError, match=r"start of robot_0 .* is 0.05 m inside an obstacle .*Box\(length=1.0"):
+        Problem(team, [[0, 0, 0], [-3, 0.3, 0]], [[0, 3], [3, 3]], world)
+
+
+def test_the_environment_goes_by_footprints() -> None:
+    team = Team(("unicycle",) * 2, footprint=Box(1.0, 0.2))
+    env = navigation_v0.parallel_env(problem=Problem(team, [[0, 0, 0], [0, 0.3, 0]], [[0, 3], [3, 0.3]]))
+    _, infos = env.reset(seed=0)
+    assert not infos["robot_0"]["collided"]
+    for _ in range(10):
+        infos = env.step({"robot_0": np.array([0, 1.5], np.float32), "robot_1": np.zeros(2, np.float32)})[-1]
+    assert infos["robot_0"]["collided"]
+    assert infos["robot_1"]["collided"]
