@@ -17,6 +17,7 @@ CONTRACT = (
     "load_problem",
     "save_problem",
     "list_scenarios",
+    "load_dynobench",
     "load_map",
     "Problem",
     "Team",
