@@ -11,6 +11,9 @@ from d4orm_env.engine.compiling import aligned_zeros
 from d4orm_env.engine.simd import BLOCK, TILE
 from d4orm_planners.engine import proximity
 from d4orm_planners.engine.proximity import bound_boxes, make_bodies, make_scratch
+from d4orm_planners.engine.sampling_types import MovingObstacles
+
+PROBLEMS = {2: make_problem("circle", num_robots=2), 3: make_problem("sphere", num_robots=2)}
 
 
 @numba.njit
@@ -20,8 +23,8 @@ def _enclose(radius, margin, dimension, places, scratch):
 
 
 @numba.njit
-def _mark(radius, margin, bodies, first, count, places, scratch):
-    proximity.mark_robots(radius, margin, bodies, first, count, places, scratch)
+def _mark(arrays, bodies, first, count, places, turns, scratch):
+    proximity.mark_robots(arrays, bodies, first, count, places, turns, scratch)
 
 
 @numba.njit
@@ -68,7 +71,10 @@ def test_whoever_is_within_the_margin_is_flagged_and_nobody_else(
     moving_radius = random.uniform(0.05, 0.3, num_bodies).astype(np.float32)
     scratch, places = make_scratch(num_robots, dimension), places_of(positions)
     _enclose(radius, margin, dimension, places, scratch)
-    _mark(radius, margin, make_bodies(moving, moving_radius, margin), first, count, places, scratch)
+    goal = np.zeros((num_robots, dimension), np.float32)
+    arrays = PROBLEMS[dimension].arrays._replace(radius=radius, margin=margin, goal=goal)
+    bodies = make_bodies(MovingObstacles(moving, moving_radius), margin)
+    _mark(arrays, bodies, first, count, places, aligned_zeros(0), scratch)
 
     steps = np.minimum(first + np.arange(BLOCK), first + count - 1)
     bodies = moving[steps].astype(np.float64).transpose(1, 0, 2)[:, :, None]
