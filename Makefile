@@ -4,10 +4,6 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
-STUDIES := ablation amswarm_gaps contact_penalty credit_by_update disturbance_study fewer_samples gradient_dilution imitate_expert lifelong \
-  multimodality multimodality_team paper_differences policy_rates scaling solve_rates tune_learners tuned_rivals warm_start
-DATA := examples/studies/data
-FIGURES := amswarm nodes noise-schedule robustness selections team-size
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
 CORE_STAMP := $(VENV)/.core-installed
@@ -53,22 +49,13 @@ lint: $(DEV_STAMP) ## Check style, formatting, types and the layers
 	$(BIN)/lint-imports
 
 docs: $(DEV_STAMP) ## Build the documentation into docs/_build/html
-	$(BIN)/sphinx-build -W --keep-going -b html docs docs/_build/html
+	$(BIN)/sphinx-build -W --keep-going -j auto -b html docs docs/_build/html
 
 bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 	$(BIN)/d4orm bench --out bench
 
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in examples/studies/data/
-	$(BIN)/python -m examples.studies.one_dimension --out docs/tables
-	$(BIN)/python -m examples.studies.tune_rivals --trials $(DATA)/tuning.parquet --out docs/tables
-	for study in $(STUDIES); do \
-	  $(BIN)/python -m examples.studies.$$study --trials $(DATA)/$$study.parquet --out docs/tables || exit 1; done
-	$(BIN)/python -m examples.studies.training_seeds --curves $(DATA)/training_curves.csv --out docs/tables
-	for figure in $(FIGURES); do \
-	  $(BIN)/python -m examples.studies.paper $$figure --trials $(DATA)/$$figure.parquet --no-times --out docs/tables || exit 1; done
-	for figure in big-teams coarseness ipopt; do \
-	  $(BIN)/python -m examples.studies.paper $$figure --trials $(DATA)/$$figure.parquet --out docs/tables || exit 1; done
-	$(BIN)/d4orm leaderboard $(DATA)/leaderboard.parquet --out docs/tables/leaderboard.md
+	$(BIN)/python -m examples.studies --out docs/tables
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .

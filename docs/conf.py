@@ -74,7 +74,7 @@ def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: boo
 
 
 def _write_replays(app: Any, config: Any) -> None:
-    """Make the replays that the pages show."""
+    """Have the replays that the pages show."""
     from replays import write_replays
 
     write_replays(HERE / "_extra" / "replays")

@@ -1,7 +1,8 @@
-"""The replays that the pages show, made anew for every build: nothing that is shown can be out of date."""
+"""The replays that the pages show, made anew when the code was changed: nothing that is shown can be out of date."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -111,8 +112,26 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
 """By name."""
 
 
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def code_digest() -> str:
+    """SHA-256 of all that a replay is made by: both packages and this file."""
+    files = [path for package in ("d4orm_env", "d4orm_planners") for path in (ROOT / package).rglob("*")]
+    digest = hashlib.sha256()
+    for path in sorted([Path(__file__).resolve(), *files]):
+        if path.is_file() and "__pycache__" not in path.parts:
+            digest.update(str(path.relative_to(ROOT)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
 def write_replays(folder: Path) -> None:
-    """Make all of them."""
+    """Make all of them, unless they are those of this code."""
+    mark, digest = folder.parent / "replays.sha256", code_digest()
+    if mark.is_file() and mark.read_text() == digest:
+        return
+    mark.unlink(missing_ok=True)
     folder.mkdir(parents=True, exist_ok=True)
     for name, make in REPLAYS.items():
         make().save(folder / f"{name}.html")
+    mark.write_text(digest)

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.core.problem import Problem
@@ -509,28 +510,68 @@ def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, plac
     parents[number] = parent
 
 
+Heap: TypeAlias = list[tuple[float, np.int64]]
+"""Nodes by the length of their paths."""
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _begin_at(lattice: Lattice, at: Place, around: int, nodes: _Nodes) -> Heap:
+    """Give the nodes so many steps around the goal straight paths."""
+    size, heap = lattice.size, [(0.0, np.int64(0)) for _ in range(0)]
+    low_i, low_j, low_k = _corner(lattice.low, lattice.step, size, at)
+    for i in range(max(0, low_i - around), min(size[0], low_i + around + 1)):
+        for j in range(max(0, low_j - around), min(size[1], low_j + around + 1)):
+            for k in range(max(0, low_k - around), min(size[2], low_k + around + 1)):
+                n = np.int64(lattice.nodes[(i * size[1] + j) * size[2] + k])
+                if n >= 0:
+                    nodes.value[n], nodes.anchor[n] = _distance(at, _place(lattice.places, n)), 0
+                    heapq.heappush(heap, (nodes.value[n], n))
+    return heap
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _pass_on(
+    space: Space,
+    lattice: Lattice,
+    reach: float,
+    nodes: _Nodes,
+    n: Whole,
+    a: Whole,
+    at: Place,
+    own: float,
+    value: float,
+    heap: Heap,
+) -> None:
+    """Give the neighbours of node ``n`` paths by its anchor ``a`` at a place of clearance ``own``, if shorter."""
+    i, j, k = _indices(lattice.size, lattice.points[n])
+    for move in range(lattice.moves.shape[0]):
+        p = _neighbour(lattice, move, i, j, k)
+        if p < 0 or nodes.done[p]:
+            continue
+        place = _place(lattice.places, p)
+        length = value + _distance(at, place)
+        # What is hidden from one that has no path yet may still be reached by going round.
+        if length >= nodes.value[p] or (nodes.hidden[p] == a and nodes.value[p] < np.inf):
+            continue
+        if nodes.tested[p] and not _sees(space, reach, at, own, place, reach):
+            nodes.hidden[p] = a
+            continue
+        nodes.value[p], nodes.anchor[p] = length, a
+        heapq.heappush(heap, (length, p))
+
+
 @cached_kernel(variant="wave", **OPTIONS)
 def _spread(
     space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _Nodes
 ) -> tuple[Floats, Floats, Ints, float]:
     """See :func:`spread`; anchors, their values and their parents, and the clearance at the goal."""
-    count, size = lattice.places.shape[0], lattice.size
     value, anchor, hidden = nodes.value, nodes.anchor, nodes.hidden
     points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
     points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
     values[0], parents[0], used = 0.0, _NOBODY, 1
     at = _place(points, 0)
     own_goal = clearance_at(space, at[0], at[1], at[2])
-    heap = [(0.0, np.int64(0)) for _ in range(0)]
-    around = 2 + int(2 * max(0.0, reach - own_goal) / lattice.step)
-    low_i, low_j, low_k = _corner(lattice.low, lattice.step, lattice.size, at)
-    for i in range(max(0, low_i - around), min(size[0], low_i + around + 1)):
-        for j in range(max(0, low_j - around), min(size[1], low_j + around + 1)):
-            for k in range(max(0, low_k - around), min(size[2], low_k + around + 1)):
-                n = np.int64(lattice.nodes[(i * size[1] + j) * size[2] + k])
-                if n >= 0:
-                    value[n], anchor[n] = _distance(at, _place(lattice.places, n)), 0
-                    heapq.heappush(heap, (value[n], n))
+    heap = _begin_at(lattice, at, 2 + int(2 * max(0.0, reach - own_goal) / lattice.step), nodes)
     while len(heap) > 0:
         length, n = heapq.heappop(heap)
         if nodes.done[n] or length != value[n]:
@@ -560,23 +601,8 @@ def _spread(
                 heapq.heappush(heap, (value[n], n))
                 continue
         nodes.done[n] = True
-        at, own = _place(points, a), _kept(a, own_goal, reach)
-        i, j, k = _indices(lattice.size, lattice.points[n])
-        for move in range(lattice.moves.shape[0]):
-            p = _neighbour(lattice, move, i, j, k)
-            if p < 0 or nodes.done[p]:
-                continue
-            place = _place(lattice.places, p)
-            length = values[a] + _distance(at, place)
-            # What is hidden from one that has no path yet may still be reached by going round.
-            if length >= value[p] or (hidden[p] == a and value[p] < np.inf):
-                continue
-            if nodes.tested[p] and not _sees(space, reach, at, own, place, reach):
-                hidden[p] = a
-                continue
-            value[p], anchor[p] = length, a
-            heapq.heappush(heap, (length, p))
-    for node in range(count):
+        _pass_on(space, lattice, reach, nodes, n, a, _place(points, a), _kept(a, own_goal, reach), values[a], heap)
+    for node in range(lattice.places.shape[0]):
         if not nodes.done[node]:
             anchor[node] = _NOBODY
     return points[:used].copy(), values[:used].copy(), parents[:used].copy(), own_goal

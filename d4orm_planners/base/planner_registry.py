@@ -8,8 +8,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, unknown
-from d4orm_env.core.registry import load_reference
-from d4orm_planners.base.import_paths import source_digest, written
+from d4orm_env.core.registry import load_reference, source_digest, written
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy, plain_attributes

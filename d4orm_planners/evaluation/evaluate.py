@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from d4orm_env.core.arrays import duration, whole_number
+from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.base.import_paths import check_sendable
 from d4orm_planners.evaluation.pool import Pool, run_here, run_jobs
 from d4orm_planners.evaluation.process_pool import ProcessPool
 from d4orm_planners.evaluation.ray_pool import RayPool

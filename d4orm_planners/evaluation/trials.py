@@ -17,10 +17,10 @@ from d4orm_env import verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import UnknownKeywordError, describe
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.registry import source_digest
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
 from d4orm_planners.base.episode import Episode, open_env, run_episode
-from d4orm_planners.base.import_paths import source_digest
 from d4orm_planners.base.machine import commit, describe_machine, versions
 from d4orm_planners.base.plan import IterationRecord, Plan
 from d4orm_planners.base.planner_registry import is_planned, make_policy, policy_settings

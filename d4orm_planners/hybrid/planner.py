@@ -19,7 +19,7 @@ from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.hybrid.settings import HybridConfig
 from d4orm_planners.mapf.beams import prepare_beams
-from d4orm_planners.mapf.improvement import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
+from d4orm_planners.mapf.motion_lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (
     MAPFConfig,
     RoadmapSolution,

@@ -6,18 +6,18 @@ turns off by some angle. After every block the most promising of the paths so fa
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import SPEED, TimeStep
+from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
@@ -26,6 +26,7 @@ from d4orm_env.engine.stepping import docking_of, models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_checks import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
+from d4orm_planners.mapf.beam import PathTree, keep_best, make_beam, trace_back
 from d4orm_planners.mapf.motion_primitives import Moves, aiming
 from d4orm_planners.tracking.tracker import tracker, velocity_step
 
@@ -82,59 +83,6 @@ class Queries(NamedTuple):
     others: OtherAgents
 
 
-class _Beam(NamedTuple):
-    """Up to ``N`` paths as far as they have come.
-
-    Attributes:
-        states: ``(N, n)``.
-        velocities: ``(N, d)``.
-        faults: ``(N,)`` robots met, block by block.
-        bounds: ``(N,)`` what they cost at least, as it seems [s].
-        before: ``(N,)`` number of the path that each goes on from: in the beam before, or ever.
-        moves: ``(N,)`` what was done in the last block.
-    """
-
-    states: FloatArray
-    velocities: FloatArray
-    faults: Floats
-    bounds: Floats
-    before: IntArray
-    moves: IntArray
-
-
-@register_jitable(nogil=True, **OPTIONS)
-def _make_beam(size: int, n: int, d: int) -> _Beam:
-    return _Beam(
-        np.empty((size, n), np.float32), np.empty((size, d), np.float32), np.empty(size), np.empty(size),
-        np.empty(size, np.int64), np.empty(size, np.int64),
-    )  # fmt: skip
-
-
-@compiled
-def _is_like_another(new: _Beam, node: Whole, kept: _Beam, size: int, dedup2: float) -> bool:
-    """Check whether a path is about where one of those kept is, about as fast."""
-    for other in range(size):
-        gap2, change2 = 0.0, 0.0
-        for axis in range(new.velocities.shape[1]):
-            gap = new.states[node, axis] - kept.states[other, axis]
-            change = new.velocities[node, axis] - kept.velocities[other, axis]
-            gap2 += gap * gap
-            change2 += change * change
-        if gap2 < dedup2 and change2 < 4 * dedup2:
-            return True
-    return False
-
-
-@compiled
-def _keep(new: _Beam, node: Whole, kept: _Beam, number: Whole) -> None:
-    for i in range(new.states.shape[1]):
-        kept.states[number, i] = new.states[node, i]
-    for axis in range(new.velocities.shape[1]):
-        kept.velocities[number, axis] = new.velocities[node, axis]
-    kept.faults[number] = new.faults[node]
-    kept.before[number], kept.moves[number] = new.before[node], new.moves[node]
-
-
 @compiled
 def _count_beside(
     table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, first: Whole, last: Whole
@@ -155,6 +103,79 @@ def _count_beside(
     return count
 
 
+@compiled
+def _count_passing(
+    table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, block: Whole, last_busy: Whole
+) -> int:
+    """Count those who come by after a block that ended at the goal, where the robot stays; ``path`` is changed."""
+    first, last = steps_of(table, block)
+    for row in range(path.shape[0]):
+        for axis in range(path.shape[1]):
+            path[row, axis] = path[last - first - 1, axis]
+    count = 0
+    for later in range(block + 1, last_busy + 1):
+        count += count_near(table, robot, others.without[r], path, steps_of(table, later)[0], later)
+    return count + _count_beside(table, robot, others, r, path, last, len(table.places))
+
+
+def _block_driver(model: Model) -> Callable[..., tuple[Row, Row, bool, float, float]]:
+    """Function that drives a robot by a move for a block: state, velocity, arrival, cost [s] and robots met."""
+    approach, velocity_of = inlined(model.functions.approach), inlined(model.functions.velocity)
+    step_towards, (aim_of, slowed) = velocity_step(model), aiming(model)
+    n, d, no_control = model.state_size, model.dimension, (ZERO,) * model.control_size
+
+    @inlined
+    def drive_block(
+        arrays: ProblemArrays, moves: Moves, number: int, states: FloatArray, faults: float, goal: FloatArray, at: Row,
+        limits: Row, docking: tuple[np.float32, np.float32, np.bool_], reach: np.float32, steps: tuple[Whole, Whole],
+        path: FloatArray,
+    ) -> tuple[Row, Row, bool, float, float]:  # fmt: skip
+        dt, closed, goal_radius = arrays.time_step, is_closed(arrays), np.sqrt(arrays.squared_goal_radius)
+        h, (first, last) = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), steps
+        state, control, at_goal = to_fixed_tuple(states, n), no_control, False
+        aim, end = aim_of(states, state, limits, goal, goal_radius, moves, number), first
+        for t in range(first, last):
+            if not transition.stands(at_goal, arrays.docks):
+                velocity = slowed(approach(state, aim, limits, h, OPS), moves.pace[number])
+                control, state, at_goal = step_towards(state, velocity, limits, at, docking, h)
+                end = t
+            for axis in range(d):
+                path[t - first, axis] = state[axis]
+            if end == t and is_unsure(arrays, path[t - first], goal):
+                faults += 1.0
+            if closed and touches_static(arrays, reach, path[t - first]):
+                faults += _TOUCH
+        velocity, cost = velocity_of(state, control, limits, OPS), end * dt[0]
+        if not at_goal:
+            rest2 = 0.0
+            for axis in range(d):
+                gap = goal[axis] - (state[axis] + _AHEAD * velocity[axis])
+                rest2 += gap * gap
+            cost = end * dt[0] + max(np.sqrt(rest2) - goal_radius, ZERO) / limits[SPEED]
+        return state, velocity, at_goal, cost, faults
+
+    return drive_block
+
+
+def _move_follower(model: Model) -> Callable[..., int]:
+    """Function that drives a robot along the moves of a path."""
+    approach, (aim_of, slowed) = inlined(model.functions.approach), aiming(model)
+
+    @inlined
+    def by_moves(
+        reference: tuple[Moves, IntArray, int, FloatArray, np.float32, FloatArray],
+        aim: Row, step: int, state: Row, at: Row, limits: Row, h: TimeStep,
+    ) -> tuple[Row, Row, bool]:  # fmt: skip
+        moves, did, begin, goal, goal_radius, states = reference
+        block = step // BLOCK - begin
+        number = did[did.shape[0] - 1 - block] if block < did.shape[0] else 0
+        if step % BLOCK == 0:
+            aim = aim_of(states[step], state, limits, goal, goal_radius, moves, number)
+        return slowed(approach(state, aim, limits, h, OPS), moves.pace[number]), aim, True
+
+    return tracker(model, by_moves)
+
+
 Search: TypeAlias = Kernel[
     [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, FloatArray, FloatArray, BoolArray], None
 ]
@@ -169,38 +190,20 @@ def search_kernel(name: str) -> Search:
     paths begin, and says in ``found`` ``(R,)`` whether a path arrives; if none does, the rest is left alone.
     """
     model = MODELS[name]
-    approach, velocity_of = inlined(model.functions.approach), inlined(model.functions.velocity)
-    step_towards, (aim_of, slowed) = velocity_step(model), aiming(model)
-    n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
-    no_control = (ZERO,) * m
-
-    @inlined
-    def by_moves(
-        reference: tuple[Moves, IntArray, int, FloatArray, np.float32, FloatArray],
-        aim: Row, step: int, state: Row, at: Row, limits: Row, h: TimeStep,
-    ) -> tuple[Row, Row, bool]:  # fmt: skip
-        moves, did, begin, goal, goal_radius, states = reference
-        block = step // BLOCK - begin
-        number = did[did.shape[0] - 1 - block] if block < did.shape[0] else 0
-        if step % BLOCK == 0:
-            aim = aim_of(states[step], state, limits, goal, goal_radius, moves, number)
-        return slowed(approach(state, aim, limits, h, OPS), moves.pace[number]), aim, True
-
-    drive = tracker(model, by_moves)
+    drive_block, follow = _block_driver(model), _move_follower(model)
+    n, d, num_limits = model.state_size, model.dimension, len(model.limit_names)
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def search(
         arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, part: IntArray,
         u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
-        dt, closed = arrays.time_step, is_closed(arrays)
-        h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
-        goal_radius = np.sqrt(arrays.squared_goal_radius)
         num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
         last_busy = min(num_blocks - 1, table.moving[0] + 1)
-        beam, new = _make_beam(width, n, d), _make_beam(width * num_moves, n, d)
-        # Of all paths ever kept: what each goes on from, and by what.
-        before, made_by = np.empty(width * num_blocks, np.int64), np.empty(width * num_blocks, np.int64)
+        beam, new = make_beam(width, n, d), make_beam(width * num_moves, n, d)
+        ever = PathTree(
+            np.empty(width * num_blocks, np.int64), np.empty(width * num_blocks, np.int64), np.empty(1, np.int64)
+        )
         numbers, did = np.empty(width, np.int64), np.empty(num_blocks, np.int64)
         path = np.empty((table.block, d), np.float32)
         for r in range(part[0], part[1]):
@@ -210,46 +213,23 @@ def search_kernel(name: str) -> Search:
             at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
             for i in range(n):
                 beam.states[0, i] = queries.states[r, i]
-            beam.faults[0], numbers[0], size, num_kept = 0.0, -1, 1, 0
+            beam.faults[0], numbers[0], size, ever.used[0] = 0.0, -1, 1, 0
             best, best_number, best_move = queries.limits[r], -1, -1
-            without = queries.others.without[r]
             for block in range(begin, num_blocks):
-                first, last = steps_of(table, block)
-                count = 0
+                steps, count = steps_of(table, block), 0
                 for node in range(size):
                     for number in range(num_moves):
-                        state, control, at_goal = to_fixed_tuple(beam.states[node], n), no_control, False
-                        aim = aim_of(beam.states[node], state, limits, goal, goal_radius, moves, number)
-                        faults, end = beam.faults[node], first
-                        for t in range(first, last):
-                            if not transition.stands(at_goal, arrays.docks):
-                                velocity = slowed(approach(state, aim, limits, h, OPS), moves.pace[number])
-                                control, state, at_goal = step_towards(state, velocity, limits, at, docking, h)
-                                end = t
-                            for axis in range(d):
-                                path[t - first, axis] = state[axis]
-                            if end == t and is_unsure(arrays, path[t - first], goal):
-                                faults += 1.0
-                            if closed and touches_static(arrays, reach, path[t - first]):
-                                faults += _TOUCH
-                        velocity, cost = velocity_of(state, control, limits, OPS), end * dt[0]
-                        if not at_goal:
-                            rest2 = 0.0
-                            for axis in range(d):
-                                gap = goal[axis] - (state[axis] + _AHEAD * velocity[axis])
-                                rest2 += gap * gap
-                            cost = end * dt[0] + max(np.sqrt(rest2) - goal_radius, ZERO) / limits[SPEED]
+                        state, velocity, at_goal, cost, faults = drive_block(
+                            arrays, moves, number, beam.states[node], beam.faults[node], goal, at, limits, docking,
+                            reach, steps, path,
+                        )  # fmt: skip
                         if rules.contact * faults + cost >= best:
                             continue
-                        faults += count_near(table, robot, without, path, first, block)
-                        faults += _count_beside(table, robot, queries.others, r, path, first, last)
+                        faults += count_near(table, robot, queries.others.without[r], path, steps[0], block)
+                        faults += _count_beside(table, robot, queries.others, r, path, steps[0], steps[1])
                         if at_goal:
                             # It stays there: whoever comes by later counts too.
-                            for axis in range(d):
-                                path[:, axis] = state[axis]
-                            for later in range(block + 1, last_busy + 1):
-                                faults += count_near(table, robot, without, path, steps_of(table, later)[0], later)
-                            faults += _count_beside(table, robot, queries.others, r, path, last, len(table.places))
+                            faults += _count_passing(table, robot, queries.others, r, path, block, last_busy)
                             if rules.contact * faults + cost < best:
                                 best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
                             continue
@@ -260,27 +240,18 @@ def search_kernel(name: str) -> Search:
                         new.bounds[count] = rules.contact * faults + cost
                         new.faults[count], new.before[count], new.moves[count] = faults, numbers[node], number
                         count += 1
-                size = 0
-                for node in np.argsort(new.bounds[:count], kind="mergesort"):
-                    if size == width or new.bounds[node] >= best:
-                        break
-                    if not _is_like_another(new, node, beam, size, rules.dedup_distance * rules.dedup_distance):
-                        _keep(new, node, beam, size)
-                        before[num_kept], made_by[num_kept], numbers[size] = new.before[node], new.moves[node], num_kept
-                        size, num_kept = size + 1, num_kept + 1
+                dedup2 = rules.dedup_distance * rules.dedup_distance
+                size = keep_best(new, count, beam, numbers, best, dedup2, ever)
                 if size == 0:
                     break
             found[r] = best_move >= 0
-            if not found[r]:
-                continue
-            # What it did, from the last block to the first.
-            did[0], length = best_move, 1
-            while best_number >= 0:
-                did[length], best_number, length = made_by[best_number], before[best_number], length + 1
-            state, start = to_fixed_tuple(queries.states[r], n), begin * BLOCK
-            for i in range(n):
-                x[r, start, i] = state[i]
-            reference = (moves, did[:length], begin, goal, goal_radius, x[r])
-            drive(arrays, robot, reference, at, start, state, False, u[r], x[r])
+            if found[r]:
+                length = trace_back(ever, best_number, best_move, did)
+                state, start = to_fixed_tuple(queries.states[r], n), begin * BLOCK
+                for i in range(n):
+                    x[r, start, i] = state[i]
+                goal_radius = np.sqrt(arrays.squared_goal_radius)
+                reference = (moves, did[:length], begin, goal, goal_radius, x[r])
+                follow(arrays, robot, reference, at, start, state, False, u[r], x[r])
 
     return search

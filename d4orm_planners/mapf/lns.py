@@ -1,162 +1,88 @@
-"""Large-neighbourhood search: a few robots at a time find faster paths around all others, under their own dynamics.
+"""Large-neighbourhood search: some robots at a time, one that is late and those near to it, look for better paths.
 
-What is worse is accepted as in simulated annealing.
+As in MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021). Low-level planners find the
+paths: on a roadmap (:mod:`~d4orm_planners.mapf.roadmap_team`) and under the robots' dynamics
+(:mod:`~d4orm_planners.mapf.motion_lns`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
-from d4orm_env.core.metrics import arrival_steps
-from d4orm_env.core.portable import log
-from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.engine.path_table import BLOCK
-from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
-from d4orm_planners.mapf.beams import find_paths
-from d4orm_planners.mapf.motion_primitives import MotionPrimitives
-from d4orm_planners.mapf.neighbourhoods import draw_neighbourhood
-from d4orm_planners.tracking.steering import straight_drives
+
+S_co = TypeVar("S_co", covariant=True)
 
 
-@dataclass(frozen=True)
-class NeighbourhoodRules:
-    """The numbers of the search.
+class Odds(NamedTuple):
+    """Chances of robots to be drawn for a neighbourhood.
 
     Attributes:
-        groups: Groups of robots that look for paths at the same time, not minding each other: so that all cores have
-            work. What one finds is taken over only if it fits what those before it have found.
-        size: Robots in a group, at most.
-        give: Delay that a robot of a group may accept for the sake of those after it [s].
-        temperature: Worsening at which a group's paths are still accepted, on average and at first [s].
-        least_delay: A robot that arrives as soon as alone is chosen as often as one so much later [s].
-        nearness: Random distance by which a robot may be farther away and still be chosen for a group, in radii of the
-            largest robot.
-        angles: By which robots turn off [degrees], all times the same number, ...
-        scales: ... which is between these and drawn for every round.
-        paces: Shares of their speed with which they head for their goals.
-        width: Paths that a search keeps after each block of steps.
-        dedup_distance: Least distance between kept paths, in the same radii, or else twice as much in speed [1/s].
-        contact: Cost of meeting another robot [s]: too much.
+        delay: ``(K,)`` chance of each to be the late one, in any unit.
+        places: ``(T + 1, K, d)`` [m].
+        until: ``(K,)`` the last step of each at which it may come near to others.
+        nearness: Random distance by which a robot may be farther away and still be chosen [m].
+        sizes: The least and the greatest number of robots.
     """
 
-    groups: int = 8
-    size: int = 2
-    give: float = 0.5
-    temperature: float = 0.05
-    least_delay: float = 0.02
-    nearness: float = 20 / 3
-    angles: tuple[float, ...] = (10.0, 20.0, 35.0, 60.0, 100.0)
-    scales: tuple[float, float] = (0.4, 1.6)
-    paces: tuple[float, ...] = (1.0, 0.7, 0.35, 0.0)
-    width: int = 32
-    dedup_distance: float = 2 / 3
-    contact: float = 1e6
+    delay: Floats
+    places: FloatArray | Floats
+    until: IntArray
+    nearness: float
+    sizes: tuple[int, int]
+
+    def draw(self, random: np.random.Generator) -> IntArray:
+        """A robot that is late, and some that it comes near to, in random order."""
+        robot = int(random.choice(len(self.delay), p=self.delay / self.delay.sum()))
+        places = self.places[: self.until[robot] + 1]
+        gaps = np.sqrt(((places - places[:, [robot]]) ** 2).sum(axis=2).min(axis=0))
+        gaps += self.nearness * random.random(len(self.delay))
+        gaps[robot] = -1.0
+        return random.permutation(np.argsort(gaps, kind="stable")[: random.integers(*self.sizes, endpoint=True)])
 
 
-RULES = NeighbourhoodRules()
+class LowLevelPlanner(Protocol[S_co]):
+    """A solution, and the search for other paths in it.
 
-
-def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float = RULES.temperature) -> FloatArray:
-    """Let groups of robots look for faster paths, so many rounds, as long as there is time.
-
-    What counts is the sum of all arrival times and of all distances left over time, each as a share of the robot's
-    first: the first is what travel takes, the second what the reward is made of.
-
-    Args:
-        team: A team in which none fails; changed.
-        seed: Of what is tried.
-        rounds: Number of rounds of :attr:`NeighbourhoodRules.groups` groups.
-        temperature: See :attr:`NeighbourhoodRules.temperature`; it falls to zero with the rounds.
-
-    Returns:
-        ``(H, K, m)`` controls of the best that there has been; at a temperature of zero that is what the team does.
+    Attributes:
+        groups: Neighbourhoods that are replanned in a round.
+        solution: The solution as it is now, which later rounds do not change.
+        cost: What it costs; can be compared.
+        odds: Chances of the robots.
+        replan: Finds other paths for groups, and accepts what is better, or at this temperature a little worse.
     """
-    search = _Neighbourhoods(team, np.random.default_rng(seed))
-    best, least = team.controls.copy(), search.cost
-    for number in range(rounds):
-        if team.search.should_stop():
-            break
-        search.run(temperature * (1 - number / rounds))
-        if search.cost < least:
-            best, least = team.controls.copy(), search.cost
-    return best
 
-
-class _Neighbourhoods:
-    """Groups of robots that look for faster paths."""
-
-    def __init__(self, team: WorkingPlan, random: np.random.Generator) -> None:
-        self.team, self.problem, self.random = team, team.problem, random
-        self.num_robots, self.size = self.problem.num_robots, min(RULES.size, self.problem.num_robots)
-        start = self.problem.start[:, : self.problem.dimension]
-        self.distance = np.linalg.norm(self.problem.goal - start, axis=1)
-        everybody, straight = np.arange(self.num_robots), straight_drives(self.problem)
-        self.soonest, _ = self.costs(everybody, straight.positions[:, :, 0])
-        self.arrival, self.lag = self.costs(everybody, team.states[..., : self.problem.dimension])
+    groups: int
 
     @property
-    def cost(self) -> float:
-        """Sum of all costs [s]."""
-        return float((self.arrival + self.lag).sum())
+    def solution(self) -> S_co: ...
+    @property
+    def cost(self) -> Any: ...
+    def odds(self, random: np.random.Generator) -> Odds: ...
+    def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None: ...
 
-    def costs(self, robots: IntArray, places: FloatArray) -> tuple[Floats, Floats]:
-        """``(R,)`` arrival times of robots at places ``(H+1, R, d)``, and their distances left over time [s]."""
-        still = (places[1:] == places[:-1]).all(axis=2)
-        gap = np.linalg.norm(places[1:] - self.problem.goal[robots], axis=2).sum(axis=0, dtype=np.float64)
-        lag: Floats = self.problem.dt * gap / np.maximum(self.distance[robots], self.problem.goal_radius)
-        # Who does not move from one step to the next has arrived by the first of the two.
-        return self.problem.dt * arrival_steps(np.concatenate([still, np.ones_like(still[:1])])).astype(float), lag
 
-    def run(self, temperature: float) -> None:
-        """One round."""
-        delay = np.maximum(self.arrival - self.soonest, RULES.least_delay)
-        until, nearness = np.full(len(delay), self.problem.horizon), RULES.nearness * self.problem.team.largest_radius
-        drawn = self.random, delay, self.team.positions, until, nearness, (self.size, self.size)
-        groups = np.stack([draw_neighbourhood(*drawn) for _ in range(RULES.groups)])
-        # Exponential, by a logarithm that is the same everywhere.
-        slack = -temperature * log(1 - self.random.random(len(groups)))
-        blocks = self.random.integers(0, 2, len(groups)) * self.arrival[groups[:, 0]] / self.problem.dt // BLOCK
-        blocks = (blocks * self.random.random(len(groups))).astype(np.int64)
-        primitives = MotionPrimitives(tuple(np.array(RULES.angles) * self.random.uniform(*RULES.scales)), RULES.paces)
-        found = np.ones(len(groups), bool)
-        controls = np.zeros((self.problem.horizon, *groups.shape, self.problem.control_size), np.float32)
-        states = np.zeros((self.problem.horizon + 1, *groups.shape, self.problem.state_size), np.float32)
-        # Those of a group one after another, those of all groups at the same time.
-        budget = self.arrival[groups].sum(axis=1) + slack + self.problem.dt / 2
-        for member in range(groups.shape[1]):
-            robots, left = groups[found, member], groups[found, member + 1 :]
-            if not len(robots):
-                return
-            limits = budget[found] - self.soonest[left].sum(axis=1)
-            if left.shape[1]:
-                limits = np.minimum(limits, self.arrival[robots] + RULES.give)
-            before = groups[found, :member]
-            others = OtherAgents(
-                groups[found],
-                np.ascontiguousarray(np.moveaxis(states[:, found, :member, : self.problem.dimension], 0, 2)),
-                np.asarray(self.problem.team.radius, np.float64)[before],
-            )
-            rules = BeamRules(RULES.width, RULES.contact, RULES.dedup_distance * self.problem.team.largest_radius)
-            paths = find_paths(self.team, robots, blocks[found], primitives, rules, limits, others)
-            controls[:, found, member], states[:, found, member] = paths.controls[:, :, 0], paths.states[:, :, 0]
-            budget[found] -= self.costs(robots, paths.positions[:, :, 0])[0]
-            found[found] = paths.arrived[:, 0]
-        for number in np.flatnonzero(found):
-            self.take_over(groups[number], controls[:, number], states[:, number], slack[number])
+def search_neighbourhoods(
+    planner: LowLevelPlanner[S_co],
+    random: np.random.Generator,
+    rounds: int,
+    should_stop: Callable[[], bool],
+    temperature: float = 0.0,
+) -> S_co:
+    """Replan neighbourhoods, so many rounds, as long as there is time; return the best solution that there has been.
 
-    def take_over(self, robots: IntArray, controls: FloatArray, states: FloatArray, slack: float) -> None:
-        """Let robots ``(R,)`` do as they found, if it fits what the others do and costs no more than so much [s]."""
-        arrival, lag = self.costs(robots, states[..., : self.problem.dimension])
-        before = (self.arrival[robots] + self.lag[robots]).sum()
-        if (arrival + lag).sum() >= before + slack - 1e-4:
-            return
-        team = self.team
-        present = team.controls[:, robots], team.states[:, robots], team.arrived[robots]
-        team.move(robots, controls, states, np.ones(len(robots), bool))
-        if team.faults(robots)[0].any():
-            team.move(robots, *present)
-        else:
-            self.arrival[robots], self.lag[robots] = arrival, lag
+    What is worse is accepted as in simulated annealing, at a temperature that falls to zero with the rounds.
+    """
+    best, least = planner.solution, planner.cost
+    for number in range(rounds):
+        if should_stop():
+            break
+        odds = planner.odds(random)
+        groups = [odds.draw(random) for _ in range(planner.groups)]
+        planner.replan(groups, random, temperature * (1 - number / rounds))
+        if planner.cost < least:
+            best, least = planner.solution, planner.cost
+    return best

@@ -15,9 +15,10 @@ from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
+from d4orm_planners.mapf.lns import search_neighbourhoods
 from d4orm_planners.mapf.pibt import fill_costs
 from d4orm_planners.mapf.roadmap import lay_roadmap
-from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves, is_compiled
+from d4orm_planners.mapf.roadmap_team import Replanning, RoadmapPaths, TeamRollout, drive_moves, is_compiled
 
 if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap import Roadmap
@@ -127,13 +128,9 @@ def improve_roadmap_solution(
     search: SolveRun, guide: RoadmapSolution, neighbours: int, replannings: int
 ) -> RoadmapSolution:
     """Replan so many groups of at most so many robots; what is no better for all together is left."""
-    random, driven = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), guide.driven
-    for _ in range(replannings):
-        if search.should_stop():
-            break
-        robots = guide.replanning.neighbours(driven, random, neighbours)
-        driven = guide.replanning.better(driven, robots, random, search.should_stop) or driven
-    return replace(guide, driven=driven)
+    paths = RoadmapPaths(guide.replanning, guide.driven, neighbours, search.should_stop)
+    random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
+    return replace(guide, driven=search_neighbourhoods(paths, random, replannings, search.should_stop))
 
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:

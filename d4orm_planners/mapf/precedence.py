@@ -16,7 +16,7 @@ import numpy as np
 from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS
+from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.mapf.near_neighbours import Cells, cells_about, items_in, sort_into_cells
 from d4orm_planners.mapf.roadmap import Roadmap
 from d4orm_planners.tracking.routes import Corners, Route, Routes
@@ -188,6 +188,50 @@ def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, le
         room = count
 
 
+@compiled
+def _find_touched(
+    cells: Cells,
+    a: int,
+    k: int,
+    first: IntArray,
+    owner: IntArray,
+    times: Floats,
+    radius: Floats,
+    margin: float,
+    reach: float,
+    passed: IntArray,
+    wanted: IntArray,
+    touched: IntArray,
+) -> int:
+    """Find whose earlier points are too near to point ``a`` of robot ``k``.
+
+    ``touched`` lists these robots, ``wanted`` says how far each of them has to have come; those that have ``passed``
+    as far already are left out. ``reach`` is the greatest distance that may be too near [m].
+
+    Returns:
+        How many they are.
+    """
+    points, count = cells.points, 0
+    (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], reach)
+    for ci in range(low_i, high_i):
+        for cj in range(low_j, high_j):
+            begin, end = items_in(cells, ci, cj, low_k, high_k)
+            for number in range(begin, end):
+                b = cells.items[number]
+                j = owner[b]
+                until = b - first[j] + 1
+                if j == k or times[b] >= times[a] or until <= passed[j] or until <= wanted[j]:
+                    continue
+                near = radius[k] + radius[j] + margin
+                dx, dy, dz = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1], points[a, 2] - points[b, 2]
+                if dx * dx + dy * dy + dz * dz < near * near:
+                    if wanted[j] == 0:
+                        touched[count] = j
+                        count += 1
+                    wanted[j] = until
+    return count
+
+
 @cached_kernel(variant="waits", **OPTIONS)
 def find_waits(
     cells: Cells,
@@ -207,8 +251,7 @@ def find_waits(
     Returns:
         How many waits there are; as many as there is room for are written.
     """
-    points, count, num_robots = cells.points, 0, first.shape[0] - 1
-    reach = 2.0 * radius.max() + margin
+    count, num_robots, reach = 0, first.shape[0] - 1, 2.0 * radius.max() + margin
     passed = np.zeros(num_robots, np.int64)
     wanted = np.zeros(num_robots, np.int64)
     touched = np.zeros(num_robots, np.int64)
@@ -216,27 +259,9 @@ def find_waits(
         wait_first[k] = count
         passed[:] = 0
         for a in range(first[k], first[k + 1]):
-            num_touched = 0
-            (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], reach)
-            for ci in range(low_i, high_i):
-                for cj in range(low_j, high_j):
-                    begin, end = items_in(cells, ci, cj, low_k, high_k)
-                    for number in range(begin, end):
-                        b = cells.items[number]
-                        j = owner[b]
-                        if j == k or times[b] >= times[a]:
-                            continue
-                        until = b - first[j] + 1
-                        if until <= passed[j] or until <= wanted[j]:
-                            continue
-                        near = radius[k] + radius[j] + margin
-                        dx, dy = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
-                        dz = points[a, 2] - points[b, 2]
-                        if dx * dx + dy * dy + dz * dz < near * near:
-                            if wanted[j] == 0:
-                                touched[num_touched] = j
-                                num_touched += 1
-                            wanted[j] = until
+            num_touched = _find_touched(
+                cells, a, k, first, owner, times, radius, margin, reach, passed, wanted, touched
+            )
             for number in range(num_touched):
                 j = touched[number]
                 # Where it is at that time it is out of the way, however near that is.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from d4orm_env.core.arrays import Floats, IntArray, Whole
+from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.wavefront import Space, is_free_line
@@ -16,7 +16,7 @@ from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import Cells
 from d4orm_planners.mapf.pibt import Footprints
 from d4orm_planners.mapf.roadmap import Roadmap
-from d4orm_planners.mapf.safe_intervals import Others, find_visits, free_intervals, interval_at
+from d4orm_planners.mapf.safe_intervals import Intervals, Others, find_visits, free_intervals, interval_at
 
 BLOCK = 16
 """Steps for which it is known at once whether a robot is about."""
@@ -138,9 +138,9 @@ class Trip(NamedTuple):
     """
 
     stride: float
-    launch: float
+    launch: Whole
     latest: int
-    dwell: int
+    dwell: Whole
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -155,6 +155,67 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
         found[count, 0], found[count, 1], found[count, 2] = tree[walk, 0], tree[walk, 1], tree[walk, 2]
         walk = tree[walk, 3]
     return found
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _last_passage(others: Others, k: Whole, place: Floats) -> int:
+    """The last step at which another comes too near to a place; -1 if none does."""
+    step = others.positions.shape[0] - 1
+    while step >= 0 and _is_clear(others, k, step, place[0], place[1], place[2]):
+        step -= 1
+    return step
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _departure(
+    safe: Intervals,
+    came: Ints,
+    tree: IntArray,
+    entry: Whole,
+    head: Whole,
+    steps: Whole,
+    left: float,
+    trip: Trip,
+    dock: Whole,
+    depart: Whole,
+) -> tuple[Whole, Whole, Whole]:
+    """The next departure from an entry of the tree that comes to a safe interval before all others.
+
+    Args:
+        safe: The safe intervals.
+        came: Entry of the tree that comes first to each of them.
+        tree: Nodes, departures, arrivals, entries before and intervals.
+        entry: The entry.
+        head: Node to drive to.
+        steps: Steps that it takes.
+        left: Steps from there to the goal, at least.
+        trip: The motion; the dwell of goals only.
+        dock: Step until which it must not arrive.
+        depart: Earliest departure.
+
+    Returns:
+        Departure, arrival and interval, or -1 for the interval if there is none.
+    """
+    while depart < safe.ends[tree[entry, 4]]:
+        lost = trip.launch if depart > tree[entry, 2] or tree[entry, 3] < 0 else 0
+        until = depart + steps + lost
+        if until + left > trip.latest:
+            break
+        there = interval_at(safe, head, until)
+        if there == safe.first[head + 1]:
+            break
+        before = came[there]
+        if safe.begins[there] > until:
+            depart += safe.begins[there] - until
+        elif before >= 0 and tree[before, 2] <= until:
+            depart += safe.ends[there] - until
+        elif until <= dock:
+            depart += 1
+        elif safe.ends[there] < min(until + trip.dwell, trip.latest):
+            depart += 1 + safe.ends[there] - until
+        else:
+            return depart, until, np.int64(there)
+    return depart, depart, np.int64(-1)
 
 
 @cached_kernel(variant="path", **OPTIONS)
@@ -175,36 +236,31 @@ def find_path(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no path.
     """
     goal, start, nodes, costs = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes, bodies.costs[k]
-    stride, latest = trip.stride, trip.latest
     # Nobody may come near its goal once it stands there for good.
-    dock = others.positions.shape[0] - 1 if trip.dwell < 0 else -1
-    while dock >= 0 and _is_clear(others, k, dock, nodes[goal, 0], nodes[goal, 1], nodes[goal, 2]):
-        dock -= 1
-    boxes = np.empty((latest // BLOCK + 2, others.positions.shape[1], 6))
+    dock = _last_passage(others, k, nodes[goal]) if trip.dwell < 0 else np.int64(-1)
+    boxes = np.empty((trip.latest // BLOCK + 2, others.positions.shape[1], 6))
     _fill_boxes(others, boxes)
-    visits, last = find_visits(cells, others, k, latest + 1)
-    safe = free_intervals(visits, last, start, latest + 1)
+    visits, last = find_visits(cells, others, k, trip.latest + 1)
+    safe = free_intervals(visits, last, start, trip.latest + 1)
     # The entry of ``tree`` that comes first to each interval.
     came = np.full(safe.begins.shape[0], -1, np.int32)
     aside = (bodies.docked + bodies.slack / 2) ** 2
     tree = np.empty((1024, 5), np.int64)
     tree[0, 0], tree[0, 1], tree[0, 2], tree[0, 3], tree[0, 4] = start, 0, 0, -1, safe.first[start]
-    used = 1
+    used, passing = 1, Trip(trip.stride, trip.launch, trip.latest, np.int64(-1))
     came[safe.first[start]] = 0
-    heap = [(np.float64(costs[start]) / stride, np.int64(0))]
+    heap = [(np.float64(costs[start]) / trip.stride, np.int64(0))]
     while len(heap) > 0:
         _, entry = heapq.heappop(heap)
-        node, arrived, interval = tree[entry, 0], tree[entry, 2], tree[entry, 4]
-        if came[interval] != entry:
+        node = tree[entry, 0]
+        if came[tree[entry, 4]] != entry:
             continue
-        if node == goal and arrived > dock:
+        if node == goal and tree[entry, 2] > dock:
             return _followed_back(tree, entry)
         if node == goal and bodies.docks:
             continue
-        tail = nodes[node]
         for e in range(roadmap.first[node], roadmap.first[node + 1]):
             head = np.int64(roadmap.heads[e])
-            left = costs[head] / stride
             if roadmap.room[e] < bodies.reach[k] or not costs[head] < np.inf:
                 continue
             if (
@@ -213,37 +269,24 @@ def find_path(roadmap: Roadmap, cells: Cells, bodies: Footprints, others: Others
                 and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside
             ):
                 continue
-            steps, depart, failures = np.int64(np.ceil(roadmap.lengths[e] / stride)), arrived, 0
-            while depart < safe.ends[interval]:
-                lost = trip.launch if depart > arrived or tree[entry, 3] < 0 else 0
-                until = depart + steps + lost
-                if until + left > latest:
+            left, steps = costs[head] / trip.stride, np.int64(np.ceil(roadmap.lengths[e] / trip.stride))
+            motion = trip if head == goal else passing
+            bound = dock if head == goal and bodies.docks else np.int64(-1)
+            depart: Whole = tree[entry, 2]
+            failures = 0
+            while True:
+                depart, until, there = _departure(safe, came, tree, entry, head, steps, left, motion, bound, depart)
+                if there < 0:
                     break
-                there = interval_at(safe, head, until)
-                if there == safe.first[head + 1]:
-                    break
-                if safe.begins[there] > until:
-                    depart += safe.begins[there] - until
-                    continue
-                before = came[there]
-                if before >= 0 and tree[before, 2] <= until:
-                    depart += safe.ends[there] - until
-                    continue
-                depart += 1
-                if head == goal and bodies.docks and until <= dock:
-                    continue
-                if head == goal and safe.ends[there] < min(until + trip.dwell, latest):
-                    depart += safe.ends[there] - until
-                    continue
-                if not _is_line_free(others, boxes, k, tail, nodes[head], depart - 1, until):
+                if not _is_line_free(others, boxes, k, nodes[node], nodes[head], depart, until):
                     # Whoever stands in the way often does so for long.
                     failures += 1
-                    depart += failures // 4
+                    depart += 1 + failures // 4
                     continue
                 if used == tree.shape[0]:
                     tree = np.concatenate((tree, np.empty((used, 5), np.int64)))
-                tree[used, 0], tree[used, 1], tree[used, 2] = head, until - steps - lost, until
+                tree[used, 0], tree[used, 1], tree[used, 2] = head, depart, until
                 tree[used, 3], tree[used, 4], came[there] = entry, there, used
                 heapq.heappush(heap, (until + left, np.int64(used)))
-                used += 1
+                used, depart = used + 1, depart + 1
     return np.empty((0, 3), np.int64)

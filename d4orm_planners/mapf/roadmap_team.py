@@ -15,8 +15,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.paths.wavefront import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
+from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
-from d4orm_planners.mapf.neighbourhoods import draw_neighbourhood
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path, straighten, touches
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
@@ -121,19 +121,10 @@ class Replanning:
         self.own_room = ends.min(axis=0) - TOUCH * self.size
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
-    def neighbours(self, driven: TeamRollout, random: np.random.Generator, most: int) -> IntArray:
-        """Some robots to replan together, in random order: one that is much delayed, and those it drove nearest to."""
-        delay = np.maximum(driven.arrivals - self.alone, 1.0)
-        late = driven.arrivals > self.problem.horizon
-        if late.any() and random.random() < 0.5:
-            delay[~late] = 0.0
-        sizes = (1, min(len(delay), most))
-        return draw_neighbourhood(random, delay, driven.places, driven.arrivals, NEARNESS * self.size, sizes)
-
-    def better(
+    def replan(
         self, driven: TeamRollout, robots: IntArray, random: np.random.Generator, should_stop: Callable[[], bool]
     ) -> TeamRollout | None:
-        """The team with new paths for some robots, in their order, if that is better for all together, and in time."""
+        """The team with new paths for some robots, planned in their order; ``None`` if one finds none, or in time."""
         last = int(driven.arrivals.max())
         changed = TeamRollout(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
         changed.places[:, robots] = FAR
@@ -141,7 +132,7 @@ class Replanning:
         for robot in robots.tolist():
             if should_stop() or not self.replan_one(changed, robot, int(latest[robot]), random):
                 return None
-        return changed if changed.cost(self.problem.horizon) < driven.cost(self.problem.horizon) else None
+        return changed
 
     def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> TeamRollout | None:
         """The team, its paths planned one by one; a robot that finds none displaces others, whose turn comes again.
@@ -247,6 +238,46 @@ class Replanning:
             return True
         room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
         return bool(room.min() > min(self.bodies.reach[robot] + TOUCH * self.size, self.own_room[robot]))
+
+
+@dataclass
+class RoadmapPaths:
+    """Low-level planner of :func:`~d4orm_planners.mapf.lns.search_neighbourhoods`: paths in space and time.
+
+    Attributes:
+        replanning: Search for paths.
+        solution: Rollout of the team.
+        most: Robots that are replanned together, at most.
+        should_stop: Asked before every path.
+    """
+
+    replanning: Replanning
+    solution: TeamRollout
+    most: int
+    should_stop: Callable[[], bool]
+    groups: int = 1
+
+    @property
+    def cost(self) -> tuple[int, int]:
+        """See :meth:`TeamRollout.cost`."""
+        return self.solution.cost(self.replanning.problem.horizon)
+
+    def odds(self, random: np.random.Generator) -> Odds:
+        """See :meth:`LowLevelPlanner.odds`: often one of those that come too late."""
+        driven, replanning = self.solution, self.replanning
+        delay = np.maximum(driven.arrivals - replanning.alone, 1.0)
+        late = driven.arrivals > replanning.problem.horizon
+        if late.any() and random.random() < 0.5:
+            delay[~late] = 0.0
+        sizes = (1, min(len(delay), self.most))
+        return Odds(delay, driven.places, driven.arrivals, NEARNESS * replanning.size, sizes)
+
+    def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
+        """See :meth:`LowLevelPlanner.replan`; what is worse is never accepted."""
+        for robots in groups:
+            changed = self.replanning.replan(self.solution, robots, random, self.should_stop)
+            if changed is not None and changed.cost(self.replanning.problem.horizon) < self.cost:
+                self.solution = changed
 
 
 def is_compiled(problem: Problem) -> bool:

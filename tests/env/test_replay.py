@@ -106,11 +106,24 @@ def test_rounding_is_to_a_65535th_of_the_range(values: np.ndarray) -> None:
     assert (np.abs(back - values) <= 0.51 * span / 65535 + 1e-9).all()
 
 
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
 def test_the_replays_that_the_pages_show_are_made() -> None:
-    docs = Path(__file__).resolve().parents[2] / "docs"
-    made = runpy.run_path(str(docs / "replays.py"))["REPLAYS"]
-    shown = {name for page in docs.rglob("*.md") for name in re.findall(r"replays/(\w+)\.html", page.read_text())}
+    made = runpy.run_path(str(DOCS / "replays.py"))["REPLAYS"]
+    shown = {name for page in DOCS.rglob("*.md") for name in re.findall(r"replays/(\w+)\.html", page.read_text())}
     assert shown == set(made)
+
+
+def test_the_pages_replays_are_made_anew_when_the_code_was_changed(tmp_path: Path, plan: Plan) -> None:
+    write = runpy.run_path(str(DOCS / "replays.py"))["write_replays"]
+    made = []
+    write.__globals__["REPLAYS"] = {"one": lambda: made.append(digest) or plan.animate()}
+    for digest in ("a", "a", "b"):
+        write.__globals__["code_digest"] = lambda digest=digest: digest
+        write(tmp_path / "replays")
+    assert made == ["a", "b"]
+    assert (tmp_path / "replays" / "one.html").is_file()
 
 
 def test_a_replay_of_nothing_is_refused() -> None:

@@ -17,11 +17,12 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.lacam import TeamMoves, find_moves
+from d4orm_planners.mapf.lns import search_neighbourhoods
 from d4orm_planners.mapf.planner import needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
-from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
+from d4orm_planners.mapf.roadmap_team import Replanning, RoadmapPaths, TeamRollout, drive_moves
 from d4orm_planners.mapf.safe_intervals import Others
 from d4orm_planners.tracking.pursuit import gear_towards
 from d4orm_planners.tracking.routes import Corners
@@ -290,14 +291,14 @@ def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
     problem = make_problem("rooms", num_robots=8, seed=0)
     roadmap, moves = found(problem, 1.25)
     driven, random = drive_moves(problem, roadmap, moves.moves), np.random.default_rng(0)
-    replanning, kept = Replanning(problem, roadmap), 0
+    paths, kept = RoadmapPaths(Replanning(problem, roadmap), driven, 4, lambda: False), 0
     for _ in range(20):
-        better = replanning.better(driven, replanning.neighbours(driven, random, 4), random, lambda: False)
-        if better is not None:
-            assert better.cost(problem.horizon) < driven.cost(problem.horizon)
-            driven, kept = better, kept + 1
+        before, cost = paths.solution, paths.cost
+        assert search_neighbourhoods(paths, random, 1, paths.should_stop) is paths.solution
+        assert paths.cost < cost if paths.solution is not before else paths.cost == cost
+        kept += paths.solution is not before
     assert kept > 0
-    assert verify(problem, driven.until(problem.horizon)).ok
+    assert verify(problem, paths.solution.until(problem.horizon)).ok
 
 
 def test_paths_one_by_one_displace_those_in_the_way() -> None:

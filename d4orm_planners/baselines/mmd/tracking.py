@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import TimeStep
+from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
@@ -44,13 +45,9 @@ class TrackedMotions(NamedTuple):
     clearances: Floats
 
 
-@cache
-def motion_kernel(
-    name: str,
-) -> Kernel[[ProblemArrays, int, PathFrame, Floats, Floats, Space, Floats, FloatArray, TrackedMotions], None]:
-    """The compiled drives of a robot of the model with this name; see :func:`drive_motions`."""
-    model = MODELS[name]
-    approach, n, d = inlined(model.functions.approach), model.state_size, model.dimension
+def _motion_follower(model: Model) -> Callable[..., int]:
+    """Function that drives a robot along a motion by its clock."""
+    approach, d = inlined(model.functions.approach), model.dimension
 
     @inlined
     def by_motion(
@@ -75,7 +72,16 @@ def motion_kernel(
             wanted[axis] = pace + GAIN * (error - pace * dt)
         return to_fixed_tuple(wanted, d), i, True
 
-    drive = tracker(model, by_motion)
+    return tracker(model, by_motion)
+
+
+@cache
+def motion_kernel(
+    name: str,
+) -> Kernel[[ProblemArrays, int, PathFrame, Floats, Floats, Space, Floats, FloatArray, TrackedMotions], None]:
+    """The compiled drives of a robot of the model with this name; see :func:`drive_motions`."""
+    model = MODELS[name]
+    follow, n, d = _motion_follower(model), model.state_size, model.dimension
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive_motion(
@@ -88,17 +94,8 @@ def motion_kernel(
         for b in range(motions.shape[0]):
             trace(frame, frame.axes[b % frame.axes.shape[0]], sines, deviation, motions[b], spot, points)
             fill_clock(points, durations[b], frame.speed, frame.acceleration, paces, times)
-            driven.arrivals[b] = drive(
-                arrays,
-                robot,
-                (points, times, arrays.time_step[0], wanted),
-                0,
-                0,
-                start,
-                False,
-                driven.controls[b],
-                states[b],
-            )
+            reference = (points, times, arrays.time_step[0], wanted)
+            driven.arrivals[b] = follow(arrays, robot, reference, 0, 0, start, False, driven.controls[b], states[b])
             places, least = driven.places[b], np.inf
             places[:] = 0.0
             places[0, :d] = arrays.start[robot, :d]

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from d4orm_env import __version__, navigation_v0
 from d4orm_env.core.arrays import shown, whole_number
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.registry import source_digest
 from d4orm_env.disturbances.disturbance import Disturbance
-from d4orm_planners.base.import_paths import source_digest
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, origin, policy_settings
 from d4orm_planners.evaluation.trials import Condition
 from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode, record_episode

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from d4orm_env.core.errors import describe
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.base.import_paths import check_sendable
 from d4orm_planners.evaluation.pool import JobEvent, WorkerLost
 from d4orm_planners.evaluation.process_pool import ProcessPool
 from d4orm_planners.rl.dataset.demonstrations import Demonstrations
