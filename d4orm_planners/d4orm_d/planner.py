@@ -79,7 +79,9 @@ class D4ormD(DeformingPlanner):
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
-        return replace(task, collisions=search.iteration > 0 or self.config.first_collisions)
+        # Only who starts from nothing is yet to find out who meets whom; a plan that is made better has to keep apart.
+        from_zero = search.iteration == 0 and not base.any()
+        return replace(task, collisions=self.config.first_collisions or not from_zero)
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""

@@ -21,13 +21,14 @@ class D4ormDConfig(DeformationConfig):
         num_steps: ``N`` of such an iteration.
         big_team: Teams of more robots than this are sampled half as often in iterations over all of them, whose time
             grows with the team while repairs make up for their errors; ``None`` for no such team.
-        decoupling: ``"groups"`` replans every group of robots that conflict, the team's reward within it (the paper).
+        decoupling: ``"groups"`` replans every group of robots that conflict, the team's reward within it (the paper;
+            groups are the components of the conflicts and of those of the last iteration that are likely to come back).
             ``"independent"`` replans robots that have no conflict with each other at once, each by its own reward,
             around all others, and takes over only what is no worse.
         start: First iteration without initial controls. ``"team"`` deforms the whole team at once;
             ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"auto"`` does the
             second in big teams where robots so meet less than half of the others on average.
-        first_collisions: Whether the first iteration over the whole team minds collisions.
+        first_collisions: Whether an iteration that starts from zero controls minds collisions.
         repair_samples: ``M`` of an independent repair. A few may be better than many: their error is a search of
             its own.
         repair_steps: ``N`` of an independent repair.

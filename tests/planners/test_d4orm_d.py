@@ -14,7 +14,7 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
-from d4orm_planners.base.conflict_groups import conflicts, failure_groups, reconnected
+from d4orm_planners.base.conflict_groups import conflicts, failure_groups, regrouped
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
@@ -88,7 +88,8 @@ def test_the_paper_preset_replans_exactly_the_groups_that_fail(clip: bool) -> No
     for _ in range(4):
         before = search.current
         graph = conflicts(before.trajectory.positions, CROSSING.team.radius, CROSSING.margin)
-        groups = failure_groups(before.failed, reconnected(graph, previous))
+        grouping = regrouped(graph, previous)
+        groups = failure_groups(before.failed, grouping.groups)
         replanned = {robot for group in groups for robot in group}
         search.advance()
         # Clipping what is clipped already may change the last bit.
@@ -97,7 +98,7 @@ def test_the_paper_preset_replans_exactly_the_groups_that_fail(clip: bool) -> No
         kept = [k for k in range(12) if k not in replanned]
         went_on_from = before.controls if clip else before.planned
         np.testing.assert_allclose(search.current.planned[:, kept], went_on_from[:, kept], atol=1e-6)
-        previous = graph
+        previous = grouping
 
 
 def test_the_first_iteration_of_the_paper_preset_minds_no_collisions() -> None:
@@ -107,6 +108,18 @@ def test_the_first_iteration_of_the_paper_preset_minds_no_collisions() -> None:
     assert not planner.task(search, search.current.controls).collisions
     search.advance()
     assert planner.task(search, search.current.controls).collisions
+
+
+def test_a_plan_that_the_paper_preset_makes_better_keeps_apart() -> None:
+    """Without contacts in mind all would cut through the middle."""
+    problem = make_problem("circle", num_robots=4, goal_speed=np.inf)
+    solved = make_planner("d4orm", engine="cpu").solve(problem, seed=0)
+    assert solved.solved
+    search = SolveRun(
+        make_planner("d4orm-d", preset="paper", engine="cpu", improve=True, num_samples=256, num_steps=20),
+        problem, 0, solved.controls,
+    )  # fmt: skip
+    assert not search.advance().num_margin_violated
 
 
 def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
