@@ -94,24 +94,24 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
 
 
 def robot_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
-    """``(K, S)`` bool: whether a robot at ``place`` ``(K, d, S)`` is within the radii plus ``extra`` of another."""
+    """``(K, S)`` how many others a robot at ``place`` ``(K, d, S)`` is within the radii plus ``extra`` of."""
     gaps = (place[:, None] - place[None, :]) ** 2
     reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
     reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, reach * reach)
-    return (gaps.sum(axis=2) <= reach2[..., None]).any(axis=1)
+    return (gaps.sum(axis=2) <= reach2[..., None]).sum(axis=1)
 
 
 def moving_contacts(
     arrays: ProblemArrays, place: Array, obstacle: Given, radius: Given, extra: Array | np.float32
 ) -> Array:
-    """``(K, S)`` bool: the same towards bodies at ``obstacle`` ``(O, d)`` of ``radius`` ``(O,)``."""
+    """``(K, S)`` the same towards bodies at ``obstacle`` ``(O, d)`` of ``radius`` ``(O,)``."""
     gaps = (place[:, None] - obstacle[None, :, :, None]) ** 2
     reach = arrays.radius[:, None] + radius[None, :] + extra
-    return (gaps.sum(axis=2) <= (reach * reach)[..., None]).any(axis=1)
+    return (gaps.sum(axis=2) <= (reach * reach)[..., None]).sum(axis=1)
 
 
 def obstacle_contacts(arrays: ProblemArrays, place: Array, extra: Array | np.float32) -> Array:
-    """``(K, S)`` bool: the same towards static obstacles and bounds."""
+    """``(K, S)`` bool: whether it is within that of static obstacles or bounds."""
     reach = (arrays.radius + extra)[:, None]
     hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
     for axis in range(place.shape[1]):
@@ -180,21 +180,21 @@ def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 
-def rewards_of(arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array) -> Array:
+def rewards_of(
+    arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array, penalty: Array | np.float32
+) -> Array:
     """``(K, S)`` reward of one step."""
     distance, one = goal_distance(arrays, place), jnp.float32(1)
     violations = pair_violation.astype(jnp.float32), obstacle_violation.astype(jnp.float32), jnp.float32(0)
-    return reward.step_reward(
-        distance, arrays.inverse_initial_distance[:, None], violations, arrays.collision_penalty, one
-    )
+    return reward.step_reward(distance, arrays.inverse_initial_distance[:, None], violations, penalty, one)
 
 
 def check_contacts(arrays: ProblemArrays, place: Array) -> Contacts:
     """``(collided, margin violated, reward)`` of teams at rest at ``place`` ``(K, d, S)``, each ``(K, S)``."""
     zero = jnp.float32(0)
-    contact = robot_contacts(arrays, place, zero) | obstacle_contacts(arrays, place, zero)
-    pair, obstacle = robot_contacts(arrays, place, arrays.margin), obstacle_contacts(arrays, place, arrays.margin)
-    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle)
+    contact = (robot_contacts(arrays, place, zero) > 0) | obstacle_contacts(arrays, place, zero)
+    pair, obstacle = robot_contacts(arrays, place, arrays.margin) > 0, obstacle_contacts(arrays, place, arrays.margin)
+    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle, arrays.collision_penalty)
 
 
 @partial(jax.jit, static_argnums=0)

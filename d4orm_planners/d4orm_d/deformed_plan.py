@@ -56,7 +56,10 @@ class DeformedPlan(WorkingPlan):
             radius = np.asarray(problem.team.radius)[others]
             moving = MovingObstacles(self.positions[1 : horizon + 1, others], radius)
         base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
-        task = SamplingTask(part.with_state(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
+        task = SamplingTask(
+            part.with_state(part.start, part.goal, horizon=horizon), base, moving=moving,
+            penalty_per_pair=planner.config.penalty_per_pair, **scoring,
+        )  # fmt: skip
         self._runs += 1
         start, seed = (
             planner.start(search, base, part.team, self._runs),

@@ -36,6 +36,9 @@ from d4orm_env.engine.simd import (
 )
 from d4orm_env.engine.tiles import near_round
 
+DIGITS = 7
+"""Binary digits that robots near each other are counted in; one tells only whether there are any."""
+
 WIDER = np.float32(1 + 2.0**-6)
 """Factor by which robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
 
@@ -52,7 +55,8 @@ class Scratch(NamedTuple):
             so that what is within the margin of each other touches.
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
-        near: ``(K, BLOCK)`` near a robot or a body at a step of the block, a bit for every sample.
+        near: ``(DIGITS, K, BLOCK)`` how many robots and bodies are near at a step of the block: a bit for every sample
+            of each binary digit, the lowest first. The last digit in use is set for all that does not fit.
         buffer: ``(2 TILE,)`` two rows to overwrite.
     """
 
@@ -82,7 +86,7 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
     """Scratch for one thread."""
     return Scratch(
         aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
-        np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
+        np.empty((num_robots, num_robots), np.int32), np.empty((DIGITS, num_robots, BLOCK), np.uint64),
         aligned_zeros(2 * TILE),
     )  # fmt: skip
 
@@ -179,9 +183,21 @@ def _list_near(dimension: int, s: Scratch) -> None:
         s.num_robots[k] = count
 
 
+@inlined
+def _count(digits: int, k: Whole, step: int, touch: np.uint64, near: NDArray[np.uint64]) -> None:
+    """Add one in these samples to what is near robot ``k``."""
+    for digit in range(digits - 1):
+        carried = near[digit, k, step] & touch
+        near[digit, k, step] ^= touch
+        touch = carried
+    near[digits - 1, k, step] |= touch
+
+
 @compiled
-def _mark_listed(radius: FloatArray, margin: np.float32, dimension: int, places: FloatArray, s: Scratch) -> None:
-    """Flag robots within the margin of those on their lists."""
+def _mark_listed(
+    radius: FloatArray, margin: np.float32, digits: int, dimension: int, places: FloatArray, s: Scratch
+) -> None:
+    """Count robots within the margin of those on their lists."""
     use_wide_registers()
     for k in range(radius.shape[0]):
         for i in range(s.num_robots[k]):
@@ -194,15 +210,16 @@ def _mark_listed(radius: FloatArray, margin: np.float32, dimension: int, places:
                 for step in range(BLOCK):
                     a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
                     touch = _near_pair(reach, a, b, dimension, places) << np.uint64(chunk)
-                    s.near[k, step] |= touch
-                    s.near[other, step] |= touch
+                    _count(digits, k, step, touch, s.near)
+                    _count(digits, other, step, touch, s.near)
 
 
 @compiled
 def _mark_bodies(
-    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
-) -> None:
-    """Flag robots within the margin of moving bodies."""
+    radius: FloatArray, margin: np.float32, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray,
+    s: Scratch,
+) -> None:  # fmt: skip
+    """Count moving bodies within the margin of robots."""
     _, num_bodies, dimension = bodies.places.shape
     limits, before = bodies.boxes.reshape(-1), first // BLOCK * num_bodies
     for k in range(radius.shape[0]):
@@ -211,30 +228,33 @@ def _mark_bodies(
                 reach = radius[k] + bodies.radius[body] + margin
                 for step in range(count):
                     rows = places[place_of(k, step, dimension) : place_of(k, step + 1, dimension)]
-                    s.near[k, step] |= near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
+                    touch = near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
+                    _count(digits, k, step, touch, s.near)
 
 
 @inlined
 def mark_robots(
-    radius: FloatArray, margin: np.float32, bodies: Bodies, first: int, count: int, places: FloatArray, s: Scratch
-) -> None:
-    """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
+    radius: FloatArray, margin: np.float32, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray,
+    s: Scratch,
+) -> None:  # fmt: skip
+    """Count in ``s.near`` robots and bodies within the margin of each robot in a block.
 
     Args:
         radius: ``(K,)``.
         margin: The margin.
         bodies: The :class:`Bodies`.
+        digits: Binary digits to count in.
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
         places: Rows of places, see :func:`place_of`.
         s: Scratch with the boxes of the robots in this block.
     """
-    s.near[:] = NOWHERE
+    s.near[:digits] = NOWHERE
     dimension = bodies.places.shape[2]
     _list_near(dimension, s)
-    _mark_listed(radius, margin, dimension, places, s)
+    _mark_listed(radius, margin, digits, dimension, places, s)
     if bodies.places.shape[1] > 0:
-        _mark_bodies(radius, margin, bodies, first, count, places, s)
+        _mark_bodies(radius, margin, bodies, digits, first, count, places, s)
 
 
 @inlined

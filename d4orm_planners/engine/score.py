@@ -30,7 +30,16 @@ from d4orm_env.engine.sample_noise import TURN, VECTOR, Drawing, draw_block, fil
 from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
 from d4orm_env.engine.stepping import Docking, dispatch, make_stepper, models_key, models_of_kernel
 from d4orm_env.engine.tile_layout import READ, WRITE, Row
-from d4orm_planners.engine.proximity import Bodies, Scratch, enclose, make_scratch, mark_robots, near_static, place_of
+from d4orm_planners.engine.proximity import (
+    DIGITS,
+    Bodies,
+    Scratch,
+    enclose,
+    make_scratch,
+    mark_robots,
+    near_static,
+    place_of,
+)
 
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
 STATE, DOCKED, TOTAL, ROWS = 0, 6, 7, 9
@@ -73,12 +82,16 @@ class Scoring(NamedTuple):
         collisions: Whether robots count when near each other or near a moving body.
         bodies: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`.
         bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`.
+        penalties: ``(K,)`` what a violation costs per step.
+        per_pair: Whether it costs so much for every robot and body that is near.
     """
 
     docked: BoolArray
     collisions: bool
     bodies: Bodies
     bounds: FloatArray
+    penalties: FloatArray
+    per_pair: bool
 
 
 Score: TypeAlias = Kernel[[ProblemArrays, Scoring, Drawing, IntArray, Workspace, FloatArray, FloatArray], None]
@@ -191,12 +204,15 @@ def _stay(dimension: int, w: FloatArray, places: FloatArray) -> None:
 
 
 @inlined
-def _punish_near(near: NDArray[np.uint64], count: int, penalty: np.float32, w: FloatArray) -> None:
-    """Take the penalty from the robots that are near each other or a body, in the steps of a block."""
-    for k in range(near.shape[0]):
-        for step in range(count):
-            if near[k, step] != NOWHERE:
-                subtract_where(w, k * STRIDE + TOTAL * TILE, near[k, step], penalty)
+def _punish_near(near: NDArray[np.uint64], digits: int, count: int, penalties: FloatArray, w: FloatArray) -> None:
+    """Take the penalties from the robots that are near each other or a body, in the steps of a block."""
+    for k in range(near.shape[1]):
+        cost = penalties[k]
+        for digit in range(digits):
+            for step in range(count):
+                if near[digit, k, step] != NOWHERE:
+                    subtract_where(w, k * STRIDE + TOTAL * TILE, near[digit, k, step], cost)
+            cost += cost
 
 
 @inlined
@@ -212,7 +228,7 @@ def _score_tile(
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     moved, keys, scratch, offset, scale = space.moved, space.keys, space.scratch, drawing.offset, drawing.scale
-    penalty, bounds = arrays.collision_penalty, scoring.bounds
+    penalties, bounds, digits = scoring.penalties, scoring.bounds, DIGITS if scoring.per_pair else 1
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
@@ -255,10 +271,10 @@ def _score_tile(
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
                     touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.buffer)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
-                    subtract_where(robot, TOTAL * TILE, touch, steps * penalty)
+                    subtract_where(robot, TOTAL * TILE, touch, steps * penalties[k])
         if scoring.collisions:
-            mark_robots(radius, margin, scoring.bodies, first, count, places, scratch)
-            _punish_near(scratch.near, count, penalty, w)
+            mark_robots(radius, margin, scoring.bodies, digits, first, count, places, scratch)
+            _punish_near(scratch.near, digits, count, penalties, w)
 
 
 def score_kernel(models: tuple[str, ...]) -> Score:

@@ -52,7 +52,10 @@ class SamplingPlanner(Planner):
             credit = "team" if search.iteration % 2 else "robot"
         elif credit == "group":  # the rules sum the robots' rewards
             credit = "robot"
-        return SamplingTask(search.problem, base, credit=credit, penalty=self.config.penalty)
+        return SamplingTask(
+            search.problem, base, credit=credit, penalty=self.config.penalty,
+            penalty_per_pair=self.config.penalty_per_pair,
+        )  # fmt: skip
 
     def num_samples(self, search: SolveRun) -> int:
         """``M`` of this iteration."""
@@ -70,19 +73,23 @@ class SamplingPlanner(Planner):
     def run(self, search: SolveRun) -> Iteration:
         """One run of the sampling loop over the whole team."""
         base, mean = self.initial(search)
-        task, rules = self.task(search, base), self.rules()
+        rules = self.rules()
+        if self.config.credit == "group":
+            rules = rules._replace(weights=GroupWeights(rules.weights, conflict_groups(search)))
+        return self.sampled(search, self.task(search, base), rules, mean)
+
+    def sampled(self, search: SolveRun, task: SamplingTask, rules: SamplingRules, mean: FloatArray) -> Iteration:
+        """One run of the sampling loop for this task, around ``mean`` ``(H, K, m)`` on top of the task's base."""
+        controls = np.zeros_like(task.base)
         if self.config.short_paths:
             task = on_short_paths(task, search)
         horizon = task.problem.horizon
         mean = np.ascontiguousarray(mean[:horizon])
-        if self.config.credit == "group":
-            rules = rules._replace(weights=GroupWeights(rules.weights, conflict_groups(search)))
         num_steps = excluded = 0
         for stage, (noise_scale, num_samples) in enumerate(self.stages(search)):
             seed = search.iteration_seed(Stream.SAMPLES, stage)
             result = search.denoise(task, rules, mean, noise_scale, num_samples, seed)
             mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
-        controls = np.zeros_like(base)
         controls[:horizon] = task.base + mean
         return Iteration(self.braking(search, controls), num_steps, excluded)
 
