@@ -62,7 +62,8 @@ class JointRun:
         )  # fmt: skip
         rules = planner.rules()
         rules = rules._replace(weights=GroupWeights(rules.weights, grouping.groups))
-        iteration = planner.sampled(search, task, rules, deformed * planner.start(search, base, problem.team))
+        start = deformed * planner.start(search, base, problem.team)
+        iteration, _ = planner.sampled(search, task, rules, start, planner.stages(search))
         return JointRun(penalties, False, grouping, labels, repeats), iteration
 
     def _penalties(self, planner: D4ormD, search: SolveRun) -> FloatArray:

@@ -110,13 +110,13 @@ class SamplingResult(NamedTuple):
         mean: ``(H, K, m)`` the last weighted mean of the deformations.
         rewards: ``(N,)`` mean reward of the samples at each step done: fewer than asked for where the run was stopped.
         excluded: Samples left out because their reward was not finite.
-        noise_factor: ``(H, K, m)`` factors on the noise that a next step would have, or ``None`` if not told.
+        noise_factor: Factors on the noise that a next step would have, that go with ``(H, K, m)``.
     """
 
     mean: FloatArray
     rewards: FloatArray
     excluded: int
-    noise_factor: FloatArray | None = None
+    noise_factor: float | FloatArray = 1.0
 
 
 class DenoisingStep(NamedTuple):
