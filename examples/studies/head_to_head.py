@@ -3,9 +3,10 @@
     python -m examples.studies.head_to_head --seeds 20 --out head_to_head
 
 D4orm and D4orm-D by their presets `paper` and `authors` and by their defaults (ours), at most 20 iterations: 16 robots
-on the paper's circle, and by D4orm-D 16 among its four obstacles and 64 random ones. On the circle also D4orm-D by the
-preset `authors` with one of its differences from the paper taken back at a time. Tests are against the preset
-`authors`; see :func:`examples.outputs.first_solutions` for the columns. Iterations are a mean over the successes.
+on the paper's circle, and by D4orm-D 64 random ones (5 seeds) and 16 among its four obstacles (10). On the circle also
+D4orm-D by the preset `authors` with one of its differences from the paper taken back at a time (10), and D4orm by the
+preset `paper` with higher penalties (10, against penalty 1). Other tests are against the preset `authors`; see
+:func:`examples.outputs.first_solutions` for the columns. Iterations are a mean over the successes.
 
 With `--checkout FOLDER`, a checkout of proroklab/d4orm at 8ea43d73, that code itself is run too, on the instances of
 the same seeds, and needs its own requirements; its rows are printed and not kept.
@@ -17,7 +18,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from examples.outputs import first_solutions, save_table, study_trials, trials_parser
@@ -39,6 +40,10 @@ D4ORM_D: Settings = {
     "d4orm-d, paper": {"policy": "d4orm-d", **PAPER},
     "d4orm-d, ours": {"policy": "d4orm-d"},
 }
+PENALTIES: Settings = {
+    f"d4orm, paper, penalty of {penalty:g}": {"policy": "d4orm", **PAPER, "penalty": penalty} for penalty in (2.0, 4.0)
+}
+"""Higher penalties with the team's credit, which the paper says do not help (section IV-C)."""
 DIFFERENCES: Settings = {
     "authors, penalty once a step": {"penalty_per_pair": False},
     "authors, penalty of 1 throughout": {"penalty_rise": 0.0},
@@ -48,15 +53,31 @@ DIFFERENCES: Settings = {
     "paper, penalty per pair": {**PAPER, "penalty_per_pair": True},
 }
 """D4orm-D with one difference taken back, and the groups one after the other, as in the paper."""
-TEAMS: Mapping[tuple[str, int], tuple[Settings, ...]] = {
-    ("paper_circle", 16): (
-        D4ORM,
-        {**D4ORM_D, **{label: {"policy": "d4orm-d", **AUTHORS, **own} for label, own in DIFFERENCES.items()}},
+
+
+class Comparison(NamedTuple):
+    """Settings on one team, and the label of those that they are compared with there."""
+
+    scenario: str
+    num_robots: int
+    settings: Settings
+    reference: str = "d4orm-d, authors"
+    seeds: int = 20
+
+
+COMPARISONS = (
+    Comparison("paper_circle", 16, D4ORM, "d4orm, authors"),
+    Comparison("paper_circle", 16, PENALTIES, "d4orm, paper", seeds=10),
+    Comparison("paper_circle", 16, D4ORM_D),
+    Comparison(
+        "paper_circle",
+        16,
+        {label: {"policy": "d4orm-d", **AUTHORS, **own} for label, own in DIFFERENCES.items()},
+        seeds=10,
     ),
-    ("paper_obstacles", 16): (D4ORM_D,),
-    ("paper_random", 64): (D4ORM_D,),
-}
-"""Scenario and number of robots, and the settings that are compared there; the first of each is the reference."""
+    Comparison("paper_random", 64, D4ORM_D, seeds=5),
+    Comparison("paper_obstacles", 16, D4ORM_D, seeds=10),
+)
 THEIR_ENVIRONMENTS = {
     "paper_circle": "multi2dholo", "paper_obstacles": "multi2dholo_obs4", "paper_random": "multi2dholo_random",
 }  # fmt: skip
@@ -64,19 +85,18 @@ THEIR_ENVIRONMENTS = {
 
 
 def studies(seeds: int, own: dict[str, Any], robots: int | None = None) -> list[Study]:
-    """Every setting with its teams, of so many ``robots`` if that is given."""
+    """Every comparison with so many seeds at most, of so many ``robots`` if that is given."""
     return [
         Study(
             policies={
                 label: {"engine": "cpu", "max_iterations": ITERATIONS, **settings, **own}
-                for part in parts
-                for label, settings in part.items()
+                for label, settings in compared.settings.items()
             },
-            scenarios=(scenario,),
-            num_robots=(robots or num_robots,),
-            seeds=range(seeds),
+            scenarios=(compared.scenario,),
+            num_robots=(robots or compared.num_robots,),
+            seeds=range(min(seeds, compared.seeds)),
         )
-        for (scenario, num_robots), parts in TEAMS.items()
+        for compared in COMPARISONS
     ]
 
 
@@ -118,21 +138,22 @@ def main() -> int:
         arguments, "head_to_head", studies(*tiny) if arguments.quick else studies(arguments.seeds, {})
     )
     rows = []
-    for (scenario, _), parts in TEAMS.items():
-        for part in parts:
-            groups = {
-                label: [trial for trial in trials if trial.scenario == scenario and trial.label == label]
-                for label in part
-            }
-            (num_robots,) = {trial.num_robots for group in groups.values() for trial in group}
-            solutions = first_solutions(f"{scenario}, {num_robots} robots", "planner", groups, next(iter(part)))
-            rows += [
-                {**dict(list(row.items())[:4]), "iterations": mean_iterations(group), **row}
-                for row, group in zip(solutions, groups.values(), strict=True)
-            ]
+    for compared in COMPARISONS:
+        there = {
+            label: [trial for trial in trials if (trial.scenario, trial.label) == (compared.scenario, label)]
+            for label in (compared.reference, *compared.settings)
+        }
+        groups = {label: group for label, group in there.items() if group}
+        (num_robots,) = {trial.num_robots for group in groups.values() for trial in group}
+        solutions = first_solutions(f"{compared.scenario}, {num_robots} robots", "planner", groups, compared.reference)
+        rows += [
+            {**dict(list(row.items())[:4]), "iterations": mean_iterations(groups[row["planner"]]), **row}
+            for row in solutions
+            if row["planner"] in compared.settings
+        ]
     save_table(rows, arguments.out / "head_to_head.csv")
     if arguments.checkout is not None:
-        for scenario, num_robots in TEAMS:
+        for scenario, num_robots in dict.fromkeys((compared.scenario, compared.num_robots) for compared in COMPARISONS):
             for row in runs_of(arguments.checkout, scenario, num_robots, arguments.seeds):
                 print(row, flush=True)
     return 0
