@@ -43,6 +43,15 @@ class Paired:
     cost_p: float
 
 
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P values corrected for how many there are by Holm's method, in their order."""
+    order = np.argsort(p_values, kind="stable")
+    left = len(p_values) - np.arange(len(p_values))
+    corrected = np.empty(len(p_values))
+    corrected[order] = np.minimum(np.maximum.accumulate(np.asarray(p_values, float)[order] * left), 1)
+    return [float(value) for value in corrected]
+
+
 def paired(
     first: Sequence[Trial],
     second: Sequence[Trial],
