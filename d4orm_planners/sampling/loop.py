@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,7 +30,8 @@ from d4orm_planners.sampling.short_paths import on_short_paths
 from d4orm_planners.sampling.weights import GroupWeights
 
 
-class NextStep(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class NextStep:
     """Where a run of the sampling loop would go on.
 
     Attributes:

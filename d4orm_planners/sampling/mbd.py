@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,7 +41,8 @@ class MBDConfig(DenoisingConfig):
     check_every: Steps | None = None
 
 
-class Part(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Part:
     """A run that is under way.
 
     Attributes:
@@ -70,7 +71,7 @@ class MBD(ControlDenoiser):
         base, mean = self.initial(search)
         done = 0
         if state is not None and state.done < self.config.num_steps:
-            mean, done = state
+            mean, done = state.mean, state.done
         end = min(done + (self.config.check_every or self.config.num_steps), self.config.num_steps)
         stages = [(self.noise_scale()[done:end], self.config.num_samples)]
         iteration, following = self.sampled(search, self.task(search, base), self.credited(search), mean, stages)
