@@ -341,8 +341,8 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
         ("solve_rates", " ".join(["solve_rates", *(f"solve_rates_{name}" for name in SOLVE_RATES)])),
         *((program, program) for program in ("ablation", "amswarm_gaps", "contact_penalty", "credit_by_update",
                                              "fewer_samples", "gradient_dilution", "head_to_head", "lifelong",
-                                             "multimodality", "multimodality_team", "paper_differences", "scaling", "tune_learners",
-                                             "tuned_rivals", "warm_start")),
+                                             "multimodality", "multimodality_team", "paper_differences", "scaling",
+                                             "tune_learners", "tuned_rivals", "warm_start")),
     ],
 )  # fmt: skip
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, program: str, names: str) -> None:
