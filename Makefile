@@ -66,6 +66,8 @@ results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the tri
 	$(BIN)/python -m examples.studies.training_seeds --curves $(DATA)/training_curves.csv --out docs/tables
 	for figure in $(FIGURES); do \
 	  $(BIN)/python -m examples.studies.paper $$figure --trials $(DATA)/$$figure.parquet --no-times --out docs/tables || exit 1; done
+	for figure in big-teams coarseness; do \
+	  $(BIN)/python -m examples.studies.paper $$figure --trials $(DATA)/algorithm_4.parquet --no-times --out docs/tables/algorithm_4 || exit 1; done
 	for figure in big-teams coarseness ipopt; do \
 	  $(BIN)/python -m examples.studies.paper $$figure --trials $(DATA)/$$figure.parquet --out docs/tables || exit 1; done
 	$(BIN)/d4orm leaderboard $(DATA)/leaderboard.parquet --out docs/tables/leaderboard.md
