@@ -443,7 +443,7 @@ def test_without_a_name_the_figures_are_listed(paper, tmp_path: Path) -> None:
     [
         (("fig4",), "invalid choice: 'fig4'"),
         (("big-teams", "--section", "Nowhere"), "no section 'Nowhere'; choose of Differential Drive; 2D Holonomic"),
-        (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; d4orm; d4orm, defaults"),
+        (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; ipopt, ours; d4orm; d4orm, defaults"),
         (("amswarm", "--quick", "--seeds", "0"), "seeds"),
         (("amswarm", "--quick", "--workers", "0"), "workers"),
     ],
