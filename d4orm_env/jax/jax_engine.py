@@ -100,7 +100,7 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
 
 
 def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
-    """``(K, S)`` bool: whether a robot in ``state`` ``(K, n, S)`` is within ``extra`` of another."""
+    """``(K, S)`` how many others a robot in ``state`` ``(K, n, S)`` is within ``extra`` of."""
     place = state[:, : arrays.goal.shape[1]]
     gaps = (place[:, None] - place[None, :]) ** 2
     reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
@@ -109,11 +109,11 @@ def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float3
     if len(arrays.footprints.inner):
         bodies = footprints.place_robots(arrays.footprints, state, arrays.goal.shape[1])
         near &= footprints.pairs_within(bodies, bodies, extra)
-    return near.any(axis=1)
+    return near.sum(axis=1)
 
 
 def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, extra: Array | np.float32) -> Array:
-    """``(K, S)`` bool: the same towards other bodies."""
+    """``(K, S)`` the same towards other bodies."""
     d = arrays.goal.shape[1]
     place = state[:, :d]
     gaps = (place[:, None] - others.places[None, :, :, None]) ** 2
@@ -122,11 +122,11 @@ def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, e
     if len(arrays.footprints.inner) or len(others.footprints.inner):
         bodies = footprints.place_robots(arrays.footprints, state, d, arrays.radius)
         near &= footprints.pairs_within(bodies, footprints.place_bodies(others), extra)
-    return near.any(axis=1)
+    return near.sum(axis=1)
 
 
 def obstacle_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
-    """``(K, S)`` bool: the same towards static obstacles and bounds."""
+    """``(K, S)`` bool: whether it is within that of static obstacles or bounds."""
     place = state[:, : arrays.goal.shape[1]]
     if len(arrays.footprints.inner):
         return footprints.static_contacts(arrays, state, extra)
@@ -198,21 +198,22 @@ def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 
-def rewards_of(arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array) -> Array:
+def rewards_of(
+    arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array, penalty: Array | np.float32
+) -> Array:
     """``(K, S)`` reward of one step."""
     distance, one = goal_distance(arrays, place), jnp.float32(1)
     violations = pair_violation.astype(jnp.float32), obstacle_violation.astype(jnp.float32), jnp.float32(0)
-    return reward.step_reward(
-        distance, arrays.inverse_initial_distance[:, None], violations, arrays.collision_penalty, one
-    )
+    return reward.step_reward(distance, arrays.inverse_initial_distance[:, None], violations, penalty, one)
 
 
 def check_contacts(arrays: ProblemArrays, state: Array) -> Contacts:
     """``(collided, margin violated, reward)`` of teams in ``state`` ``(K, n, S)``, each ``(K, S)``."""
     zero = jnp.float32(0)
-    contact = robot_contacts(arrays, state, zero) | obstacle_contacts(arrays, state, zero)
-    pair, obstacle = robot_contacts(arrays, state, arrays.margin), obstacle_contacts(arrays, state, arrays.margin)
-    return contact, pair | obstacle, rewards_of(arrays, state[:, : arrays.goal.shape[1]], pair, obstacle)
+    contact = (robot_contacts(arrays, state, zero) > 0) | obstacle_contacts(arrays, state, zero)
+    pair, obstacle = robot_contacts(arrays, state, arrays.margin) > 0, obstacle_contacts(arrays, state, arrays.margin)
+    place = state[:, : arrays.goal.shape[1]]
+    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle, arrays.collision_penalty)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from numpy.typing import ArrayLike
 
@@ -19,6 +19,18 @@ Graph: TypeAlias = tuple[frozenset[int], ...]
 """The robots that each robot is in conflict with."""
 
 Groups = tuple[tuple[int, ...], ...]
+
+
+class Grouping(NamedTuple):
+    """A team's groups, and the conflicts that they come from.
+
+    Attributes:
+        graph: The conflicts.
+        groups: Components of the graph after :func:`reconnected`, singletons included.
+    """
+
+    graph: Graph
+    groups: Groups
 
 
 def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
@@ -41,7 +53,12 @@ def graph_of(num_robots: int, pairs: IntArray) -> Graph:
     return tuple(map(frozenset, neighbours))
 
 
-def reconnected(graph: Graph, previous: Graph | None) -> Graph:
+def regrouped(graph: Graph, previous: Grouping | None) -> Grouping:
+    """Return the groups of a graph of conflicts that comes after the previous one's."""
+    return Grouping(graph, components(reconnected(graph, previous)))
+
+
+def reconnected(graph: Graph, previous: Grouping | None) -> Graph:
     """The graph of conflicts with those of the previous iteration added that are likely to come back.
 
     A robot of a previous group that now conflicts with a robot outside that group is joined again to those of its
@@ -49,15 +66,15 @@ def reconnected(graph: Graph, previous: Graph | None) -> Graph:
 
     Args:
         graph: Conflicts now.
-        previous: Conflicts in the previous iteration, or ``None``.
+        previous: Groups of the previous iteration, or ``None``.
     """
     if previous is None:
         return graph
     joined = [set(neighbours) for neighbours in graph]
-    for group in components(previous):
+    for group in previous.groups:
         for robot in group if len(group) > 1 else ():
             if not graph[robot] <= set(group):
-                for other in previous[robot]:
+                for other in previous.graph[robot]:
                     if not graph[other]:
                         joined[robot].add(other)
                         joined[other].add(robot)
@@ -80,17 +97,17 @@ def components(graph: Graph) -> Groups:
     return tuple(groups)
 
 
-def failure_groups(failed: BoolArray, graph: Graph) -> Groups:
-    """Groups to replan: the components of the graph that hold a failed robot.
+def failure_groups(failed: BoolArray, groups: Groups) -> Groups:
+    """Groups to replan: those that hold a failed robot.
 
     Args:
         failed: ``(K,)`` robots that do not arrive, or violate the margin to anything.
-        graph: Conflicts, after :func:`reconnected`.
+        groups: All groups, singletons included.
 
     Returns:
         Disjoint groups of robots, each in ascending order. A robot that fails without conflict is a group of its own.
     """
-    return tuple(group for group in components(graph) if failed[list(group)].any())
+    return tuple(group for group in groups if failed[list(group)].any())
 
 
 def independent_robots(candidates: Iterable[int], graph: Graph) -> tuple[int, ...]:

@@ -41,6 +41,11 @@ def describe_planner(name: str) -> str:
     return _summary(_planner_class(name))
 
 
+def preset_names(name: str) -> tuple[str, ...]:
+    """The presets of a planner or policy."""
+    return tuple(_presets(find_policy(name)))
+
+
 def describe_policy(name: str) -> str:
     """The first line of a policy's documentation."""
     return _summary(find_policy(name))
@@ -52,8 +57,9 @@ def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None 
     Args:
         name: One of :func:`list_planners`, ``"package.module:Name"`` (or ``"folder/file.py:Name"``) of a planner class,
             or the class.
-        preset: ``"paper"`` for the paper's algorithm and parameters; ``"tuned"``, of D4orm and its rivals, for that
-            with parameters that were tuned; ``None`` for this project's defaults.
+        preset: ``"paper"`` for the paper's algorithm and parameters; ``"authors"``, of D4orm, D4orm-D and CEM, for what
+            its authors published as code; ``"tuned"``, of D4orm and its rivals, for the paper's with parameters that
+            were tuned; ``None`` for this project's defaults. :func:`preset_names` lists a planner's.
         **config: Settings that differ from the preset; see the planner's configuration class.
 
     Raises:

@@ -9,7 +9,7 @@ import typer
 
 from d4orm_env.scenarios import describe_scenario, list_scenarios
 from d4orm_planners.base.names import PLANNERS, POLICIES
-from d4orm_planners.base.planner_registry import default_settings, describe_planner, describe_policy
+from d4orm_planners.base.planner_registry import default_settings, describe_planner, describe_policy, preset_names
 from d4orm_planners.cli.outputs import print_table
 
 
@@ -28,10 +28,11 @@ def scenarios() -> None:
 def planners(
     name: Annotated[str | None, typer.Argument(help="List the settings of this one, with their defaults.")] = None,
 ) -> None:
-    """List the planners and policies, or what --set can set of one."""
+    """List the planners and policies, or what --set can set of one, and its presets."""
     if name is not None:
-        settings = default_settings(name).items()
-        print_table(name, [(setting, str(value)) for setting, value in settings] or [("no settings", "")])
+        settings = [(setting, str(value)) for setting, value in default_settings(name).items()]
+        presets = [("preset", ", ".join(names))] if (names := preset_names(name)) else []
+        print_table(name, [*settings, *presets] or [("no settings", "")])
         return
     for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
         print_table(title, [(name, _or_error(describe, name)) for name in table])

@@ -37,7 +37,7 @@ class PlanOptions(PictureOptions, ProblemOptions):
         ),
     ] = None
     preset: Annotated[
-        str | None, typer.Option("--preset", help="`paper` for the paper's parameters, `tuned` for tuned ones.")
+        str | None, typer.Option("--preset", help="`paper`, `authors` or `tuned`; see `d4orm planners NAME`.")
     ] = None
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")

@@ -89,7 +89,7 @@ def subgoal_indices(indices: IntArray, mean: int, offset: int, lag: int, last: i
 
     Args:
         indices: ``(K,)`` where the robots are.
-        mean: Their mean over the robots under way.
+        mean: Their mean over the robots that count.
         offset: ``m``, waypoints from the mean to the subgoal.
         lag: Waypoints that a robot may be behind the mean and still head for the same subgoal.
         last: ``H``, the last waypoint.

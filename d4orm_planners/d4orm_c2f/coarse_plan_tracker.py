@@ -169,9 +169,9 @@ class CoarsePlanTracker:
         path, offset = self.guidance.path, self._config.subgoal_offset
         positions = joint.states[:, : self.problem.dimension]
         self._indices = nearest_indices(path, positions, self._indices, offset)
-        going = ~docked & ~self.stuck
-        if going.any():
-            self.index = round(float(self._indices[going].mean()))
+        counted = np.ones_like(docked) if self._config.mean_of_all else ~docked & ~self.stuck
+        if counted.any():
+            self.index = round(float(self._indices[counted].mean()))
         lag = len(path) if self._config.max_lag is None else self._config.max_lag
         targets = subgoal_indices(self._indices, self.index, offset, lag, len(path) - 1)
         if not self._config.line_of_sight:

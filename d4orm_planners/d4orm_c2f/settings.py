@@ -23,6 +23,7 @@ PAPER_CONTROL = {
     "weight_cutoff": PAPER["weight_cutoff"],
     "max_lag": None,
     "line_of_sight": False,
+    "mean_of_all": True,
     "credit": "team",
     "penalty": 1.0,
     "normalise_distance": True,
@@ -61,6 +62,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         subgoal_offset: ``m``, waypoints from where the team is to its subgoal.
         max_lag: Waypoints that a robot may be behind the others without its subgoal staying behind too. ``None`` for
             any number: the subgoals of all are always those of one moment, as in the paper.
+        mean_of_all: Whether the team is where all robots are on average, as in the paper, not those under way: robots
+            that have arrived then hold the subgoals of others back.
         line_of_sight: Whether a subgoal behind robots at rest is exchanged for the furthest in sight before it.
         num_samples: ``M`` of a control loop.
         num_steps: ``N`` of a control loop.
@@ -112,6 +115,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     execute_horizon: Steps = 1
     subgoal_offset: Steps = 15
     max_lag: Annotated[Whole, Field(ge=0)] | None = 5
+    mean_of_all: bool = False
     line_of_sight: bool = True
     num_samples: Samples = 128
     num_steps: Steps = 20

@@ -55,7 +55,10 @@ class DeformedPlan(WorkingPlan):
         if len(others):
             moving = moving_robots(problem.team.select(others.tolist()), self.states[1 : horizon + 1, others])
         base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
-        task = SamplingTask(part.with_state(part.start, part.goal, horizon=horizon), base, moving=moving, **scoring)
+        task = SamplingTask(
+            part.with_state(part.start, part.goal, horizon=horizon), base, moving=moving,
+            penalty_per_pair=planner.config.penalty_per_pair, **scoring,
+        )  # fmt: skip
         self._runs += 1
         start, seed = (
             planner.start(search, base, part.team, self._runs),

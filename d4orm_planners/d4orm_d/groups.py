@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from d4orm_planners.base.conflict_groups import Graph, conflicts, failure_groups, reconnected
+from d4orm_planners.base.conflict_groups import Grouping, conflicts, failure_groups, regrouped
+from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 
 
@@ -13,18 +14,17 @@ class Groups:
     """The state of the search by groups.
 
     Attributes:
-        graph: Conflicts before the last iteration by groups, or ``None`` before the first.
+        grouping: Groups of the last iteration by groups, or ``None`` before the first.
     """
 
-    graph: Graph | None = None
+    grouping: Grouping | None = None
 
     def replan(self, team: DeformedPlan) -> Groups:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
         planner, search, problem = team.planner, team.search, team.problem
-        checked = search.current.trajectory.positions[:: search.check_interval]
-        graph = conflicts(checked, problem.team.radius, problem.margin)
+        grouping = grouping_of(search, self.grouping)
         team.controls = planner.config.continued(search.current).copy()
-        for group in failure_groups(search.current.unsolved, reconnected(graph, self.graph)):
+        for group in failure_groups(search.current.unsolved, grouping.groups):
             if search.should_stop():
                 break
             robots = list(group)
@@ -32,4 +32,11 @@ class Groups:
                 robots, problem.horizon, planner.config.num_samples, planner.noise_scale(), credit="team"
             )
             team.move(robots, controls, trajectory.states, trajectory.arrived[-1])
-        return Groups(graph)
+        return Groups(grouping)
+
+
+def grouping_of(search: SolveRun, previous: Grouping | None) -> Grouping:
+    """Return the groups of the present candidate, at the steps that are checked."""
+    problem, positions = search.problem, search.current.trajectory.positions
+    graph = conflicts(positions[:: search.check_interval], problem.team.radius, problem.margin)
+    return regrouped(graph, previous)

@@ -12,13 +12,14 @@ from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.groups import Groups
+from d4orm_planners.d4orm_d.joint_run import JointRun
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.sampling_types import SamplingTask
-from d4orm_planners.sampling.d4orm import PAPER_DEFORMATION, DeformingPlanner
+from d4orm_planners.sampling.d4orm import AUTHORS_DEFORMATION, PAPER_DEFORMATION, DeformingPlanner
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
-State = Groups | Repairs
+State = Groups | JointRun | Repairs
 """State between iterations, by the kind of decoupling."""
 
 
@@ -37,7 +38,17 @@ class D4ormD(DeformingPlanner):
             "start": "team",
             "first_collisions": False,
             "big_team": None,
-        }
+        },
+        "authors": {
+            **AUTHORS_DEFORMATION,
+            "decoupling": "joint",
+            "start": "team",
+            "first_collisions": False,
+            "big_team": None,
+            "penalty_rise": 0.5,
+            "reset_after_probe": True,
+            "clip_after": 6,
+        },
     }
     config: D4ormDConfig
 
@@ -45,18 +56,31 @@ class D4ormD(DeformingPlanner):
         """See :meth:`Planner.init`."""
         with search.watch.paused():
             prepare_drives(search.problem)
-        return Groups() if self.config.decoupling == "groups" else Repairs.of(search.problem.num_robots)
+        num_robots, config = search.problem.num_robots, self.config
+        if config.decoupling == "joint":
+            resets = config.reset_after_probe and not search.current.controls.any()
+            return JointRun.of(num_robots, config.penalty, resets)
+        return Groups() if config.decoupling == "groups" else Repairs.of(num_robots)
 
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once none fails, the failed robots in between."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
-        if not search.current.unsolved.any() or (isinstance(state, Groups) and search.best.solved):
+        if not isinstance(state, Repairs):
+            return self.replan(search, state)
+        if not search.current.unsolved.any():
             return self.whole_team(search, state)
         team = DeformedPlan(self, search, search.current.trajectory, search.current.report)
-        if isinstance(state, Repairs):
-            return state.repair(team, self.config), team.iteration()
+        return state.repair(team, self.config), team.iteration()
+
+    def replan(self, search: SolveRun, state: Groups | JointRun) -> tuple[State, Iteration]:
+        """Replan the groups that fail, in turn or in one run, or once there was a solution the whole team."""
+        if search.best.solved or not search.current.unsolved.any():
+            return self.whole_team(search, state)
+        if isinstance(state, JointRun):
+            return state.replan(self, search)
+        team = DeformedPlan(self, search, search.current.trajectory, search.current.report)
         state, iteration = state.replan(team), team.iteration()
         return state, replace(iteration, controls=self.braking(search, iteration.controls))
 
@@ -79,7 +103,12 @@ class D4ormD(DeformingPlanner):
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
-        return replace(task, collisions=search.iteration > 0 or self.config.first_collisions)
+        # Only who starts from nothing is yet to find out who meets whom; a plan that is made better has to keep apart.
+        from_zero = search.iteration == 0 and not base.any()
+        if self.config.first_collisions or not from_zero:
+            return task
+        # Robots that do not meet are groups of their own, which joint runs weight by.
+        return replace(task, collisions=False, credit="robot" if self.config.decoupling == "joint" else task.credit)
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""

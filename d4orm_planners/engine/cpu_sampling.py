@@ -48,7 +48,7 @@ class CpuSamplingEngine(CpuEngine):
     ) -> SamplingResult:
         """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.denoise`."""
         run = Sampling(task, rules, num_samples, seed, self._threads)
-        factor, units = np.ones_like(task.base), task.problem.team.control_units
+        factor, units = task.first_factor, task.problem.team.control_units
         mean_rewards = np.empty(len(noise_scale), np.float32)
         done = excluded = 0
         for step, sigma in enumerate(noise_scale):
@@ -74,7 +74,7 @@ class CpuSamplingEngine(CpuEngine):
             if rules.adapt is not None:
                 # The square deviation of the samples from their new mean.
                 factor = rules.adapt((factor * sigma) ** 2 * (second - first**2), np).astype(np.float32)
-        return SamplingResult(mean, mean_rewards[:done], excluded)
+        return SamplingResult(mean, mean_rewards[:done], excluded, factor)
 
 
 class Sampling:
@@ -96,6 +96,8 @@ class Sampling:
             collisions=task.collisions,
             bodies=make_bodies(moving, self.arrays.margin),
             bounds=bound_boxes(self.arrays),
+            penalties=task.penalties,
+            per_pair=task.penalty_per_pair,
         )
         self.shaped = bool(len(self.arrays.footprints.inner) or len(moving.footprints.inner))
         self.seed = np.array(noise.seed_words(seed), np.uint32)

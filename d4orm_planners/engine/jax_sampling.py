@@ -48,6 +48,7 @@ class _Static(NamedTuple):
     rules: SamplingRules
     num_samples: int
     collisions: bool
+    per_pair: bool
     credit: str
 
 
@@ -55,6 +56,7 @@ class _Inputs(NamedTuple):
     """Inputs that it is called with."""
 
     arrays: ProblemArrays
+    penalties: Array
     units: Array
     base: Array
     docked: Array
@@ -90,14 +92,17 @@ def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Ar
         deformation = _deformations(static, inputs, step, time, mean_now, scale_now)
         worlds = advance_worlds(static.models, arrays, worlds, base[..., None] + deformation)
         place = worlds.state[:, :d]
-        near_robot = jnp.zeros((num_robots, static.num_samples), bool)
+        near_robot = jnp.zeros((num_robots, static.num_samples), int)
         if static.collisions:
             near_robot = robot_contacts(arrays, worlds.state, arrays.margin)
             if inputs.moving is not None and obstacle is not None:
                 bodies = MovingBodies(obstacle[0], obstacle[1], inputs.moving.radius, inputs.moving.footprints)
-                near_robot |= moving_contacts(arrays, worlds.state, bodies, arrays.margin)
+                near_robot += moving_contacts(arrays, worlds.state, bodies, arrays.margin)
+        if not static.per_pair:
+            near_robot = near_robot > 0
         near_obstacle = obstacle_contacts(arrays, worlds.state, arrays.margin)
-        return (worlds, total + rewards_of(arrays, place, near_robot, near_obstacle)), deformation
+        reward = rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalties[:, None])
+        return (worlds, total + reward), deformation
 
     worlds = Worlds(
         jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
@@ -179,11 +184,12 @@ class JaxSamplingEngine(JaxEngine):
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         scored = (
-            task.arrays, problem.team.control_units, task.base, docked, task.moving, noise.seed_words(seed),
+            task.arrays, task.penalties, problem.team.control_units, task.base, docked, task.moving,
+            noise.seed_words(seed),
         )  # fmt: skip
-        static = _Static(problem.team.models, rules, num_samples, task.collisions, task.credit)
+        static = _Static(problem.team.models, rules, num_samples, task.collisions, task.penalty_per_pair, task.credit)
         scale = np.asarray(noise_scale, np.float32)
-        begun = (mean, np.ones_like(mean), np.zeros_like(scale), np.int32(0))
+        begun = (mean, task.first_factor, np.zeros_like(scale), np.int32(0))
         scored, scale, begun = jax.tree.map(jnp.asarray, (scored, scale, begun))
         arguments = (_Inputs(*scored), scale, _DenoisingState(*begun), jnp.int32(0), jnp.int32(len(scale)))
         leaves, treedef = jax.tree.flatten(arguments)
@@ -220,4 +226,5 @@ class JaxSamplingEngine(JaxEngine):
             run = jax.block_until_ready(compiled(inputs, scale, run, jnp.int32(first), jnp.int32(done)))
             if time.perf_counter() - start < LOOK:
                 part *= 2
-        return SamplingResult(np.asarray(run.mean), np.asarray(run.rewards)[:done], int(run.excluded))
+        rewards = np.asarray(run.rewards)[:done]
+        return SamplingResult(np.asarray(run.mean), rewards, int(run.excluded), np.asarray(run.factor))

@@ -39,6 +39,9 @@ from d4orm_env.engine.tiles import near_round
 from d4orm_env.footprints import FootprintArrays
 from d4orm_planners.engine.sampling_types import MovingObstacles
 
+DIGITS = 7
+"""Binary digits that robots near each other are counted in; one tells only whether there are any."""
+
 WIDER = np.float32(1 + 2.0**-6)
 """Factor by which robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
 
@@ -55,7 +58,8 @@ class Scratch(NamedTuple):
             so that what is within the margin of each other touches.
         num_robots: ``(K,)`` how many robots before it each may touch,
         robots: ``(K, K)`` and which.
-        near: ``(K, BLOCK)`` near a robot or a body at a step of the block, a bit for every sample.
+        near: ``(DIGITS, K, BLOCK)`` how many robots and bodies are near at a step of the block: a bit for every sample
+            of each binary digit, the lowest first. The last digit in use is set for all that does not fit.
         buffer: ``(2 TILE,)`` two rows to overwrite.
     """
 
@@ -89,7 +93,7 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
     """Scratch for one thread."""
     return Scratch(
         aligned_zeros(num_robots * dimension * BOX), np.empty(num_robots, np.int32),
-        np.empty((num_robots, num_robots), np.int32), np.empty((num_robots, BLOCK), np.uint64),
+        np.empty((num_robots, num_robots), np.int32), np.empty((DIGITS, num_robots, BLOCK), np.uint64),
         aligned_zeros(2 * TILE),
     )  # fmt: skip
 
@@ -193,9 +197,19 @@ def _list_near(dimension: int, s: Scratch) -> None:
         s.num_robots[k] = count
 
 
+@inlined
+def _count(digits: int, k: Whole, step: int, touch: np.uint64, near: NDArray[np.uint64]) -> None:
+    """Add one in these samples to what is near robot ``k``."""
+    for digit in range(digits - 1):
+        carried = near[digit, k, step] & touch
+        near[digit, k, step] ^= touch
+        touch = carried
+    near[digits - 1, k, step] |= touch
+
+
 @compiled
-def _mark_listed(arrays: ProblemArrays, places: FloatArray, turns: FloatArray, s: Scratch) -> None:
-    """Flag robots within the margin of those on their lists."""
+def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, turns: FloatArray, s: Scratch) -> None:
+    """Count robots within the margin of those on their lists."""
     radius, margin, dimension = arrays.radius, arrays.margin, arrays.goal.shape[1]
     use_wide_registers()
     for k in range(radius.shape[0]):
@@ -215,15 +229,16 @@ def _mark_listed(arrays: ProblemArrays, places: FloatArray, turns: FloatArray, s
                             arrays, k, other, touch, margin, dimension, places, a, b, turns, own, its, s.buffer
                         )
                     touch <<= np.uint64(chunk)
-                    s.near[k, step] |= touch
-                    s.near[other, step] |= touch
+                    _count(digits, k, step, touch, s.near)
+                    _count(digits, other, step, touch, s.near)
 
 
 @compiled
 def _mark_bodies(
-    arrays: ProblemArrays, bodies: Bodies, first: int, count: int, places: FloatArray, turns: FloatArray, s: Scratch
-) -> None:
-    """Flag robots within the margin of moving bodies."""
+    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, turns: FloatArray,
+    s: Scratch,
+) -> None:  # fmt: skip
+    """Count moving bodies within the margin of robots."""
     radius, margin = arrays.radius, arrays.margin
     _, num_bodies, dimension = bodies.places.shape
     limits, before = bodies.boxes.reshape(-1), first // BLOCK * num_bodies
@@ -239,7 +254,7 @@ def _mark_bodies(
                         touch = _refine_body(
                             arrays, bodies, body, first + step, k, touch, rows, turns, turn_of(k, step), s
                         )
-                    s.near[k, step] |= touch
+                    _count(digits, k, step, touch, s.near)
 
 
 @compiled
@@ -267,25 +282,27 @@ def _refine_body(
 
 @inlined
 def mark_robots(
-    arrays: ProblemArrays, bodies: Bodies, first: int, count: int, places: FloatArray, turns: FloatArray, s: Scratch
-) -> None:
-    """Flag in ``s.near`` robots within the margin of each other or of a body in a block.
+    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, turns: FloatArray,
+    s: Scratch,
+) -> None:  # fmt: skip
+    """Count in ``s.near`` robots and bodies within the margin of each robot in a block.
 
     Args:
         arrays: The problem.
         bodies: The :class:`Bodies`.
+        digits: Binary digits to count in.
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
         places: Rows of places, see :func:`place_of`.
         turns: Rows of headings, see :func:`turn_of`; of size zero where all bodies are discs.
         s: Scratch with the boxes of the robots in this block.
     """
-    s.near[:] = NOWHERE
+    s.near[:digits] = NOWHERE
     dimension = bodies.places.shape[2]
     _list_near(dimension, s)
-    _mark_listed(arrays, places, turns, s)
+    _mark_listed(arrays, digits, places, turns, s)
     if bodies.places.shape[1] > 0:
-        _mark_bodies(arrays, bodies, first, count, places, turns, s)
+        _mark_bodies(arrays, bodies, digits, first, count, places, turns, s)
 
 
 @inlined

@@ -52,7 +52,10 @@ class SamplingTask:
             part of a sample by that robot's own reward.
         moving: Bodies to avoid that are not sampled, or ``None``.
         arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
-        penalty: Factor of the problem's collision penalty.
+        penalty: Factor of the problem's collision penalty: of all robots, or ``(K,)`` of each.
+        penalty_per_pair: Whether a robot pays for every robot and moving body that it is near, not once for all.
+        noise_factor: Factors on the noise of the first step that go with ``(H, K, m)``: zero for robots that are not
+            sampled, so that their base stays.
         reference_distance: Distances count relative to the initial one (paper, section III-D), or to this if that is
             less: a robot that starts next to its goal then loses no more by waiting than others do. ``None`` for the
             paper's.
@@ -64,14 +67,26 @@ class SamplingTask:
     credit: str = "team"
     moving: MovingObstacles | None = None
     arrived: BoolArray | None = None
-    penalty: float = 1.0
+    penalty: float | FloatArray = 1.0
+    penalty_per_pair: bool = False
+    noise_factor: float | FloatArray = 1.0
     reference_distance: float | None = None
 
     @property
+    def penalties(self) -> FloatArray:
+        """``(K,)`` what a violation costs each robot per step."""
+        penalties = np.asarray(self.penalty, np.float64) * self.problem.collision_penalty
+        return np.full(self.problem.num_robots, penalties, np.float32)
+
+    @property
+    def first_factor(self) -> FloatArray:
+        """``(H, K, m)`` factors on the noise of the first step."""
+        return np.broadcast_to(np.asarray(self.noise_factor, np.float32), self.base.shape).copy()
+
+    @property
     def arrays(self) -> ProblemArrays:
-        """The problem as this task scores it."""
+        """The problem as this task scores it, but for the penalties."""
         arrays = self.problem.arrays
-        arrays = arrays._replace(collision_penalty=np.float32(self.penalty * self.problem.collision_penalty))
         if self.reference_distance is None:
             return arrays
         inverse = np.minimum(arrays.inverse_initial_distance, np.float32(1 / self.reference_distance))
@@ -109,11 +124,13 @@ class SamplingResult(NamedTuple):
         mean: ``(H, K, m)`` the last weighted mean of the deformations.
         rewards: ``(N,)`` mean reward of the samples at each step done: fewer than asked for where the run was stopped.
         excluded: Samples left out because their reward was not finite.
+        noise_factor: Factors on the noise that a next step would have, that go with ``(H, K, m)``.
     """
 
     mean: FloatArray
     rewards: FloatArray
     excluded: int
+    noise_factor: float | FloatArray = 1.0
 
 
 class DenoisingStep(NamedTuple):

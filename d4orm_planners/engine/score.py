@@ -32,6 +32,7 @@ from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide
 from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_stepper, models_key, models_of_kernel
 from d4orm_env.engine.tile_layout import READ, WRITE, Row
 from d4orm_planners.engine.proximity import (
+    DIGITS,
     Bodies,
     Scratch,
     enclose,
@@ -85,12 +86,16 @@ class Scoring(NamedTuple):
         collisions: Whether robots count when near each other or near a moving body.
         bodies: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`.
         bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`.
+        penalties: ``(K,)`` what a violation costs per step.
+        per_pair: Whether it costs so much for every robot and body that is near.
     """
 
     docked: BoolArray
     collisions: bool
     bodies: Bodies
     bounds: FloatArray
+    penalties: FloatArray
+    per_pair: bool
 
 
 Score: TypeAlias = Kernel[[ProblemArrays, Scoring, Drawing, IntArray, Workspace, FloatArray, FloatArray], None]
@@ -205,12 +210,15 @@ def _stay(dimension: int, w: FloatArray, places: FloatArray) -> None:
 
 
 @inlined
-def _punish_near(near: NDArray[np.uint64], count: int, penalty: np.float32, w: FloatArray) -> None:
-    """Take the penalty from the robots that are near each other or a body, in the steps of a block."""
-    for k in range(near.shape[0]):
-        for step in range(count):
-            if near[k, step] != NOWHERE:
-                subtract_where(w, k * STRIDE + TOTAL * TILE, near[k, step], penalty)
+def _punish_near(near: NDArray[np.uint64], digits: int, count: int, penalties: FloatArray, w: FloatArray) -> None:
+    """Take the penalties from the robots that are near each other or a body, in the steps of a block."""
+    for k in range(near.shape[1]):
+        cost = penalties[k]
+        for digit in range(digits):
+            for step in range(count):
+                if near[digit, k, step] != NOWHERE:
+                    subtract_where(w, k * STRIDE + TOTAL * TILE, near[digit, k, step], cost)
+            cost += cost
 
 
 @inlined
@@ -227,7 +235,7 @@ def _score_tile(
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     moved, keys, scratch, offset, scale = space.moved, space.keys, space.scratch, drawing.offset, drawing.scale
     turns, shaped = space.turns, arrays.footprints.inner.shape[0] > 0
-    penalty, bounds = arrays.collision_penalty, scoring.bounds
+    penalties, bounds, digits = scoring.penalties, scoring.bounds, DIGITS if scoring.per_pair else 1
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
     # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
@@ -274,10 +282,10 @@ def _score_tile(
                     if shaped and touch != NOWHERE:
                         touch = refine_static(arrays, k, touch, margin, rows, 0, own_turns, step * TILE, scratch.buffer)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
-                    subtract_where(robot, TOTAL * TILE, touch, steps * penalty)
+                    subtract_where(robot, TOTAL * TILE, touch, steps * penalties[k])
         if scoring.collisions:
-            mark_robots(arrays, scoring.bodies, first, count, places, turns, scratch)
-            _punish_near(scratch.near, count, penalty, w)
+            mark_robots(arrays, scoring.bodies, digits, first, count, places, turns, scratch)
+            _punish_near(scratch.near, digits, count, penalties, w)
 
 
 def score_kernel(models: tuple[str, ...]) -> Score:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from operator import attrgetter
@@ -41,6 +41,15 @@ class Paired:
     success_p: float
     difference: float
     cost_p: float
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P values corrected for how many there are by Holm's method, in their order."""
+    order = np.argsort(p_values, kind="stable")
+    left = len(p_values) - np.arange(len(p_values))
+    corrected = np.empty(len(p_values))
+    corrected[order] = np.minimum(np.maximum.accumulate(np.asarray(p_values, float)[order] * left), 1)
+    return [float(value) for value in corrected]
 
 
 def paired(
@@ -222,14 +231,20 @@ def is_solved(trial: Trial) -> bool:
 
 def steps_spent(trial: Trial) -> int | None:
     """Denoising steps of a whole trial; ``None`` where they are not known."""
-    steps = json.loads(trial.config).get("num_steps")
-    return None if steps is None or not trial.iterations else trial.iterations * int(steps)
+    steps = _iteration_steps(json.loads(trial.config))
+    return None if steps is None or not trial.iterations else trial.iterations * steps
 
 
 def penalised_steps(trial: Trial) -> int:
     """:func:`steps_to_solution`, and twice all the steps that there were where it found none (PAR-2)."""
     steps, config = steps_to_solution(trial), json.loads(trial.config)
-    return 2 * int(config["num_steps"] * config["max_iterations"]) if steps is None else steps
+    return 2 * (_iteration_steps(config) or 0) * int(config["max_iterations"]) if steps is None else steps
+
+
+def _iteration_steps(config: Mapping[str, Any]) -> int | None:
+    """Denoising steps of an iteration with these settings; ``None`` where there are none."""
+    steps = config.get("check_every") or config.get("num_steps")
+    return None if steps is None else int(steps)
 
 
 @dataclass(frozen=True, eq=False)

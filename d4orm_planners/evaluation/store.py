@@ -17,7 +17,7 @@ from d4orm_env.core.arrays import shown
 
 APPLICATION_ID = 0x64346F72
 """Marks the file as one of ours, in its header ("d4or")."""
-VERSION = 9
+VERSION = 10
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
 LARGEST_NUMBER = 2**63 - 1
@@ -92,6 +92,7 @@ class Trial:
         mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
         iterations: Iterations of the planner; ``None`` for a policy that executes no plan.
+        denoising_share: Share of them that denoised; 0 where the plan is search's and path finding's alone.
         status: End of its solve, see :class:`d4orm_planners.base.plan.Plan`.
         wall_time: Seconds spent planning, or choosing actions.
         preparation: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a
@@ -135,6 +136,7 @@ class Trial:
     mean_squared_jerk: float | None = None
     steps: int = 0
     iterations: int | None = None
+    denoising_share: float | None = None
     status: str = ""
     wall_time: float | None = None
     preparation: float | None = None
@@ -154,6 +156,11 @@ class Trial:
     def progress(self) -> list[BestSoFar]:
         """:attr:`history`, point by point."""
         return [BestSoFar(*point) for point in json.loads(self.history)]
+
+    @property
+    def denoising_steps(self) -> int | None:
+        """Denoising steps until the last better plan; ``None`` where they are not known."""
+        return self.progress[-1].steps if self.progress else None
 
 
 _NAMES = tuple(field.name for field in fields(Trial))

@@ -108,6 +108,8 @@ class SuccessRate(Compared):
         travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
         travel_time_upper: Upper end.
         stretch: Mean over the successes of the path travelled over the shortest path; ``None`` without any.
+        denoising_steps: Median denoising steps until the last better plan; ``None`` where no plan is executed.
+        denoising_share: Mean share of the iterations that denoised, where it is known.
         wall_time: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors.
         decision: Median seconds of choosing the actions of one step, without what came before the first one; ``None``
             if all raised errors.
@@ -124,6 +126,8 @@ class SuccessRate(Compared):
     travel_time_lower: float | None
     travel_time_upper: float | None
     stretch: float | None
+    denoising_steps: float | None
+    denoising_share: float | None
     wall_time: float | None
     decision: float | None
     training_time: float | None
@@ -204,6 +208,8 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
     successes = [trial for trial in trials if trial.success]
     travel = mean_interval([trial.travel_time for trial in successes if trial.travel_time is not None])
     stretch = [trial.stretch for trial in successes if trial.stretch is not None]
+    steps = [trial.denoising_steps for trial in trials if trial.denoising_steps is not None]
+    shares = [trial.denoising_share for trial in trials if trial.denoising_share is not None]
     timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
     compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
     choosing = [
@@ -220,6 +226,8 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         travel_time_lower=travel[1],
         travel_time_upper=travel[2],
         stretch=float(np.mean(stretch)) if stretch else None,
+        denoising_steps=float(np.median(steps)) if steps else None,
+        denoising_share=float(np.mean(shares)) if shares else None,
         wall_time=float(np.median([seconds for seconds, _ in timed])) if timed else None,
         decision=float(np.median(choosing)) if choosing else None,
         training_time=max((trial.training_time for trial in trials if trial.training_time is not None), default=None),

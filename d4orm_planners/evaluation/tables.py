@@ -28,7 +28,7 @@ MAX_TRIALS, MAX_BYTES = 10**7, 2**32
 """Limits of a Parquet file that is read."""
 PARQUET_HINT = "trials.parquet is not written, which needs pyarrow; install it with: pip install 'd4orm-env[evaluate]'"
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
-          "travel time, s", "stretch", "planning, s", "decision, ms", "training, min",
+          "travel time, s", "stretch", "denoising steps", "denoising", "planning, s", "decision, ms", "training, min",
           "computing per s of motion, s")  # fmt: skip
 
 
@@ -175,6 +175,8 @@ def _cells(rate: SuccessRate, disturbed: bool) -> tuple[str, ...]:
         *(str(count) for count in (rate.verified, rate.contacts, rate.late, rate.errors)),
         _interval(rate.travel_time, rate.travel_time_lower, rate.travel_time_upper, 2),
         "-" if rate.stretch is None else f"{rate.stretch:.2f}",
+        "-" if rate.denoising_steps is None else f"{rate.denoising_steps:g}",
+        "-" if rate.denoising_share is None else f"{rate.denoising_share:.0%}",
         "-" if rate.wall_time is None else f"{rate.wall_time:.2f}",
         "-" if rate.decision is None else f"{1e3 * rate.decision:.2f}",
         "-" if rate.training_time is None else f"{rate.training_time / 60:.0f}",

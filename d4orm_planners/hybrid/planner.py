@@ -13,8 +13,8 @@ from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
-from d4orm_planners.d4orm_d.groups import Groups
 from d4orm_planners.d4orm_d.planner import D4ormD, straight_start
+from d4orm_planners.d4orm_d.planner import State as DecouplingState
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.hybrid.settings import HybridConfig
@@ -31,7 +31,7 @@ from d4orm_planners.mapf.planner import (
     roadmap_iteration,
 )
 
-State = Groups | Repairs | RoadmapSolution
+State = DecouplingState | RoadmapSolution
 """State between iterations: the repairer's, or the roadmap solution once there is one."""
 
 REPLANNING = MAPFConfig()
@@ -78,18 +78,18 @@ class Hybrid(Planner):
             return state, solution.explained(iteration)
         return self.without_paths(search, state)
 
-    def without_paths(self, search: SolveRun, state: Groups | Repairs) -> tuple[State, Iteration]:
+    def without_paths(self, search: SolveRun, state: DecouplingState) -> tuple[State, Iteration]:
         """Start straight or with the whole team, repair robots that fail, then improve."""
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
         if self.improves_by_lns and search.best.solved:
             return state, improve_by_lns(search)
-        if not search.current.unsolved.any() or (isinstance(state, Groups) and search.best.solved):
+        if not isinstance(state, Repairs):
+            return self.denoiser.replan(search, state)
+        if not search.current.unsolved.any():
             return self.whole_team(search, state)
         team = DeformedPlan(self.denoiser, search, search.current.trajectory, search.current.report)
-        if isinstance(state, Groups):
-            return state.replan(team), team.iteration()
         return self.repair(team, state), team.iteration()
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
@@ -104,7 +104,7 @@ class Hybrid(Planner):
         self.improve_first(team)
         return state
 
-    def whole_team(self, search: SolveRun, state: Groups | Repairs) -> tuple[State, Iteration]:
+    def whole_team(self, search: SolveRun, state: DecouplingState) -> tuple[State, Iteration]:
         """Deform all controls at once, as D4orm-D does, and improve them if none fails."""
         state, iteration = self.denoiser.whole_team(search, state)
         if not isinstance(state, Repairs):

@@ -22,7 +22,7 @@ from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
-from d4orm_env.engine.stepping import docking_of, models_key
+from d4orm_env.engine.stepping import Docking, docking_of, models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_checks import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
@@ -127,7 +127,7 @@ def _block_driver(model: Model) -> Callable[..., tuple[Row, Row, bool, float, fl
     @inlined
     def drive_block(
         arrays: ProblemArrays, moves: Moves, number: int, states: FloatArray, faults: float, goal: FloatArray, at: Row,
-        limits: Row, docking: tuple[np.float32, np.float32, np.bool_], reach: np.float32, steps: tuple[Whole, Whole],
+        limits: Row, docking: Docking, reach: np.float32, steps: tuple[Whole, Whole],
         path: FloatArray,
     ) -> tuple[Row, Row, bool, float, float]:  # fmt: skip
         dt, closed, goal_radius = arrays.time_step, is_closed(arrays), np.sqrt(arrays.squared_goal_radius)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.settings import Positive, Share
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingRules
-from d4orm_planners.sampling.loop import SamplingPlanner
+from d4orm_planners.sampling.loop import NextStep, SamplingPlanner
 from d4orm_planners.sampling.schedule import constant
 from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig
 from d4orm_planners.sampling.tuned import TUNED
@@ -28,12 +29,22 @@ class CEMConfig(ContinuationSettings, SamplingConfig):
         sigma: Standard deviation of the samples of an iteration's first step.
         adapt_variance: Let the variance follow that of the elite, as the method is usually written.
         sigma_floor: Smallest standard deviation that the adaptation may reach.
+        carry_variance: Whether an iteration begins with the last one's variance, as in the authors' published code.
+
+    Raises:
+        ValueError: If variance is to be carried over that is not adapted.
     """
 
     elite_fraction: Share = 0.05
     sigma: Positive = 1.0
     adapt_variance: bool = False
     sigma_floor: Positive = 0.05
+    carry_variance: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.carry_variance and not self.adapt_variance:
+            raise ValueError("carry_variance is True, but the variance stays as it is; set adapt_variance=True")
 
 
 @dataclass(frozen=True)
@@ -53,7 +64,17 @@ class CEM(SamplingPlanner):
 
     name: ClassVar[str] = "cem"
     config_class = CEMConfig
-    presets: ClassVar = {"paper": PAPER, "tuned": {**PAPER, **TUNED["cem"]}}
+    presets: ClassVar = {
+        "paper": PAPER,
+        "authors": {
+            **PAPER,
+            "penalty_per_pair": True,
+            "adapt_variance": True,
+            "sigma_floor": 0.1,
+            "carry_variance": True,
+        },
+        "tuned": {**PAPER, **TUNED["cem"]},
+    }
     config: CEMConfig
 
     def noise_scale(self) -> FloatArray:
@@ -65,6 +86,15 @@ class CEM(SamplingPlanner):
         config = self.config
         adapt = EliteDeviation(config.sigma, config.sigma_floor) if config.adapt_variance else None
         return SamplingRules(weights=EliteWeights(config.elite_fraction), adapt=adapt)
+
+    def iterate(self, search: SolveRun, state: NextStep | None) -> tuple[NextStep, Iteration]:
+        """See :meth:`Planner.iterate`."""
+        base, mean = self.initial(search)
+        task = self.task(search, base)
+        if self.config.carry_variance and state is not None:
+            task = replace(task, noise_factor=state.noise_factor)
+        iteration, following = self.sampled(search, task, self.credited(search), mean, self.stages(search))
+        return following, iteration
 
     def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
         """See :meth:`SamplingPlanner.initial`."""

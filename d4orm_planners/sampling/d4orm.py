@@ -22,6 +22,9 @@ many times as many samples it draws meanwhile."""
 
 PAPER_DEFORMATION = {**PAPER, "credit": "team", "penalty": 1.0, "late_samples": 1.0, "random_start": False}
 
+AUTHORS_DEFORMATION = {**PAPER_DEFORMATION, "penalty_per_pair": True}
+"""The same as in the code that the paper's authors published (proroklab/d4orm, 8ea43d73)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DeformationConfig(ContinuationSettings, DenoisingConfig):
@@ -91,7 +94,11 @@ class D4orm(DeformingPlanner):
 
     name: ClassVar[str] = "d4orm"
     config_class = D4ormConfig
-    presets: ClassVar = {"paper": PAPER_DEFORMATION, "tuned": {**PAPER_DEFORMATION, **TUNED["d4orm"]}}
+    presets: ClassVar = {
+        "paper": PAPER_DEFORMATION,
+        "authors": AUTHORS_DEFORMATION,
+        "tuned": {**PAPER_DEFORMATION, **TUNED["d4orm"]},
+    }
     config: D4ormConfig
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:

@@ -9,6 +9,8 @@ standard deviations, a rule for the weights, and where an iteration starts.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,6 +28,19 @@ from d4orm_planners.sampling.schedule import alpha_bar
 from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig
 from d4orm_planners.sampling.short_paths import on_short_paths
 from d4orm_planners.sampling.weights import GroupWeights
+
+
+@dataclass(frozen=True, eq=False)
+class NextStep:
+    """Where a run of the sampling loop would go on.
+
+    Attributes:
+        mean: ``(H, K, m)`` mean of the samples.
+        noise_factor: ``(H, K, m)`` factors on their standard deviation.
+    """
+
+    mean: FloatArray
+    noise_factor: FloatArray
 
 
 class SamplingPlanner(Planner):
@@ -52,7 +67,10 @@ class SamplingPlanner(Planner):
             credit = "team" if search.iteration % 2 else "robot"
         elif credit == "group":  # the rules sum the robots' rewards
             credit = "robot"
-        return SamplingTask(search.problem, base, credit=credit, penalty=self.config.penalty)
+        return SamplingTask(
+            search.problem, base, credit=credit, penalty=self.config.penalty,
+            penalty_per_pair=self.config.penalty_per_pair,
+        )  # fmt: skip
 
     def num_samples(self, search: SolveRun) -> int:
         """``M`` of this iteration."""
@@ -70,21 +88,40 @@ class SamplingPlanner(Planner):
     def run(self, search: SolveRun) -> Iteration:
         """One run of the sampling loop over the whole team."""
         base, mean = self.initial(search)
-        task, rules = self.task(search, base), self.rules()
+        return self.sampled(search, self.task(search, base), self.credited(search), mean, self.stages(search))[0]
+
+    def credited(self, search: SolveRun) -> SamplingRules:
+        """The rules, with weights by groups where these have the credit."""
+        rules = self.rules()
+        if self.config.credit != "group":
+            return rules
+        return rules._replace(weights=GroupWeights(rules.weights, conflict_groups(search)))
+
+    def sampled(
+        self,
+        search: SolveRun,
+        task: SamplingTask,
+        rules: SamplingRules,
+        mean: FloatArray,
+        stages: Sequence[tuple[FloatArray, int]],
+    ) -> tuple[Iteration, NextStep]:
+        """One run of the sampling loop for this task, around ``mean`` ``(H, K, m)`` on top of the task's base."""
+        controls = np.zeros_like(task.base)
         if self.config.short_paths:
             task = on_short_paths(task, search)
         horizon = task.problem.horizon
         mean = np.ascontiguousarray(mean[:horizon])
-        if self.config.credit == "group":
-            rules = rules._replace(weights=GroupWeights(rules.weights, conflict_groups(search)))
         num_steps = excluded = 0
-        for stage, (noise_scale, num_samples) in enumerate(self.stages(search)):
+        factor: float | FloatArray = task.first_factor
+        for stage, (noise_scale, num_samples) in enumerate(stages):
             seed = search.iteration_seed(Stream.SAMPLES, stage)
             result = search.denoise(task, rules, mean, noise_scale, num_samples, seed)
             mean, num_steps, excluded = result.mean, num_steps + len(result.rewards), excluded + result.excluded
-        controls = np.zeros_like(base)
+            factor = result.noise_factor
+        following = NextStep(np.zeros_like(controls), np.ones_like(controls))
+        following.mean[:horizon], following.noise_factor[:horizon] = mean, factor
         controls[:horizon] = task.base + mean
-        return Iteration(self.braking(search, controls), num_steps, excluded)
+        return Iteration(self.braking(search, controls), num_steps, excluded), following
 
     def braking(self, search: SolveRun, controls: FloatArray) -> FloatArray:
         """``(H, K, m)`` the controls, with final approaches where robots must slow down for their goals."""

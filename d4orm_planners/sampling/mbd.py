@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.settings import Count, Steps
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
@@ -15,23 +16,11 @@ from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Denois
 from d4orm_planners.sampling.tuned import TUNED
 
 
-@dataclass(frozen=True, kw_only=True)
-class MBDConfig(DenoisingConfig):
-    """Settings of model-based diffusion: one run of many steps."""
-
-    num_steps: Steps = 10_000
-    max_iterations: Count = 1
-
-
-class MBD(DenoisingPlanner):
-    """Model-based diffusion: one denoising run of the controls, from pure noise (paper, Algorithm 1)."""
-
-    name: ClassVar[str] = "mbd"
-    config_class: ClassVar[type[DenoisingConfig]] = MBDConfig
-    presets: ClassVar = {"paper": {**PAPER, "num_steps": 10_000}, "tuned": {**PAPER, **TUNED["mbd"]}}
+class ControlDenoiser(DenoisingPlanner):
+    """A planner that denoises the controls themselves, not a deformation."""
 
     def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
-        """See :meth:`SamplingPlanner.initial`: the controls themselves are denoised, not a deformation."""
+        """See :meth:`SamplingPlanner.initial`."""
         return np.zeros_like(search.current.controls), self.first_mean(self.noisy_controls(search))
 
     def noisy_controls(self, search: SolveRun) -> FloatArray:
@@ -40,11 +29,61 @@ class MBD(DenoisingPlanner):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MBDConfig(DenoisingConfig):
+    """Settings of model-based diffusion: one run of many steps.
+
+    Attributes:
+        check_every: Steps of the run that an iteration does, after which its controls are evaluated; ``None`` for all.
+    """
+
+    num_steps: Steps = 10_000
+    max_iterations: Count = 1
+    check_every: Steps | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A run that is under way.
+
+    Attributes:
+        mean: ``(H, K, m)`` mean of the next step's samples.
+        done: Steps done.
+    """
+
+    mean: FloatArray
+    done: int
+
+
+class MBD(ControlDenoiser):
+    """Model-based diffusion: one denoising run of the controls, from pure noise (paper, Algorithm 1)."""
+
+    name: ClassVar[str] = "mbd"
+    config_class: ClassVar[type[DenoisingConfig]] = MBDConfig
+    # The paper evaluates the trajectory every 100 steps.
+    presets: ClassVar = {
+        "paper": {**PAPER, "num_steps": 10_000, "check_every": 100, "max_iterations": 100},
+        "tuned": {**PAPER, **TUNED["mbd"]},
+    }
+    config: MBDConfig
+
+    def iterate(self, search: SolveRun, state: Part | None) -> tuple[Part, Iteration]:
+        """See :meth:`Planner.iterate`: the next part of a run, or the first of another."""
+        base, mean = self.initial(search)
+        done = 0
+        if state is not None and state.done < self.config.num_steps:
+            mean, done = state.mean, state.done
+        end = min(done + (self.config.check_every or self.config.num_steps), self.config.num_steps)
+        stages = [(self.noise_scale()[done:end], self.config.num_samples)]
+        iteration, following = self.sampled(search, self.task(search, base), self.credited(search), mean, stages)
+        return Part(following.mean, end), iteration
+
+
+@dataclass(frozen=True, kw_only=True)
 class IterativeMBDConfig(ContinuationSettings, DenoisingConfig):
     """Settings of i-MBD."""
 
 
-class IterativeMBD(MBD):
+class IterativeMBD(ControlDenoiser):
     """i-MBD: model-based diffusion restarted from its last result as if that were noise (paper, section IV-A)."""
 
     name: ClassVar[str] = "i-mbd"

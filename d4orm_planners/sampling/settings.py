@@ -41,6 +41,8 @@ class SamplingConfig(PlannerConfig):
             weights by the reward of those that a robot was in conflict with, directly or by others, in the last plan.
         penalty: Factor of the problem's collision penalty, 1 in the paper. A robot's own reward does not tell what
             touching it costs the other, so that going through can be cheaper than making way; 2 makes up for that.
+        penalty_per_pair: Whether it is taken for every robot that a robot is too close to, as in the authors' published
+            code, rather than once, as in the paper. All obstacles together count once.
         short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
             each other takes, by rewards that make up for the shortness (:mod:`d4orm_planners.sampling.short_paths`).
             The paper always samples all steps.
@@ -53,6 +55,7 @@ class SamplingConfig(PlannerConfig):
     num_steps: Steps = 100
     credit: Credit = "team"
     penalty: Positive = 1.0
+    penalty_per_pair: bool = False
     short_paths: bool = True
     final_approach: bool = True
 

@@ -42,7 +42,8 @@ def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
     slack = SLACK + SLACK_GROWTH * search.iteration
     horizon = min(problem.horizon, math.ceil(slack * float(drive_times(problem, lengths).max()) / problem.dt))
     part = problem.with_state(problem.start, problem.goal, horizon=horizon)
-    return replace(task, problem=part, base=np.ascontiguousarray(task.base[:horizon]), reference_distance=reference)
+    base, factor = np.ascontiguousarray(task.base[:horizon]), task.first_factor[:horizon]
+    return replace(task, problem=part, base=base, noise_factor=factor, reference_distance=reference)
 
 
 def drive_times(problem: Problem, lengths: Floats) -> Floats:

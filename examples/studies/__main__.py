@@ -20,8 +20,8 @@ from d4orm_planners.cli.app import main as d4orm
 DATA = Path(__file__).parent / "data"
 STUDIES = (
     "ablation", "amswarm_gaps", "contact_penalty", "credit_by_update", "disturbance_study", "fewer_samples",
-    "gradient_dilution", "imitate_expert", "lifelong", "multimodality", "multimodality_team", "paper_differences",
-    "policy_rates", "scaling", "solve_rates", "tune_learners", "tuned_rivals", "warm_start",
+    "gradient_dilution", "head_to_head", "imitate_expert", "lifelong", "multimodality", "multimodality_team",
+    "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners", "tuned_rivals", "warm_start",
 )  # fmt: skip
 """Studies whose trials are in a file of their name."""
 TIMED = ("big-teams", "coarseness", "ipopt")
@@ -49,6 +49,16 @@ def main() -> int:
     for figure in FIGURES:
         times = () if figure in TIMED else ("--no-times",)
         run("paper.__main__", figure, "--trials", DATA / f"{figure}.parquet", *times, "--out", out)
+    for figure in ("big-teams", "coarseness"):
+        run(
+            "paper.__main__",
+            figure,
+            "--trials",
+            DATA / "algorithm_4.parquet",
+            "--no-times",
+            "--out",
+            out / "algorithm_4",
+        )
     d4orm(["leaderboard", str(DATA / "leaderboard.parquet"), "--out", str(out / "leaderboard.md")])
     return 0
 

@@ -37,7 +37,7 @@ CREDITS: dict[str, dict[str, Any]] = {
 UPDATES: dict[str, dict[str, Any]] = {
     "mppi": {},
     "cem": {"adapt_variance": True},
-    "mbd": {"max_iterations": 1},
+    "mbd": {"max_iterations": 1, "check_every": None},
     "i-mbd": {},
     "d4orm": {},
 }

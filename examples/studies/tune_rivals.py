@@ -83,7 +83,7 @@ def policy(method: str, settings: Settings, budget: int) -> Settings:
     """The settings as a study takes them, with as many iterations as the budget has room for."""
     chosen: Settings = {"policy": method, "preset": "paper", "engine": "cpu", **settings}
     if method == "mbd":
-        chosen["num_steps"] = budget
+        chosen |= {"num_steps": budget, "check_every": None}
     chosen["num_steps"] = min(chosen.get("num_steps", 100), budget)
     return {**chosen, "max_iterations": budget // chosen["num_steps"]}
 

@@ -149,6 +149,7 @@ def test_lists(d4orm, command: str) -> None:
         ("cem", {"sigma", "elite_fraction"}, "temperature"),
         ("d-d4orm", {"planner", "nodes", "late_samples"}, "repair_steps"),
         ("d4orm-c2f", {"weight_cutoff", "deadline"}, "nodes"),
+        ("d4orm-d", {"penalty_rise", "paper, authors"}, "nodes"),
         ("go-to-goal", {"no settings"}, "sigma"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d4orm_planners.evaluation.comparison import paired, penalised_steps, steps_to_solution, survival
+from d4orm_planners.evaluation.comparison import holm, paired, penalised_steps, steps_to_solution, survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import wilson_interval
 
@@ -97,3 +97,9 @@ def test_steps_are_those_of_the_iterations() -> None:
     (missed,) = trials([None], config=config, status="iteration_limit", iterations=20)
     assert (steps_to_solution(found), penalised_steps(found)) == (150, 150)
     assert (steps_to_solution(missed), penalised_steps(missed)) == (None, 2000)
+
+
+def test_holm_multiplies_by_the_tests_that_are_left_and_never_turns_round() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.5]) == pytest.approx([0.04, 0.09, 0.09, 0.5])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []

@@ -458,7 +458,16 @@ def test_a_disk_that_fills_up_while_exporting_is_one_line(
 
 def test_the_table_row_by_row(tmp_path: Path) -> None:
     rows = [
-        trial(0, wall_time=0.25, preparation=0.1, travel_time=4.0, stretch=1.25, training_time=1170.0),
+        trial(
+            0,
+            denoising_share=0.5,
+            history="[[0.1,1,0.5,40]]",
+            wall_time=0.25,
+            preparation=0.1,
+            travel_time=4.0,
+            stretch=1.25,
+            training_time=1170.0,
+        ),
         trial(1, travel_time=6.0, stretch=1.75),
         trial(2, success=False, verified=False, collided=2),
     ]
@@ -468,10 +477,11 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "### circle, 2 robots, holonomic2d",
         "",
         "| policy | noise | success | 95% interval | verified | contact | not in time | errors | travel time, s | "
-        "stretch | planning, s | decision, ms | training, min | computing per s of motion, s |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "stretch | denoising steps | denoising | planning, s | decision, ms | training, min | "
+        "computing per s of motion, s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
         # The interval of two values, 4 and 6: half of it is 12.7062 * sqrt(2) / sqrt(2).
-        "| d4orm | 0 | 2 of 3 (67%) | 21% to 94% | 2 | 1 | 0 | 0 | 5.00 (-7.71 to 17.71) | 1.50 | 0.50 | "
+        "| d4orm | 0 | 2 of 3 (67%) | 21% to 94% | 2 | 1 | 0 | 0 | 5.00 (-7.71 to 17.71) | 1.50 | 40 | 50% | 0.50 | "
         "2.50 | 20 | 0.069 (0.010 to 0.129) |",
     ]
 

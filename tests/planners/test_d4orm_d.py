@@ -14,7 +14,7 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
-from d4orm_planners.base.conflict_groups import conflicts, failure_groups, reconnected
+from d4orm_planners.base.conflict_groups import conflicts, failure_groups, regrouped
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
@@ -88,7 +88,8 @@ def test_the_paper_preset_replans_exactly_the_groups_that_fail(clip: bool) -> No
     for _ in range(4):
         before = search.current
         graph = conflicts(before.trajectory.positions, CROSSING.team.radius, CROSSING.margin)
-        groups = failure_groups(before.failed, reconnected(graph, previous))
+        grouping = regrouped(graph, previous)
+        groups = failure_groups(before.failed, grouping.groups)
         replanned = {robot for group in groups for robot in group}
         search.advance()
         # Clipping what is clipped already may change the last bit.
@@ -97,7 +98,7 @@ def test_the_paper_preset_replans_exactly_the_groups_that_fail(clip: bool) -> No
         kept = [k for k in range(12) if k not in replanned]
         went_on_from = before.controls if clip else before.planned
         np.testing.assert_allclose(search.current.planned[:, kept], went_on_from[:, kept], atol=1e-6)
-        previous = graph
+        previous = grouping
 
 
 def test_the_first_iteration_of_the_paper_preset_minds_no_collisions() -> None:
@@ -107,6 +108,18 @@ def test_the_first_iteration_of_the_paper_preset_minds_no_collisions() -> None:
     assert not planner.task(search, search.current.controls).collisions
     search.advance()
     assert planner.task(search, search.current.controls).collisions
+
+
+def test_a_plan_that_the_paper_preset_makes_better_keeps_apart() -> None:
+    """Without contacts in mind all would cut through the middle."""
+    problem = make_problem("circle", num_robots=4, goal_speed=np.inf)
+    solved = make_planner("d4orm", engine="cpu").solve(problem, seed=0)
+    assert solved.solved
+    search = SolveRun(
+        make_planner("d4orm-d", preset="paper", engine="cpu", improve=True, num_samples=256, num_steps=20),
+        problem, 0, solved.controls,
+    )  # fmt: skip
+    assert not search.advance().num_margin_violated
 
 
 def test_an_independent_repair_leaves_whoever_does_not_fail_alone() -> None:
@@ -250,14 +263,90 @@ def test_failures_name_robots_and_reasons() -> None:
 @pytest.mark.parametrize(
     ("setting", "value", "message"),
     [
-        ("decoupling", "all", "decoupling 'all' is unknown; choose one of independent, groups"),
+        ("decoupling", "all", "decoupling 'all' is unknown; choose one of independent, groups, joint"),
         ("start", "zero", "start 'zero' is unknown; choose one of auto, team, straight"),
         ("first_collisions", 1, "first_collisions must be True or False"),
         ("repair_samples", 1, "repair_samples is 1.*at least 2"),
         ("repair_steps", 0, "repair_steps is 0.*at least 1"),
         ("penalty", 0, "penalty is 0.*positive"),
+        ("penalty_rise", 0.5, "penalty_rise is 0.5; it goes with decoupling 'joint', not 'independent'"),
+        ("clip_after", 6, "clip_after is 6; it goes with decoupling 'joint'"),
+        ("reset_after_probe", True, "reset_after_probe is True; it goes with decoupling 'joint'"),
     ],
 )
 def test_a_bad_setting_is_refused_by_name(setting: str, value: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_planner("d4orm-d", **{setting: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"clip_between_iterations": True}, "clip_after is 6, but every iteration is clipped; set clip_between"),
+        ({"first_collisions": True}, "reset_after_probe is True.*set first_collisions=False, or start='straight'"),
+        ({"penalty": 4.0}, "penalty_limit 3 is below penalty 4; raise it"),
+        ({"decoupling": "groups"}, "penalty_rise is 0.5; it goes with decoupling 'joint', not 'groups'"),
+    ],
+)
+def test_settings_that_contradict_the_authors_preset_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_planner("d4orm-d", preset="authors", **settings)
+
+
+class Lost(Recorded):
+    """Keeps how it was asked to sample, and the groups; deformations are nothing, so that failures repeat."""
+
+    def denoise(self, task: Any, rules: Any, mean: Any, noise_scale: Any, *more: Any, **options: Any) -> Any:
+        self.tasks.append(task)
+        self.groups = getattr(rules.weights, "groups", None)
+        return SamplingResult(np.zeros_like(mean), np.zeros(len(noise_scale), np.float32), 0)
+
+
+def meeting_in_pairs() -> tuple[Problem, np.ndarray]:
+    """Robots 0 and 1 drive into each other, 2 drives home by itself, and 3 never does; all by far too much."""
+    start = [[0, 0, 0, 0], [3, 0, 0, 0], [0, 5, 0, 0], [0, 9, 0, 0]]
+    problem = Problem(
+        Team(("holonomic2d",) * 4), start, [[3, 0], [0, 0], [3, 5], [3, 9]], horizon=80, goal_speed=np.inf
+    )
+    controls = np.zeros((80, 4, 2), np.float32)
+    controls[:, :3, 0] = [5, -5, 5]
+    return problem, controls
+
+
+def test_the_joint_run_deforms_who_fails_by_groups_and_raises_penalties() -> None:
+    problem, controls = meeting_in_pairs()
+    engine = Lost()
+    search = SolveRun(make_planner("d4orm-d", preset="authors", engine="cpu"), problem, 0, controls, engine)
+    for _ in range(8):
+        search.advance()
+    first = engine.tasks[0]
+    assert engine.groups == ((0, 1), (2,), (3,))
+    assert first.credit == "robot"
+    assert first.collisions
+    assert first.penalty_per_pair
+    np.testing.assert_array_equal(first.first_factor.any(axis=(0, 2)), [True, True, False, True])
+    risen = [task.penalties[:2].tolist() for task in engine.tasks[:6]]
+    assert risen == [[1, 1], [1.5, 1.5], [2, 2], [2.5, 2.5], [3, 3], [3, 3]]
+    assert all((task.penalties[2:] == 1).all() for task in engine.tasks)
+    # As wide as they were until the failure has come back six times.
+    assert [float(task.base[0, 0, 0]) for task in engine.tasks] == [5] * 6 + [1] * 2
+
+
+@pytest.mark.parametrize("start", ["team", "straight"])
+def test_after_the_probe_of_the_authors_preset_only_the_groups_stay(start: str) -> None:
+    problem, _ = meeting_in_pairs()
+    engine = Lost()
+    search = SolveRun(make_planner("d4orm-d", preset="authors", engine="cpu", start=start), problem, 0, None, engine)
+    search.advance()
+    assert len(engine.tasks) == (start == "team")
+    if start == "team":
+        probe = engine.tasks.pop()
+        assert probe.credit == "robot"
+        assert not probe.collisions
+    search.advance()
+    assert not engine.tasks[0].base.any()
+    assert engine.groups == (((0,), (1,), (2,), (3,)) if start == "team" else ((0, 1), (2,), (3,)))
+
+
+def test_the_authors_preset_solves_a_circle() -> None:
+    assert_solves({"scenario": "paper_circle", "num_robots": 8}, 0, preset="authors", num_samples=256)

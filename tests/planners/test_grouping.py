@@ -12,12 +12,14 @@ from hypothesis.extra.numpy import arrays
 
 from d4orm_planners.base.conflict_groups import (
     Graph,
+    Grouping,
     components,
     conflicts,
     failure_groups,
     graph_of,
     independent_robots,
     reconnected,
+    regrouped,
 )
 
 MAX_ROBOTS = 7
@@ -33,6 +35,11 @@ def edges(conflicts: Graph) -> list[tuple[int, int]]:
     assert all(robot in conflicts[other] for robot, others in enumerate(conflicts) for other in others)
     assert not any(robot in others for robot, others in enumerate(conflicts))
     return sorted((robot, other) for robot, others in enumerate(conflicts) for other in others if robot < other)
+
+
+def first(graph: Graph) -> Grouping:
+    """Groups of a first iteration with these conflicts."""
+    return regrouped(graph, None)
 
 
 def graphs(num_robots: int) -> st.SearchStrategy[Graph]:
@@ -155,38 +162,45 @@ def test_without_a_previous_iteration_the_conflicts_stay_as_they_are() -> None:
 
 def test_robot_that_conflicts_outside_its_old_group_gets_its_free_neighbours_back() -> None:
     """0 and 1 conflicted; 0 has got out of it and into 2's way: 1 is likely to be in the way again."""
-    assert edges(reconnected(graph(3, (0, 2)), graph(3, (0, 1)))) == [(0, 1), (0, 2)]
+    assert edges(reconnected(graph(3, (0, 2)), first(graph(3, (0, 1))))) == [(0, 1), (0, 2)]
 
 
 def test_direct_neighbours_only_are_brought_back() -> None:
     """Of the old chain 0-1-2, robot 0 conflicts with 3 now: 1 comes back and 2 does not."""
-    assert edges(reconnected(graph(4, (0, 3)), graph(4, (0, 1), (1, 2)))) == [(0, 1), (0, 3)]
+    assert edges(reconnected(graph(4, (0, 3)), first(graph(4, (0, 1), (1, 2))))) == [(0, 1), (0, 3)]
 
 
 def test_neighbours_that_are_in_conflict_themselves_are_not_brought_back() -> None:
     """1 has a conflict of its own, with 4, and so a group of its own; 2 is free."""
     now, before = graph(5, (0, 3), (1, 4)), graph(5, (0, 1), (0, 2))
-    assert edges(reconnected(now, before)) == [(0, 2), (0, 3), (1, 4)]
+    assert edges(reconnected(now, first(before))) == [(0, 2), (0, 3), (1, 4)]
 
 
 def test_conflict_within_the_old_group_brings_nobody_back() -> None:
     """2 is in the old group of 0, though not its neighbour then."""
-    assert edges(reconnected(graph(3, (0, 2)), graph(3, (0, 1), (1, 2)))) == [(0, 2)]
+    assert edges(reconnected(graph(3, (0, 2)), first(graph(3, (0, 1), (1, 2))))) == [(0, 2)]
 
 
 def test_robot_that_was_in_no_conflict_brings_nobody_back() -> None:
-    assert edges(reconnected(graph(4, (2, 3)), graph(4, (0, 1)))) == [(2, 3)]
+    assert edges(reconnected(graph(4, (2, 3)), first(graph(4, (0, 1))))) == [(2, 3)]
 
 
 def test_robots_of_two_old_groups_that_meet_bring_both_back() -> None:
     now, before = graph(4, (1, 2)), graph(4, (0, 1), (2, 3))
-    assert edges(reconnected(now, before)) == [(0, 1), (1, 2), (2, 3)]
+    assert edges(reconnected(now, first(before))) == [(0, 1), (1, 2), (2, 3)]
+
+
+def test_whoever_was_brought_back_is_of_the_old_group() -> None:
+    """1 was brought back to 0 and 2, and so has met nobody new when it meets 2."""
+    earlier = regrouped(graph(3, (0, 2)), first(graph(3, (0, 1))))
+    assert earlier.groups == ((0, 1, 2),)
+    assert edges(reconnected(graph(3, (1, 2)), earlier)) == [(1, 2)]
 
 
 @given(teams())
 def test_reconnection_only_adds_old_conflicts_of_a_free_robot(team: Any) -> None:
     _, now, before = team
-    joined = reconnected(now, before)
+    joined = reconnected(now, first(before))
     added = set(edges(joined)) - set(edges(now))
     assert set(edges(now)) <= set(edges(joined))
     assert added <= set(edges(before))
@@ -198,7 +212,7 @@ def test_reconnection_only_adds_old_conflicts_of_a_free_robot(team: Any) -> None
 @given(teams())
 def test_the_same_conflicts_again_bring_nobody_back(team: Any) -> None:
     now = team[1]
-    assert reconnected(now, now) == now
+    assert reconnected(now, first(now)) == now
 
 
 # Groups
@@ -207,24 +221,24 @@ def test_the_same_conflicts_again_bring_nobody_back(team: Any) -> None:
 def test_failure_groups_of_a_team_with_every_kind_of_robot() -> None:
     """0 and 3 conflict; 1 does not arrive; 2 and 4 succeed."""
     failed = np.array([True, True, False, True, False])
-    assert failure_groups(failed, graph(5, (0, 3))) == ((0, 3), (1,))
+    assert failure_groups(failed, components(graph(5, (0, 3)))) == ((0, 3), (1,))
 
 
 def test_successful_robot_brought_back_is_in_the_group() -> None:
     failed = np.array([True, False, True, False])
-    joined = reconnected(graph(4, (0, 2)), graph(4, (0, 1)))
-    assert failure_groups(failed, joined) == ((0, 1, 2),)
+    joined = reconnected(graph(4, (0, 2)), first(graph(4, (0, 1))))
+    assert failure_groups(failed, components(joined)) == ((0, 1, 2),)
 
 
 def test_team_without_failure_has_no_groups() -> None:
-    assert failure_groups(np.zeros(3, bool), graph(3)) == ()
+    assert failure_groups(np.zeros(3, bool), components(graph(3))) == ()
 
 
 @given(teams())
 def test_every_failed_robot_is_in_one_group_and_nobody_in_two(team: Any) -> None:
     failed, now, before = team
-    for matrix in (now, reconnected(now, before)):
-        groups = failure_groups(failed, matrix)
+    for matrix in (now, reconnected(now, first(before))):
+        groups = failure_groups(failed, components(matrix))
         members = [robot for group in groups for robot in group]
         assert len(members) == len(set(members))
         assert set(np.flatnonzero(failed)) <= set(members)
@@ -237,7 +251,8 @@ def test_every_failed_robot_is_in_one_group_and_nobody_in_two(team: Any) -> None
 @given(teams())
 def test_before_reconnection_nobody_successful_is_in_a_group(team: Any) -> None:
     failed, now, _ = team
-    assert {robot for group in failure_groups(failed, now) for robot in group} == set(np.flatnonzero(failed))
+    groups = failure_groups(failed, components(now))
+    assert {robot for group in groups for robot in group} == set(np.flatnonzero(failed))
 
 
 # Independent robots

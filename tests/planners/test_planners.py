@@ -29,6 +29,7 @@ from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS, describe_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
+from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.loop import SamplingPlanner, standard_normal
 from d4orm_planners.sampling.schedule import alpha_bar, annealed
@@ -517,7 +518,8 @@ def test_the_paper_presets_of_the_methods_own_parameters() -> None:
     assert make_planner("mppi", preset="paper").config.sigma == 1
     cem = make_planner("cem", preset="paper").config
     assert (cem.elite_fraction, cem.sigma, cem.adapt_variance) == (0.05, 1, False)
-    assert make_planner("mbd", preset="paper").config.max_iterations == 1
+    mbd = make_planner("mbd", preset="paper").config
+    assert mbd.num_steps == mbd.check_every * mbd.max_iterations == 10_000
 
 
 @WITH_PRESETS
@@ -708,6 +710,36 @@ def test_mbd_goes_on_from_noise_again() -> None:
         noise, list(alpha_bar(STEPS, *BETAS)), draws_of(search), rewards_of(search, np.float32(0)), TEMPERATURE
     )
     assert_controls(search, expected)
+
+
+def test_mbd_is_the_same_run_however_often_it_is_looked_at() -> None:
+    """But for the noise, which is an iteration's own; and after its last step it begins anew."""
+    problem = tiny_problem(1)
+    search = start_of("mbd", problem, check_every=3)
+    scale, seen = search.planner.noise_scale(), []
+    mean = search.planner.first_mean(standard_normal(search, problem.team, problem.horizon))
+    for part in (scale[:3], scale[3:]):
+        task, rules = SamplingTask(problem, np.zeros_like(mean)), search.planner.rules()
+        mean = search.engine.denoise(task, rules, mean, part, SAMPLES, search.iteration_seed()).mean
+        seen.append(search.advance().denoising_steps)
+        np.testing.assert_allclose(search.current.planned, mean, atol=1e-5)
+    assert seen == [3, STEPS]
+    assert search.advance().denoising_steps == STEPS + 3
+
+
+def test_cem_may_carry_its_variance_over() -> None:
+    settings = {"adapt_variance": True, "sigma_floor": 0.01}
+    searches = [start_of("cem", tiny_problem(1), carry_variance=carry, **settings) for carry in (False, True)]
+    for search in searches:
+        search.advance()
+    np.testing.assert_array_equal(*(search.current.planned for search in searches))
+    first, kept = (search.state.noise_factor for search in searches)
+    np.testing.assert_array_equal(first, kept)
+    before = searches[0].current.planned
+    anew, carried = (np.abs(search.current.planned - before).max() for search in searches if search.advance())
+    assert 0 < carried < anew
+    with pytest.raises(ValueError, match=r"carry_variance is True.*set adapt_variance=True"):
+        make_planner("cem", carry_variance=True)
 
 
 @CREDIT

@@ -327,6 +327,31 @@ def test_penalty_and_reference_distance_of_a_task_change_the_rewards(
         assert result.rewards.tolist() == [pytest.approx(np.mean(expected), abs=1e-5)]
 
 
+@pytest.mark.parametrize(("per_pair", "expected"), [(False, [2.0, 2.0, 3.0]), (True, [6.0, 6.0, 9.0])])
+def test_a_penalty_may_be_each_robots_own_and_be_paid_for_every_pair(per_pair: bool, expected: list[float]) -> None:
+    """Three robots near each other, and a body between them, all the time."""
+    start = np.float32([[0, 0], [0.32, 0], [0.16, 0.277]])
+    problem = Problem(Team(("velocity2d",) * 3), start, start + np.float32([4, 0]), horizon=10)
+    moving = MovingObstacles(np.full((10, 1, 2), [0.16, 0.09], np.float32), np.float32([0.1]))
+    base = np.zeros((10, 3, 2), np.float32)
+    penalty = np.float32([2, 2, 3])
+    task = SamplingTask(problem, base, credit="robot", moving=moving, penalty=penalty, penalty_per_pair=per_pair)
+    np.testing.assert_allclose(cpu_rewards(CPU, task, 0.0, 2, 0).T, [np.negative(expected)] * 2, atol=1e-5)
+    result = JAX.denoise(task, SOFTMAX, 0 * base, np.zeros(1, np.float32), 2, 0)
+    assert result.rewards.tolist() == [pytest.approx(-np.mean(expected), abs=1e-5)]
+
+
+@pytest.mark.parametrize("engine", [CPU, JAX], ids=["cpu", "jax"])
+def test_robots_without_noise_keep_their_controls(engine: Any) -> None:
+    task = TASKS["holonomic2d"]()
+    factor = np.ones_like(task.base)
+    factor[:, 1] = 0
+    task = replace(task, credit="robot", noise_factor=factor)
+    result = engine.denoise(task, SOFTMAX, 0 * task.base, np.full(3, 0.5, np.float32), NUM_SAMPLES, 0)
+    assert not result.mean[:, 1].any()
+    assert result.mean[:, 0].any()
+
+
 def test_team_credit_is_the_mean_of_the_robots_rewards() -> None:
     task = TASKS["obstacles"]()
     team = cpu_rewards(CPU, task, 0.7, NUM_SAMPLES, 1)

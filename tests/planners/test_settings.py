@@ -22,8 +22,14 @@ KINDS: dict[str, type[CheckedSettings]] = {
     name: kind.config_class for name, kind in {**PLANNERS, **POLICIES}.items() if kind.config_class is not None
 }
 
-NETWORK = {"transport": "zenoh", "mode": "async", "node": 0}
-"""What the number of a node needs beside it."""
+JOINT: dict[str, Any] = {"decoupling": "joint", "clip_between_iterations": False}
+BESIDE: dict[str, dict[str, Any]] = {
+    "node": {"transport": "zenoh", "mode": "async", "node": 0},
+    "penalty_rise": JOINT,
+    "penalty_limit": JOINT,
+    "clip_after": JOINT,
+}
+"""What these numbers need beside them."""
 
 
 def number_type(hint: Any) -> type | None:
@@ -44,7 +50,7 @@ NUMBERS = pytest.mark.parametrize(("kind", "setting", "number"), tuple(numbers()
 
 
 def made(kind: type[CheckedSettings], setting: str, value: Any) -> CheckedSettings:
-    return kind(**({"node": 0} | NETWORK if setting == "node" else {}) | {setting: value})
+    return kind(**BESIDE.get(setting, {}) | {setting: value})
 
 
 def test_the_numbers_of_all_kinds_are_looked_at() -> None:
@@ -58,7 +64,8 @@ def test_every_spelling_of_a_number_is_the_same_setting(
     kind: type[CheckedSettings], setting: str, number: type
 ) -> None:
     default = getattr(kind(), setting)
-    value = number(0 if setting == "node" else 0.01 if default is None else default)
+    given = {"node": 0, "clip_after": 1, "check_every": 1}.get(setting, 0.01) if default is None else default
+    value = number(given)
     expected = made(kind, setting, value)
     spellings = [str(value), f" {value} ", np.array([value])[0]]
     if number is float:

@@ -46,6 +46,10 @@ REPAIRING: dict[str, Any] = {
     "start": "straight", "reroute": False, "max_iterations": 6, "repair_samples": 64, "repair_steps": 20,
 }  # fmt: skip
 
+JOINT: dict[str, Any] = {
+    "decoupling": "joint", "start": "team", "first_collisions": False, "clip_between_iterations": False,
+    "reroute": False, "max_iterations": 6, "num_samples": 32, "num_steps": 6, "improve": False,
+}  # fmt: skip
 TEAM: dict[str, Any] = {"start": "team", "num_samples": 128, "num_steps": 20}
 
 CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -68,6 +72,13 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "elite_fraction": (0.3, {}),
     "adapt_variance": (True, {}),
     "sigma_floor": (0.9, {"adapt_variance": True}),
+    "carry_variance": (True, {"adapt_variance": True}),
+    "check_every": (3, {}),
+    "penalty_per_pair": (True, {"max_iterations": 4, **TEAM}),
+    "penalty_rise": (2.0, JOINT),
+    "penalty_limit": (1.0, {**JOINT, "penalty": 1.0, "penalty_rise": 2.0}),
+    "reset_after_probe": (True, JOINT),
+    "clip_after": (1, {**JOINT, "improve": True, "num_samples": 8}),
     "improver": ("denoising", {"max_iterations": 12, "num_samples": 128, "num_steps": 20}),
     "big_team": (1, TEAM),
     "decoupling": ("groups", REPAIRING),

@@ -288,6 +288,25 @@ def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) 
     assert table(tmp_path / "again" / "paper_differences.csv") == rows
 
 
+def test_the_paper_its_code_and_ours_meet_head_to_head(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    completed("head_to_head", out)
+    rows = table(out / "head_to_head.csv")
+    assert len({(row["team"], row["planner"]) for row in rows}) == len(rows) == 3 * 4 + 2 + 6
+    trials = {trial.label: json.loads(trial.config) for trial in read_parquet(out / "head_to_head.parquet")}
+    base = trials["d4orm-d, authors"]
+    changed = {
+        label: sorted(key for key, value in config.items() if value != base[key])
+        for label, config in trials.items()
+        if label.startswith("authors, ")
+    }
+    assert sorted(changed.values()) == [
+        ["clip_after"], ["penalty_per_pair"], ["penalty_rise"], ["reset_after_probe"], ["start"]
+    ]  # fmt: skip
+    completed("head_to_head", tmp_path / "again", "--trials", str(out / "head_to_head.parquet"))
+    assert table(tmp_path / "again" / "head_to_head.csv") == rows
+
+
 def test_rivals_meet_the_same_seeds_tuned_and_as_the_paper_has_them(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("tuned_rivals", out)

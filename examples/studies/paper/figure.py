@@ -27,7 +27,7 @@ QUICK_SETTINGS: Mapping[str, Mapping[str, object]] = MappingProxyType({
     "cem": _FEW,
     "d-d4orm": _FEW,
     "i-mbd": _FEW,
-    "mbd": {"num_samples": 64, "num_steps": 30},
+    "mbd": {"num_samples": 64, "num_steps": 30, "max_iterations": 1},
 })  # fmt: skip
 """Settings of the quick version by policy: enough to go through every step, not to solve much."""
 QUICK_TIME_LIMIT = 5.0

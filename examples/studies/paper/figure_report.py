@@ -9,7 +9,7 @@ from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from examples.studies.paper.plots import draw
 
-from d4orm_planners.evaluation.comparison import paired, steps_to_solution
+from d4orm_planners.evaluation.comparison import Paired, holm, paired, steps_to_solution
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by
@@ -24,7 +24,7 @@ trials."""
 PAIRS = """\
 The same problems and seeds, trial by trial: how often only the one or the other succeeded, with McNemar's exact test;
 the median difference in {cost}, with Wilcoxon's signed-rank test. A trial that failed counts twice the longest that
-either needed."""
+either needed. P values are corrected for all tests of this page by Holm's method."""
 _COSTS = {
     "runtime": "seconds to the first solution",
     "travel_time": "travel time [s]",
@@ -95,16 +95,20 @@ def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
     placed = {(group.section, column(figure, row), group.label): group.trials
               for group in groups for row in [measured(group)]}  # fmt: skip
     one_column = figure.across == "policy"
-    blocks: dict[str, list[tuple[str, ...]]] = {}
+    tests: dict[tuple[str, str, str], Paired] = {}
     for (section, place, label), trials in placed.items():
         others = placed.get((section, str(figure.reference) if one_column else place, str(figure.reference)))
         if others is None or label == figure.reference:
             continue
-        test = paired(trials, others, _cost(figure, [*trials, *others]), lambda one: first_solution(one) is not None)
+        cost = _cost(figure, [*trials, *others])
+        tests[section, place, label] = paired(trials, others, cost, lambda one: first_solution(one) is not None)
+    p_values = iter(holm([p for test in tests.values() for p in (test.success_p, test.cost_p)]))
+    blocks: dict[str, list[tuple[str, ...]]] = {}
+    for (section, place, label), test in tests.items():
         counts = (str(count) for count in (test.pairs, test.only_first, test.only_second))
         blocks.setdefault(section, []).append(
-            (label, *[place] * (not one_column), *counts, f"{test.success_p:.2g}", f"{test.difference:+.2f}",
-             f"{test.cost_p:.2g}")
+            (label, *[place] * (not one_column), *counts, f"{next(p_values):.2g}", f"{test.difference:+.2f}",
+             f"{next(p_values):.2g}")
         )  # fmt: skip
     header = ("policy", *[figure.across] * (not one_column), "pairs", "only it", f"only {figure.reference}", "p",
               "difference", "p")  # fmt: skip

@@ -15,6 +15,8 @@ from d4orm_planners.d_d4orm.selection import SELECTIONS
 PAPER: Mapping[str, object] = {"preset": "paper"}
 C2F: dict[str, object] = {"policy": "d4orm-c2f", "refine": "sync"}
 """Refinement in the background would make the result depend on how busy the machine is."""
+BOTH_C2F: Mapping[str, Mapping[str, object]] = {"d4orm-c2f": {**C2F, **PAPER}, "d4orm-c2f, ours": C2F}
+"""Algorithm 4, and our controller. What is not the paper's method has a label that says so."""
 SIZES = (4, 8, 12, 16)
 Environment = tuple[str, str, str | None]
 """Title, scenario, model."""
@@ -49,6 +51,7 @@ def _team_size() -> Figure:
         "i-mbd": longer,
         "cem": longer,
         "mbd": PAPER,
+        "mbd, judged once": {"policy": "mbd", **PAPER, "check_every": None, "max_iterations": 1},
     }
     return Figure(
         name="team-size",
@@ -68,15 +71,20 @@ def _team_size() -> Figure:
         },
         remarks=(
             "Methods have a budget of samples, 20 iterations of 100 steps of 1024 (the defaults of d4orm: 80, of 256 "
-            "and later 128), instead of a deadline; MBD has its 10,000 steps in one iteration, and is judged after the "
-            "last one only.",
+            "and later 128), instead of a deadline; MBD has one run of 10,000 steps, judged every 100 of them, as in "
+            "the paper, or once.",
             "The defaults of d4orm end with their first solution: what they would improve it by is no sampling.",
         ),
     )
 
 
 def _ipopt() -> Figure:
-    policies = {"ipopt": {}, "d4orm": PAPER, "d4orm, defaults": {"policy": "d4orm"}}
+    policies = {
+        "ipopt": PAPER,
+        "ipopt, ours": {"policy": "ipopt"},
+        "d4orm": PAPER,
+        "d4orm, defaults": {"policy": "d4orm"},
+    }
     paper = {
         ("2D Holonomic", "ipopt", "mean_runtime"): {
             "4": "1.12 ± 0.526", "8": "6.33 ± 2.284", "12": "35.32 ± 11.53", "16": "failed",
@@ -104,7 +112,7 @@ def _big_teams() -> Figure:
         "d4orm, defaults": {"policy": "d4orm"},
         "d4orm-d": PAPER,
         "hybrid": {"policy": "hybrid"},
-        "d4orm-c2f": C2F,
+        **BOTH_C2F,
     }
     paper = {
         ("2D Holonomic", "d4orm", "runtime"): D4ORM_SECONDS,
@@ -140,7 +148,7 @@ def _big_teams() -> Figure:
         paper=paper,
         remarks=(
             "Runtime is that of the first solution, or of the coarse plan of d4orm-c2f. Within deadlines d4orm-c2f "
-            "counts with all its control loops.",
+            "counts with all its control loops. `d4orm-c2f` is Algorithm 4 (preset `paper`), with few seeds.",
             "The paper shows 100 random robots; its authors' scenario has no room for them, and ours, with a square of "
             "12.5 m, takes its place.",
         ),
@@ -148,7 +156,7 @@ def _big_teams() -> Figure:
 
 
 def _robustness() -> Figure:
-    policies = {"d4orm-c2f": C2F, "d4orm-d": PAPER, "hybrid": {"policy": "hybrid"}}
+    policies = {**BOTH_C2F, "d4orm-d": PAPER, "hybrid": {"policy": "hybrid"}}
     levels = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
     return Figure(
         name="robustness",
@@ -158,10 +166,14 @@ def _robustness() -> Figure:
         across="control_noise_std",
         metrics=("success", "travel_time"),
         plots=("success", "travel_time"),
-        reference="d4orm-c2f",
+        reference="d4orm-c2f, ours",
         compared_by="travel_time",
         remarks=("The paper gives no numbers in its text; its plots compare the same two methods.",),
     )
+
+
+OURS = "ours, "
+"""Before the labels of our controller's rows."""
 
 
 def _coarseness() -> Figure:
@@ -175,7 +187,11 @@ def _coarseness() -> Figure:
     }
     metrics = ("runtime", "travel_time", "makespan")
     labels = {(f, o): f"f={f}, o={o}" for f, o in table}
-    policies = {label: {**C2F, "coarse_factor": f, "check_interval": o} for (f, o), label in labels.items()}
+    policies = {
+        prefix + label: {**C2F, **preset, "coarse_factor": f, "check_interval": o}
+        for prefix, preset in (("", PAPER), (OURS, {}))
+        for (f, o), label in labels.items()
+    }
     return Figure(
         name="coarseness",
         title="D4orm-C2F and the coarseness of its guidance",
@@ -184,14 +200,17 @@ def _coarseness() -> Figure:
         across="policy",
         metrics=(*metrics, "success"),
         plots=metrics,
-        reference=labels[1, 1],
+        reference=OURS + labels[1, 1],
         compared_by="travel_time",
         paper={
             (OBSTACLES[0], labels[key], metric): {labels[key]: value}
             for key, values in table.items()
             for metric, value in zip(metrics, values)
         },
-        remarks=("f: how many times longer the coarse steps are; o: checked for violations at every o-th of them.",),
+        remarks=(
+            "f: how many times longer the coarse steps are; o: checked for violations at every o-th of them.",
+            "Rows without `ours` are Algorithm 4 (preset `paper`).",
+        ),
     )
 
 
@@ -237,7 +256,8 @@ def _amswarm() -> Figure:
                     "d4orm, defaults": {"policy": "d4orm"},
                     "d4orm-d": PAPER,
                     "hybrid": {"policy": "hybrid"},
-                    "amswarm": {},
+                    "amswarm": PAPER,
+                    "amswarm, ours": {"policy": "amswarm"},
                 },
                 scenarios=scenarios,
                 quick_robots=(None,),
