@@ -200,10 +200,11 @@ class Controller:
 
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
         parked = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
-        if self.mode == "measured" and not self.over:
-            seen = self._possible(self._observer.undelayed(measured))
-            self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, seen))
         self._observer.observe(measured, known)
+        if self.mode == "measured":
+            measured = self._possible(self._observer.undelayed(measured))
+            if not self.over:
+                self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, measured))
         before, actions = self._joint, self._actions()
         brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
         controls, held = brakes, not self.over and actions is None
