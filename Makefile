@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
 PYTEST_ARGS ?=
 STUDIES := ablation amswarm_gaps contact_penalty credit_by_update disturbance_study fewer_samples gradient_dilution imitate_expert lifelong \
-  multimodality multimodality_team paper_differences policy_rates scaling solve_rates tune_learners tuned_rivals warm_start
+  multimodality multimodality_team paper_differences policy_rates scaling solve_rates tune_learners tuned_rivals warm_start zero_shot
 DATA := examples/studies/data
 FIGURES := amswarm nodes noise-schedule robustness selections team-size
 

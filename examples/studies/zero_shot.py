@@ -29,7 +29,7 @@ CONDITIONS: dict[str, dict[str, float]] = {
     "nominal, disturbed": DISTURBED,
     "measured, disturbed": DISTURBED,
 }
-HORIZON, RAMP, RESERVE = 150, 1.0, 0.5
+HORIZON, RESERVE = 150, 0.5
 CALM = 10
 """Steps to fly on when all have arrived."""
 
@@ -93,7 +93,7 @@ def setpoints_of_a_controller(problem: Problem, seed: int, mode: Any, bodies: An
                 after = np.concatenate([position, velocity], axis=1)
             position, velocity, acceleration = between(last, after, dt, count)
             # Acceleration that jumps by twice the limit ten times a second is more than the attitude can follow.
-            ramp = np.minimum(1, np.arange(1, count + 1) / count / RAMP)[:, None, None]
+            ramp = (np.arange(1, count + 1) / count)[:, None, None]
             yield position, velocity, former + ramp * (acceleration - former)
             last, former, step, calm = after, acceleration[-1], step + 1, calm + controller.over
 
