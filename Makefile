@@ -30,14 +30,15 @@ test-all: $(DEV_STAMP) ## Run all tests
 	$(BIN)/d4orm warmup # once; processes that find nothing in the cache all compile the same kernels
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal --durations 40 $(SELECTED) $(PYTEST_ARGS)
 
-# RLlib and JaxMARL pin an older Gymnasium, BenchMARL an older TorchRL than the rest is tested with.
+# RLlib and JaxMARL pin an older Gymnasium, BenchMARL an older TorchRL, crazyflow another JAX than the rest is tested with.
 test-apart = $(PYTHON) -m venv $(VENV)-$(1) && \
   $(VENV)-$(1)/bin/python -m pip install --quiet --editable . pytest $(2) && \
   $(VENV)-$(1)/bin/python -m pytest --noconftest -W default tests/env/test_$(1).py
-integrations: ## Test the integrations whose libraries need an environment of their own: RLlib, BenchMARL, JaxMARL
+integrations: ## Test the integrations whose libraries need an environment of their own: RLlib, BenchMARL, JaxMARL, crazyflow
 	$(call test-apart,rllib,'ray[rllib]==2.60.0' torch==2.13.0)
 	$(call test-apart,benchmarl,benchmarl==1.5.2)
 	$(call test-apart,jaxmarl,jaxmarl==0.2.0)
+	$(call test-apart,crazyflow,crazyflow==0.4.0)
 
 portability: $(DEV_STAMP) ## Plan under the instruction sets of other processors and compare to the bit
 	$(BIN)/python tests/portability/processors.py --quick

@@ -36,6 +36,7 @@ class Stream(IntEnum):
     NEIGHBOURHOODS = 19  # which robots look for faster paths, and how, by iteration
     DEMONSTRATIONS = 20  # of an expert, by round and episode
     TRAINING_INSTANCES = 21  # by part of the mixture and number
+    GUSTS = 22  # on drones in crazyflow
 
 
 def derived_seed(seed: int, stream: Stream, *key: int) -> int:

@@ -12,13 +12,18 @@ from d4orm_env.envs.viewer import Frame, Viewer
 
 
 class BaseEnv:
-    """A simulation, read and drawn; how it is reset and stepped is up to the environment."""
+    """A simulation, read and drawn; how it is reset and stepped is up to the environment.
 
+    Attributes:
+        options: Options that it was made of.
+    """
+
+    options: EnvOptions
     metadata: dict[str, object]
     render_mode: str | None
 
     def _begin(self, options: EnvOptions) -> None:
-        self.render_mode = options.render_mode
+        self.options, self.render_mode = options, options.render_mode
         self._viewer = self._make_viewer(options)
         self._simulation = self._make_simulation(options)
         self.metadata = type(self).metadata | {"render_fps": max(1, round(1 / self.problem.dt))}

@@ -92,6 +92,11 @@ class EnvOptions:
         options._check()
         return options
 
+    def keywords(self) -> dict[str, Any]:
+        """Return the keyword arguments that make such an environment."""
+        own = {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
+        return {**own.pop("scenario_settings"), **own}
+
     def disturbances_of(self, problem: Problem) -> Disturbances:
         """All disturbances that change anything in a problem, noise on the controls included.
 

@@ -3,38 +3,24 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.winding import unwound
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TimeStep
+from d4orm_env.envs.body_simulation import Moved, Robots
 from d4orm_env.mujoco.physics import Physics
 from d4orm_env.mujoco.scene import DRIVES, HALF_TRACK, NOT_SOLID, OBSTACLE, PUCKS, WHEEL_RADIUS, build_scene
 from d4orm_env.mujoco.wheels import GRAVITY, WheelCommands, WheelControl
 
-Robots = NDArray[np.intp]
-
 _HELD = 1e6
 """Weight added to a docked robot, per degree of freedom [kg]: nothing moves it."""
 _SPIN, _FREE_DOFS, _FREE_PLACE = 2, 6, 7
-
-
-class Moved(NamedTuple):
-    """Result of a step.
-
-    Attributes:
-        states: ``(K, n)`` as the problem's models have them.
-        touched: ``(K,)`` bool: was in contact with a robot, an obstacle or an intruder at any moment of it.
-    """
-
-    states: FloatArray
-    touched: BoolArray
 
 
 class TeamBodies:
@@ -42,11 +28,11 @@ class TeamBodies:
 
     Args:
         problem: The problem; every robot has a body, see :func:`~d4orm_env.mujoco.scene.check_problem`.
-        physics: Their material.
         intruder_radius: ``(N,)`` of bodies that are no robots [m].
+        physics: Their material.
     """
 
-    def __init__(self, problem: Problem, physics: Physics, intruder_radius: FloatArray) -> None:
+    def __init__(self, problem: Problem, intruder_radius: FloatArray, physics: Physics) -> None:
         self.problem, self.intruder_radius = problem, intruder_radius
         self._substeps = math.ceil(problem.dt / physics.time_step - 1e-9)
         self._step = problem.dt / self._substeps
@@ -67,9 +53,8 @@ class TeamBodies:
         self._headings: Floats = np.zeros(problem.num_robots)
         self._wanted: Floats = np.zeros(problem.num_robots)
         self._held: BoolArray = np.zeros(problem.num_robots, np.bool_)
-        self.begin()
 
-    def begin(self) -> None:
+    def begin(self, seed: int) -> None:
         """Put all robots at the start, at whatever speed the problem says, and let go of those that were held."""
         mujoco.mj_resetData(self.scene.model, self.data)
         self._held[:] = False
@@ -90,18 +75,13 @@ class TeamBodies:
             self.scene.model.dof_armature[dofs] = _HELD
         self._held[robots] = True
 
-    def advance(self, controls: FloatArray, limits: FloatArray, intruders: FloatArray) -> Moved:
-        """One time step of the problem.
-
-        Args:
-            controls: ``(K, m)`` within the robots' limits.
-            limits: ``(K, L)`` of the robots.
-            intruders: ``(N, 5)`` where bodies that are no robots are at the end of the step, and their velocities.
+    def advance(self, controls: FloatArray, arrays: ProblemArrays, intruders: FloatArray) -> Moved:
+        """See :class:`~d4orm_env.envs.body_simulation.Bodies`.
 
         Raises:
             RuntimeError: If the simulation has become unstable.
         """
-        states = self.states()
+        states, limits = self.states(), arrays.limits
         self._push(controls, states, limits)
         commands = self._commands(controls, states, limits)
         touched = np.zeros(self.problem.num_robots, np.bool_)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from pettingzoo import AECEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray, shown
+from d4orm_env.envs.body_simulation import BodySimulation
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.viewer import RENDER_MODES
-from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
+from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_env.mujoco.mujoco_viewer import RENDERERS, MujocoViewer
 from d4orm_env.mujoco.physics import Physics
+from d4orm_env.mujoco.scene import check_problem
 from d4orm_env.navigation_v0 import AECNavigationEnv
 from d4orm_env.scenarios.problems import ScenarioLike
 
@@ -60,8 +64,8 @@ class parallel_env(navigation_v0.parallel_env):
         self._physics, self._renderer = physics or Physics(), renderer
         super().__init__(scenario, num_robots, **options)
 
-    def _make_simulation(self, options: EnvOptions) -> MujocoSimulation:
-        return MujocoSimulation(options, self._physics)
+    def _make_simulation(self, options: EnvOptions) -> BodySimulation:
+        return BodySimulation(options, check_problem, partial(TeamBodies, physics=self._physics))
 
     def _make_viewer(self, options: EnvOptions) -> MujocoViewer:
         return MujocoViewer(options.render_mode, self._renderer)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from d4orm_env.envs.body_simulation import BodySimulation
 from d4orm_env.envs.team_simulation import TeamSimulation
 from d4orm_env.envs.viewer import Frame, Viewer
+from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_env.mujoco.camera import Camera, NoCameraError
-from d4orm_env.mujoco.mujoco_simulation import MujocoSimulation
 
 RENDERERS = ("auto", "mujoco", "pictures")
 """Renderers of frames."""
@@ -34,11 +35,11 @@ class MujocoViewer(Viewer):
         Raises:
             NoCameraError: If MuJoCo is to draw and OpenGL cannot.
         """
-        assert isinstance(simulation, MujocoSimulation)
+        assert isinstance(simulation, BodySimulation)
         if self.renderer != "pictures":
             simulation.require_reset()
             bodies = simulation.bodies
-            assert bodies is not None
+            assert isinstance(bodies, TeamBodies)
             try:
                 if self._camera is None or self._looks_at is not bodies:
                     self.close()

@@ -72,7 +72,8 @@ class Controller:
             feedback in mode ``"nominal"``.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
             meanwhile, and its answer, which would be too late, is not used. ``None`` waits.
-        lag: Time constant of the robots' actuators [s], one or one per robot, which the estimate of that allows for.
+        lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
+            in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
         **settings: Of the policy.
 
     Raises:
@@ -186,18 +187,24 @@ class Controller:
         if measured.shape != reference.shape:
             raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
         known: BoolArray = np.all(np.isfinite(measured), axis=1)
-        plausible = np.clip(np.where(known[:, None], measured, reference), *self._bounds)
+        return self._possible(np.where(known[:, None], measured, reference)), known
+
+    def _possible(self, states: FloatArray) -> FloatArray:
+        """``(K, n)`` states within the robots' limits and the state space."""
+        plausible = np.clip(states, *self._bounds)
         for model, robots in by_model(self._robots):
             x, limits = (tuple(rows[robots].T) for rows in (plausible, self._robots.team.limits))
             limited = model.functions.limit_state(x[: model.state_size], limits, NUMPY_OPS)
             plausible[robots, : model.state_size] = np.stack(np.broadcast_arrays(*limited), axis=1)
-        return plausible, known
+        return plausible
 
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
         parked = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
-        if self.mode == "measured" and not self.over:
-            self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, measured))
         self._observer.observe(measured, known)
+        if self.mode == "measured":
+            measured = self._possible(self._observer.undelayed(measured))
+            if not self.over:
+                self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, measured))
         before, actions = self._joint, self._actions()
         brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
         controls, held = brakes, not self.over and actions is None

@@ -43,6 +43,8 @@ class DisturbanceObserver:
         names = problem.team.models
         columns = {"holonomic2d": range(d, 2 * d), "holonomic3d": range(d, 2 * d), "velocity2d": range(d)}
         self._observed: BoolArray = np.array([name in columns for name in names])
+        self._second_order = np.isin(names, ("holonomic2d", "holonomic3d"))[:, None]
+        self._lag = np.where(self._observed, constants, 0.0)[:, None]
         self._columns = np.array([columns.get(name, range(d)) for name in names])
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
@@ -66,6 +68,20 @@ class DisturbanceObserver:
             better = np.clip(self.bias + GAIN * left, -self._most, self._most)
             self.bias = np.where(self._observed[:, None] & np.isfinite(left), better, self.bias)
         self._before = now
+
+    def undelayed(self, states: FloatArray) -> FloatArray:
+        """``(K, n)`` states that obey the models as if there were no lag; those of other models as they are.
+
+        With a lag ``tau`` after which an acceleration ``a`` is the control's, ``p + tau v`` and ``v + tau a`` move as a
+        double integrator under the control itself; so does ``p + tau v`` of first-order models.
+        """
+        d, ahead = self.problem.dimension, states.copy()
+        rate = self._lag * (self._applied + self.bias)
+        velocity = states[:, d : 2 * d] if states.shape[1] >= 2 * d else 0.0
+        ahead[:, :d] += np.where(self._second_order, self._lag * velocity, rate).astype(np.float32)
+        if self._second_order.any():
+            ahead[:, d : 2 * d] += np.where(self._second_order, rate, 0.0).astype(np.float32)
+        return ahead
 
     def compensated(self, controls: FloatArray, resting: BoolArray) -> FloatArray:
         """``(K, m)`` controls that come to what these would without the disturbance; unchanged for robots at rest."""

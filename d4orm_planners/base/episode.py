@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,8 +25,8 @@ from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
-PHYSICS = ("model", "mujoco")
-"""Physics that moves robots: the equations that planners know, or rigid bodies in MuJoCo."""
+PHYSICS = ("model", "mujoco", "crazyflow")
+"""Physics that moves robots: the equations that planners know, rigid bodies in MuJoCo, or drones in crazyflow."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,12 +87,21 @@ def check_physics(problem: Problem, physics: str) -> None:
         ValueError: If it is not one of :data:`PHYSICS`, or robots have no bodies in it.
         ImportError: If it needs a library that is not installed.
     """
+    module = physics_module(physics)
+    if module is not navigation_v0:
+        module.check_problem(problem)
+
+
+def physics_module(physics: str) -> Any:
+    """The module with the environment of a physics.
+
+    Raises:
+        ValueError: If it is not one of :data:`PHYSICS`.
+        ImportError: If it needs a library that is not installed.
+    """
     if physics not in PHYSICS:
         raise ValueError(f"physics is {shown(physics)}; choose one of {', '.join(PHYSICS)}")
-    if physics == "mujoco":
-        from d4orm_env.mujoco import check_problem
-
-        check_problem(problem)
+    return navigation_v0 if physics == "model" else import_module(f"d4orm_env.{physics}")
 
 
 def open_env(problem: Problem, physics: str = "model", **options: Any) -> ParallelEnv:
@@ -107,28 +117,29 @@ def open_env(problem: Problem, physics: str = "model", **options: Any) -> Parall
         ImportError: If the physics needs a library that is not installed.
     """
     check_physics(problem, physics)
-    if physics == "mujoco":
-        from d4orm_env import mujoco
-
-        return mujoco.parallel_env(problem=problem, **options)
-    return navigation_v0.parallel_env(problem=problem, **options)
+    return physics_module(physics).parallel_env(problem=problem, **options)
 
 
-def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
+def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics: str | None = None) -> Episode:
     """Reset ``env``, reset ``policy``, and step until no agent is left.
 
     Args:
         env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
         policy: A policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
         seed: Seeds both.
+        physics: One of :data:`PHYSICS`, to run an environment like ``env`` with that in its place.
 
     Returns:
         The executed trajectory and its metrics.
 
     Raises:
-        ValueError: If the seed is negative, or there is no such policy.
+        ValueError: If the seed is negative, there is no such policy or physics, or robots have no bodies in it; or if
+            the environment is wrapped, and the physics given.
+        ImportError: If the physics needs a library that is not installed.
     """
     whole_number(seed, "seed", 0)
+    if physics is not None:
+        env = _moved_by(env, physics)
     actor = make_policy(policy)
     observations, infos = env.reset(seed=seed)
     problem = env.unwrapped.problem
@@ -151,6 +162,14 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0) -> Episode:
     marks = None if all(part is None for part in effects[0]) else marks_of(effects, problem)
     goals = np.stack([joint.goals for joint in joints])
     return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals, marks)
+
+
+def _moved_by(env: ParallelEnv, physics: str) -> ParallelEnv:
+    """An environment with the options of another, moved by some physics."""
+    check_physics(env.unwrapped.problem, physics)
+    if env is not env.unwrapped:
+        raise ValueError(f"physics is {physics!r}, and the environment is wrapped; give one that is not")
+    return physics_module(physics).parallel_env(**env.options.keywords())
 
 
 class _Outcome(NamedTuple):

@@ -45,6 +45,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "train": ("train:train", "Train a policy by reinforcement or imitation."),
     "bench": ("bench:bench", "Measure the speed of this machine."),
     "node": ("node_command:node", "Plan as one node of several on a network."),
+    "serve": ("serve_command:serve", "Drive robots on a ROS 2 network over Zenoh."),
     "warmup": ("warmup_command:warmup", "Compile ahead, so that the next start is quick."),
     "scenarios": ("listings:scenarios", "List the scenarios."),
     "planners": ("listings:planners", "List planners and policies, or the settings of one."),

@@ -12,6 +12,7 @@ import typer
 from d4orm_env.render import save_animation, save_picture
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
+from d4orm_planners.base.episode import physics_module
 from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
 
 if TYPE_CHECKING:
@@ -27,8 +28,18 @@ ScenarioSettings = Annotated[
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
 Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
 TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
+
+
+def _imported(physics: str) -> str:
+    physics_module(physics)  # before SciPy, as crazyflow must be
+    return physics
+
+
 Physics = Annotated[
-    str, typer.Option("--physics", help="What moves the robots: model, as planners know them, or mujoco.")
+    str,
+    typer.Option(
+        "--physics", callback=_imported, help="What moves the robots: model, as planners know them, mujoco, crazyflow."
+    ),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
 

@@ -60,23 +60,20 @@ def load_node(path: str | os.PathLike[str]) -> NodeTask:
 
 
 def _task(content: object, folder: Path) -> NodeTask:
-    fields = _mapping("the file", content)
+    fields = mapping("the file", content)
     for name in fields:
         if name not in REQUIRED + OPTIONAL:
             raise ValueError(f"unknown field {name!r}; known are {', '.join(REQUIRED + OPTIONAL)}")
     for name in REQUIRED:
         if fields.get(name) is None:
             raise ValueError(f"field {name!r} is missing")
-    settings = _mapping("settings", fields.get("settings", {}))
+    settings = mapping("settings", fields.get("settings", {}))
     for name in OWN:
         if name in settings:
             raise ValueError(f"settings has {name!r}, which " + (
                 "is a field of the file itself" if name in fields else "is the same for every node of a network"
             ))  # fmt: skip
-    zenoh = _mapping("zenoh", fields.get("zenoh", {}))
-    if isinstance(zenoh.get("config_file"), str):
-        zenoh = {**zenoh, "config_file": str(folder / zenoh["config_file"])}
-    network = {"transport": "zenoh", "mode": "async", "zenoh": zenoh}
+    network = {"transport": "zenoh", "mode": "async", "zenoh": zenoh_in(fields, folder)}
     if not isinstance(fields["out"], str):
         raise ValueError(f"out must be a path, not {fields['out']!r}")
     planner = make_planner(
@@ -88,14 +85,15 @@ def _task(content: object, folder: Path) -> NodeTask:
     assert isinstance(planner, DD4orm)
     return NodeTask(
         planner=planner,
-        problem=_problem(fields["problem"], folder),
+        problem=problem_in(fields["problem"], folder),
         seed=whole_number(fields.get("seed", 0), "seed", 0),
         time_limit=duration(fields["time_limit"], "time_limit"),
         out=folder / fields["out"],
     )
 
 
-def _problem(content: object, folder: Path) -> Problem:
+def problem_in(content: object, folder: Path) -> Problem:
+    """The problem that a file names or has."""
     if isinstance(content, str):
         return load_problem(folder / content)
     if not isinstance(content, dict):
@@ -106,7 +104,16 @@ def _problem(content: object, folder: Path) -> Problem:
         raise ValueError(f"problem: {error}") from error
 
 
-def _mapping(name: str, content: object) -> Mapping[str, Any]:
+def mapping(name: str, content: object) -> Mapping[str, Any]:
+    """A part of a file that must be a mapping."""
     if not isinstance(content, dict):
         raise ValueError(f"{name} must be a mapping of fields, not {content!r}")
     return content
+
+
+def zenoh_in(fields: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+    """The settings of zenoh in a file."""
+    zenoh = mapping("zenoh", fields.get("zenoh", {}))
+    if isinstance(zenoh.get("config_file"), str):
+        zenoh = {**zenoh, "config_file": str(folder / zenoh["config_file"])}
+    return zenoh

@@ -131,7 +131,7 @@ class ZenohTransport:
     def __init__(self, settings: ZenohSettings) -> None:
         zenoh = load(_zenoh)
         zenoh.try_init_log_from_env()
-        config = _config(zenoh, settings)
+        config = zenoh_config(zenoh, settings)
         key = f"{settings.namespace}/candidates"
         self._mailbox = Mailbox()
         self._error: type[Exception] = zenoh.ZError
@@ -191,7 +191,7 @@ class ZenohTransport:
         return bool(self._publisher.matching_status.matching)
 
 
-def _config(zenoh: ModuleType, settings: ZenohSettings) -> object:
+def zenoh_config(zenoh: ModuleType, settings: ZenohSettings) -> object:
     """Zenoh's own configuration."""
     config = plain = zenoh.Config()
     if settings.config_file is not None:

@@ -30,7 +30,7 @@ from d4orm_planners.evaluation.store import Trial, TrialKey
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
-LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco")
+LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco", "crazyflow")
 
 
 @dataclass(frozen=True)

@@ -333,5 +333,5 @@ def test_an_environment_is_opened_by_its_physics() -> None:
     problem = line_problem([1.0])
     assert type(open_env(problem)) is navigation_v0.parallel_env
     assert type(open_env(problem, "mujoco")) is mujoco.parallel_env
-    with pytest.raises(ValueError, match="physics is 'bullet'; choose one of model, mujoco"):
+    with pytest.raises(ValueError, match="physics is 'bullet'; choose one of model, mujoco, crazyflow"):
         open_env(problem, "bullet")

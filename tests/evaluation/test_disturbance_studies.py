@@ -146,7 +146,7 @@ def test_the_physics_on_the_command_line(tmp_path: Path, d4orm: Call) -> None:
     assert [trial.physics for trial in TrialStore.existing(tmp_path).trials()] == ["mujoco"]
     for command in (["run"], ["evaluate", "-o", str(tmp_path)]):
         status, _, complaint = d4orm(*command, *options[:2], "--policy", "go-to-goal", "--physics", "bullet")
-        assert (status, complaint) == (2, "d4orm: physics is 'bullet'; choose one of model, mujoco\n")
+        assert (status, complaint) == (2, "d4orm: physics is 'bullet'; choose one of model, mujoco, crazyflow\n")
 
 
 def test_a_stalled_robot_does_not_spoil_the_trial(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from d4orm_env import Problem, Team, make_problem, navigation_v0
-from d4orm_env.disturbances import Bias, ControlNoise, Gain, StateNoise
+from d4orm_env.disturbances import Bias, ControlNoise, Gain, Lag, StateNoise
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import Controller, make_policy, run_episode
 from d4orm_planners.base.controller import ControlSetpoint
@@ -87,6 +87,38 @@ def test_disturbed_robots_arrive(mode: Any, disturbances: list[Any]) -> None:
     assert metrics["arrived"] == 6
     assert metrics["collisions"] == 0
     assert len(said) < problem.horizon
+
+
+def test_a_known_lag_is_no_weakness() -> None:
+    problem = team("holonomic2d", 4, horizon=150)
+    arrived = [
+        driven(Controller("d4orm-c2f", mode="measured", lag=lag), problem, [Lag(0.25)])[0].metrics()["arrived"]
+        for lag in (0.0, 0.25)
+    ]
+    assert arrived[1] == 4 > arrived[0]
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "velocity2d"])
+def test_undelayed_states_obey_the_model(model: str) -> None:
+    second = model == "holonomic2d"
+    problem = Problem(Team((model,)), [[0, 0, 0, 0] if second else [0, 0]], [[5, 0]])
+    observer, lag, dt = DisturbanceObserver(problem, 0.3), 0.3, problem.dt / 100
+    state, applied = problem.start.astype(np.float64).copy(), np.zeros(2)
+    before = None
+    for control in np.float32([[0.5, 0.1], [-0.3, 0.4], [0.2, 0.0]]):
+        now = observer.undelayed(state.astype(np.float32))
+        if before is not None:
+            np.testing.assert_allclose(now, before, atol=2e-3)
+        observer.compensated(control[None], np.array([False]))
+        position = now[0, :2] + (
+            now[0, 2:] * problem.dt + control * problem.dt**2 / 2 if second else control * problem.dt
+        )
+        before = np.concatenate([position, now[0, 2:] + control * problem.dt])[None] if second else position[None]
+        for _ in range(100):
+            applied += dt / lag * (control - applied)
+            state[0, :2] += dt * (state[0, 2:] if second else applied)
+            if second:
+                state[0, 2:] += dt * applied
 
 
 def test_without_an_estimate_a_steady_push_leaves_robots_short(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,7 @@ def completed(name: str, out: Path, *arguments: str) -> None:
         ("read_results", "pandas", "dev"),
         ("read_results", "pyarrow", "evaluate"),
         ("onboard_lifelong", "zenoh", "zenoh"),
+        ("zero_shot", "crazyflow", "drones"),
     ],
 )
 def test_an_example_says_which_extra_is_missing(name: str, module: str, extra: str, tmp_path: Path) -> None:

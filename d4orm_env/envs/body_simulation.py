@@ -1,13 +1,18 @@
-"""A team in its world, moved by MuJoCo; all else is the simulation that all environments share."""
+"""A team in its world, moved by another physics; all else is the simulation that all environments share."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Protocol
+
 import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.transition import stands
 from d4orm_env.engine.types import MOVED
 from d4orm_env.envs.lifelong import reached_goals
@@ -15,41 +20,95 @@ from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.team_simulation import TeamSimulation
 from d4orm_env.envs.team_step import TeamStep
-from d4orm_env.mujoco.bodies import TeamBodies
-from d4orm_env.mujoco.physics import Physics
-from d4orm_env.mujoco.scene import check_problem
+
+Robots = NDArray[np.intp]
 
 
-class MujocoSimulation(TeamSimulation):
-    """A simulation whose bodies MuJoCo moves.
+class Moved(NamedTuple):
+    """Result of a step.
 
-    A robot docks as in any environment, at the end of a step, and is held fast from then on. It has collided if it was
-    in contact at any moment of a step, or is judged to be at its end. What a disturbance does to states is done to the
+    Attributes:
+        states: ``(K, n)`` as the problem's models have them.
+        touched: ``(K,)`` bool: was in contact with a robot, an obstacle or an intruder at any moment of it.
+    """
+
+    states: FloatArray
+    touched: BoolArray
+
+
+class Bodies(Protocol):
+    """The bodies of a problem's team in another physics.
+
+    Attributes:
+        problem: The problem.
+        intruder_radius: ``(N,)`` of bodies that are no robots [m].
+    """
+
+    problem: Problem
+    intruder_radius: FloatArray
+
+    def begin(self, seed: int) -> None:
+        """Put all robots at the start, and let go of those that were held; the seed is of what is random."""
+
+    def put(self, robots: Robots, states: FloatArray) -> None:
+        """Put some robots into the states in their rows of ``states`` ``(K, n)``."""
+
+    def hold(self, robots: Robots) -> None:
+        """Keep some robots where they are."""
+
+    def advance(self, controls: FloatArray, arrays: ProblemArrays, intruders: FloatArray) -> Moved:
+        """One time step of the problem.
+
+        Args:
+            controls: ``(K, m)`` within the robots' limits.
+            arrays: The problem with the robots' true limits and present goals.
+            intruders: ``(N, 5)`` where bodies that are no robots are at the end of the step, and their velocities.
+        """
+
+
+class BodySimulation(TeamSimulation):
+    """A simulation whose bodies another physics moves.
+
+    A robot docks as in any environment, at the end of a step, and is held from then on. It has collided if it was in
+    contact at any moment of a step, or is judged to be at its end. What a disturbance does to states is done to the
     bodies.
 
     Args:
         options: Options of the simulation.
-        physics: Material of the bodies.
+        check: Refuses a problem whose robots have no bodies.
+        make_bodies: Makes the bodies of a problem, given the radii of those that are no robots.
 
     Raises:
-        ValueError: For an argument out of range, or a robot that has no body in MuJoCo.
+        ValueError: For an argument out of range, or a robot that has no body in the physics.
     """
 
-    def __init__(self, options: EnvOptions, physics: Physics) -> None:
-        self.physics = physics
-        self.bodies: TeamBodies | None = None
+    def __init__(
+        self,
+        options: EnvOptions,
+        check: Callable[[Problem], None],
+        make_bodies: Callable[[Problem, FloatArray], Bodies],
+    ) -> None:
+        self.bodies: Bodies | None = None
+        self._make_bodies = make_bodies
         super().__init__(EnvSetup(options, slack=_slack_of))
-        check_problem(self.problem)
+        check(self.problem)
 
     def reset(self, random: np.random.Generator) -> TeamStep:
         """See :meth:`d4orm_env.envs.team_simulation.TeamSimulation.reset`."""
         step = super().reset(random)
-        bodies, radius = self.bodies, self.worlds.bodies[0, :, -1]
-        if bodies is None or bodies.problem is not self.problem or (bodies.intruder_radius != radius).any():
-            self.bodies = TeamBodies(self.problem, self.physics, radius.copy())
-        else:
-            bodies.begin()
+        radius = self.worlds.bodies[0, :, -1]
+        if (
+            self.bodies is None
+            or self.bodies.problem is not self.problem
+            or (self.bodies.intruder_radius != radius).any()
+        ):
+            self.bodies = self._make_bodies(self.problem, radius.copy())
+        self.bodies.begin(self._seed)
         return step
+
+    def _begin(self, seeds: Mapping[int, int]) -> None:
+        super()._begin(seeds)
+        self._seed = seeds[0]
 
     def _put(self, states: FloatArray) -> None:
         assert self.bodies is not None
@@ -63,9 +122,10 @@ class MujocoSimulation(TeamSimulation):
         team, docks = self.problem.team, self.problem.docks
         standing = np.asarray(stands(self.arrived, docks))
         limited = self._limited(controls[0], true.limits, standing)
-        states, touched = self.bodies.advance(limited, true.limits, worlds.bodies[0])
+        true = true._replace(goal=self.goals)
+        states, touched = self.bodies.advance(limited, true, worlds.bodies[0])
         states = self._measured(states, standing)
-        arrived = standing | reached_goals(team, true._replace(goal=self.goals), states, limited)
+        arrived = standing | reached_goals(team, true, states, limited)
         docking = np.flatnonzero(np.asarray(stands(arrived, docks)) & ~standing)
         for robot in docking:
             model = team.robot_models[robot]

@@ -1,0 +1,25 @@
+"""Teams of Crazyflies in crazyflow, a physics that was written elsewhere; extra ``drones``.
+
+crazyflow 0.4.0, https://pypi.org/project/crazyflow: first-principles dynamics of rotors and body, and the Mellinger
+controller of the Crazyflie (D. Mellinger and V. Kumar, "Minimum snap trajectory generation and control for quadrotors",
+ICRA, 2011), both at 500 Hz.
+"""
+
+import os
+import sys
+from importlib.util import find_spec
+
+if find_spec("crazyflow") is None:
+    raise ImportError("drones in flight need crazyflow; install it with: pip install 'd4orm-env[drones]'")
+if "scipy" in sys.modules and os.environ.get("SCIPY_ARRAY_API") != "1":
+    raise ImportError(
+        "crazyflow needs SciPy's array API, and SciPy is imported already; set the environment variable "
+        "SCIPY_ARRAY_API=1, or import d4orm_env.crazyflow first"
+    )
+
+from d4orm_env.crazyflow.drone_bodies import DroneBodies, check_problem
+from d4orm_env.crazyflow.drone_physics import DronePhysics
+from d4orm_env.crazyflow.environment import parallel_env
+from d4orm_env.crazyflow.flight_record import FlightRecord
+
+__all__ = ["DroneBodies", "DronePhysics", "FlightRecord", "check_problem", "parallel_env"]

@@ -1,0 +1,112 @@
+"""crazyflow's simulation, flown through many setpoints at once."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from crazyflow.control import Control
+from crazyflow.drones import Drone
+from crazyflow.dynamics import Dynamics
+from crazyflow.sim import Sim
+from crazyflow.sim.functional import state_control
+
+from d4orm_env.core.arrays import BoolArray, Floats
+
+PHYSICS_RATE, SETPOINT_RATE = 500, 100
+"""Steps of dynamics and controller, and setpoints, per second [Hz]."""
+COMMAND_SIZE = 16
+"""Numbers of crazyflow's full-state command: position, velocity, acceleration, quaternion, turn rates."""
+_QUATERNION_W = 12
+
+
+class Flight:
+    """Drones in the air.
+
+    Args:
+        num_drones: ``K``.
+        drone: Their type.
+        mass_factor: Their mass over that which their controller reckons with.
+
+    Attributes:
+        position: ``(K, 3)`` [m].
+        velocity: ``(K, 3)`` [m/s].
+    """
+
+    def __init__(self, num_drones: int, drone: str, mass_factor: float) -> None:
+        self._sim, self._fly = _compiled(num_drones, drone)
+        params = self._sim.default_data.params
+        self._fresh = self._sim.default_data.replace(params=params.replace(mass=params.mass * mass_factor))
+        self._data = self._fresh
+        self._look()
+
+    def begin(self, position: Floats) -> None:
+        """Put all drones level and at rest at ``(K, 3)``."""
+        self._data = self._fresh
+        self.put(np.ones(len(position), np.bool_), position, np.zeros_like(position))
+
+    def put(self, chosen: BoolArray, position: Floats, velocity: Floats) -> None:
+        """Put the drones that are true in ``(K,)`` level at ``(K, 3)`` positions, at velocities."""
+        states, rows = self._data.states, jnp.asarray(chosen)[None, :, None]
+        quaternion = jnp.array([0.0, 0.0, 0.0, 1.0], states.quat.dtype)
+        self._data = self._data.replace(
+            states=states.replace(
+                pos=jnp.where(rows, jnp.asarray(position, states.pos.dtype), states.pos),
+                vel=jnp.where(rows, jnp.asarray(velocity, states.vel.dtype), states.vel),
+                quat=jnp.where(rows, quaternion, states.quat),
+                ang_vel=jnp.where(rows, 0.0, states.ang_vel),
+            )
+        )
+        self._look()
+
+    def fly(self, position: Floats, velocity: Floats, acceleration: Floats, force: Floats) -> Floats:
+        """Follow setpoints, one after the other, each for a period.
+
+        Args:
+            position: ``(S, K, 3)`` [m].
+            velocity: ``(S, K, 3)`` [m/s].
+            acceleration: ``(S, K, 3)`` [m/s^2].
+            force: ``(S, K, 3)`` that acts on the drones from outside [N].
+
+        Returns:
+            ``(S, K, 3)`` positions at the ends of the periods.
+        """
+        commands = np.zeros((*position.shape[:2], COMMAND_SIZE), np.float32)
+        commands[..., :9] = np.concatenate([position, velocity, acceleration], axis=2)
+        commands[..., _QUATERNION_W] = 1
+        self._data, path = self._fly(self._data, commands, force.astype(np.float32))
+        self._look()
+        return np.asarray(path, np.float64)
+
+    def _look(self) -> None:
+        states = self._data.states
+        self.position, self.velocity = (np.asarray(part[0], np.float64) for part in (states.pos, states.vel))
+
+
+@cache
+def _compiled(num_drones: int, drone: str) -> tuple[Any, Any]:
+    """The simulation of so many drones, and the function that flies setpoints; both take seconds to make."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MuJoCo's, of the scene that crazyflow draws
+        sim = Sim(
+            n_drones=num_drones,
+            drone=Drone(drone),
+            dynamics=Dynamics.first_principles,
+            control=Control.state,
+            freq=PHYSICS_RATE,
+            state_freq=SETPOINT_RATE,
+        )
+    step = sim.build_step_fn()
+
+    def period(data: Any, inputs: tuple[Any, Any]) -> tuple[Any, Any]:
+        command, force = inputs
+        data = state_control(data, command[None])
+        data = data.replace(states=data.states.replace(force=force[None]))
+        data = step(data, n_steps=PHYSICS_RATE // SETPOINT_RATE)
+        return data, data.states.pos[0]
+
+    return sim, jax.jit(lambda data, commands, force: jax.lax.scan(period, data, (commands, force)))

@@ -1,0 +1,204 @@
+"""A team of robots on a ROS 2 network, driven by a controller."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats, positive_number
+from d4orm_env.core.problem import Problem
+from d4orm_planners.base.controller import Controller, ControlSetpoint
+from d4orm_planners.serve.team_messages import diagnostics, full_state, heading_of, state_from, twist
+from d4orm_planners.serve.wire import RosSession, messages
+
+NODE = "d4orm"
+DRIVING, PLANNING, WAITING, STOPPED = "driving", "planning", "waiting", "stopped"
+"""States of the server. It drives; stands and plans; stands as robots are silent; stands after an emergency stop."""
+LEVELS = {DRIVING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
+"""Levels of diagnostics: well, warning, error."""
+TELL = 1.0
+"""Time between two diagnostics of the same state [s]."""
+
+
+@dataclass
+class Robot:
+    """What is known of a robot.
+
+    Attributes:
+        name: Name of its topics.
+        heard: When it was last heard, by this process's clock [s].
+        state: ``(n,)`` as last heard; not a number before.
+        heading: As last heard [rad].
+        stand: ``(d,)`` where it is to stand, while all do [m].
+    """
+
+    name: str
+    state: FloatArray
+    heard: float = -np.inf
+    heading: float = 0.0
+    stand: Floats | None = field(default=None)
+
+
+class FleetServer:
+    """A controller as a ROS 2 node.
+
+    In: ``/NAME/odom`` (``nav_msgs/Odometry``), ``/NAME/goal`` (``geometry_msgs/PoseStamped``) and ``/e_stop``
+    (``std_msgs/Bool``). Out, once a period: ``/NAME/cmd_vel`` (``geometry_msgs/Twist``) and ``/NAME/setpoint``
+    (``trajectory_msgs/MultiDOFJointTrajectory`` of one point); and ``/diagnostics``.
+
+    Nobody moves before all have been heard, nor while one has been silent for longer than the deadline, nor after an
+    emergency stop until that is taken back. When that is over the controller begins anew from where robots are, and so
+    it does for a new goal.
+
+    Args:
+        session: The network.
+        problem: The team; its starts do not count.
+        controller: What drives it.
+        names: Of the robots, in the problem's order.
+        deadline: Longest silence of a robot [s].
+        seed: Of the controller.
+
+    Attributes:
+        state: What it does.
+        loops: Times of the last periods' work [s].
+        refusal: Reason why a goal was refused last.
+    """
+
+    def __init__(
+        self,
+        session: RosSession,
+        problem: Problem,
+        controller: Controller,
+        names: tuple[str, ...],
+        deadline: float = 0.5,
+        seed: int = 0,
+    ) -> None:
+        if len(names) != problem.num_robots:
+            raise ValueError(f"there are {len(names)} names for {problem.num_robots} robots; give one for each")
+        self.deadline = positive_number(deadline, "deadline", least=problem.dt)
+        self._problem, self._controller, self._seed = problem, controller, seed
+        unknown = np.full(problem.state_size, np.nan, np.float32)
+        self._robots = [Robot(name, unknown) for name in names]
+        self._by_name = {name: robot for robot, name in enumerate(names)}
+        self._odometry = session.subscriber("*/odom", messages.Odometry)
+        self._goal = session.subscriber("*/goal", messages.PoseStamped)
+        self._e_stop = session.subscriber("e_stop", messages.Bool)
+        self._commands = [session.publisher(f"{name}/cmd_vel", messages.Twist) for name in names]
+        self._setpoints = [session.publisher(f"{name}/setpoint", messages.MultiDOFJointTrajectory) for name in names]
+        self._diagnostics = session.publisher("diagnostics", messages.DiagnosticArray)
+        self._planner = ThreadPoolExecutor(1, thread_name_prefix="serve")
+        self._begun: Future[None] | None = None
+        self._emergency = self._replan = False
+        self.state, self._told, self.loops, self.refusal = WAITING, -np.inf, [0.0], ""
+
+    def run(self, over: threading.Event) -> None:
+        """Serve until ``over`` is set; robots are told to stand then."""
+        begin, period = time.monotonic(), 0
+        try:
+            while not over.is_set():
+                now = time.monotonic()
+                self.tick(now)
+                self.loops = [*self.loops[-99:], time.monotonic() - now]
+                period = max(period + 1, int((time.monotonic() - begin) / self._problem.dt))
+                over.wait(max(0.0, begin + period * self._problem.dt - time.monotonic()))
+        finally:
+            self._stand()
+            self._planner.shutdown(wait=False, cancel_futures=True)
+            self._controller.close()
+
+    def tick(self, now: float) -> None:
+        """One period: read what has come, and command every robot."""
+        self._read(now)
+        before, self.state = self.state, self._next_state(now)
+        if self.state == DRIVING:
+            if before != DRIVING:
+                for robot in self._robots:
+                    robot.stand = None
+            self._drive(self._controller.step(self._states(now), now))
+            # The horizon is over, and somebody has not arrived.
+            self._replan |= self._controller.over and not self._controller.arrived.all()
+        else:
+            self._stand()
+        if self.state != before or now - self._told >= TELL:
+            self._told = now
+            self._diagnostics.publish(self._diagnosis(now))
+
+    def _next_state(self, now: float) -> str:
+        if self._emergency or self._silent(now):
+            self._replan = True
+            return STOPPED if self._emergency else WAITING
+        if self._begun is not None and self._begun.done():
+            self._begun.result()
+            self._begun = None
+            # Somebody may have been pushed, and goals may have changed, while it was planned.
+            return PLANNING if self._replan else DRIVING
+        if self._begun is None and (self._replan or self.state != DRIVING):
+            self._replan = False
+            states = np.stack([robot.state for robot in self._robots])
+            self._begun = self._planner.submit(self._controller.begin, self._problem, states, now, self._seed)
+        return DRIVING if self._begun is None else PLANNING
+
+    def _read(self, now: float) -> None:
+        for topic, message in self._odometry.take():
+            number = self._by_name.get(topic.partition("/")[0])
+            if number is not None:
+                state, robot = state_from(self._problem, number, message), self._robots[number]
+                if np.isfinite(state).all():
+                    robot.state, robot.heading = state, heading_of(message.pose.pose.orientation)
+                    robot.heard = now
+        for topic, message in self._goal.take():
+            number = self._by_name.get(topic.partition("/")[0])
+            if number is not None:
+                self._take_goal(number, message.pose.position)
+        for _, message in self._e_stop.take():
+            self._emergency = bool(message.data)
+
+    def _take_goal(self, number: int, place: Any) -> None:
+        goals = self._problem.goal.copy()
+        goals[number] = [place.x, place.y, place.z][: self._problem.dimension]
+        try:
+            self._problem, self._replan = self._problem.replace(goal=goals), True
+        except ValueError as error:
+            self.refusal = f"goal of {self._robots[number].name}: {error}"
+
+    def _silent(self, now: float) -> list[str]:
+        return [robot.name for robot in self._robots if now - robot.heard > self.deadline]
+
+    def _states(self, now: float) -> FloatArray:
+        """``(K, n)`` states; not a number for who was not heard within the last two periods."""
+        lost = 2 * self._problem.dt
+        missing = np.full(self._problem.state_size, np.nan, np.float32)
+        return np.stack([robot.state if now - robot.heard <= lost else missing for robot in self._robots])
+
+    def _drive(self, setpoint: ControlSetpoint) -> None:
+        reference = zip(setpoint.position, setpoint.velocity, setpoint.acceleration, setpoint.heading)
+        for number, (robot, (position, velocity, acceleration, heading)) in enumerate(zip(self._robots, reference)):
+            self._setpoints[number].publish(full_state(robot.name, position, velocity, acceleration, heading))
+            control = setpoint.control[number]
+            self._commands[number].publish(twist(self._problem, number, robot.state, control, robot.heading))
+
+    def _stand(self) -> None:
+        """Have everybody stand where it was when that began."""
+        still, d = np.zeros(self._problem.dimension), self._problem.dimension
+        for robot, command, setpoint in zip(self._robots, self._commands, self._setpoints):
+            command.publish(messages.Twist())
+            if robot.stand is None and np.isfinite(robot.state).all():
+                robot.stand = robot.state[:d].astype(np.float64)
+            if robot.stand is not None:
+                setpoint.publish(full_state(robot.name, robot.stand, still, still, robot.heading))
+
+    def _diagnosis(self, now: float) -> Any:
+        silent, refused = self._silent(now), self._odometry.refused + self._goal.refused + self._e_stop.refused
+        values = {
+            "silent": ", ".join(silent),
+            "arrived": str(int(self._controller.arrived.sum())) if self.state == DRIVING else "",
+            "longest loop [ms]": f"{1000 * max(self.loops):.1f}",
+            "unreadable messages": str(refused),
+            "refused": self.refusal,
+        }
+        return diagnostics(NODE, LEVELS[self.state], self.state, values)

@@ -1,0 +1,169 @@
+"""Crazyflies in crazyflow, a physics that planners know nothing of: open loop from the defaults, and closed loop.
+
+    python -m examples.studies.zero_shot --seeds 20
+
+Teams of `robot="crazyflie"`, with its radius, limits and margin: a swap of ten among obstacles, a circle of eight in a
+slab of 0.5 m, and ten that rise from a grid to a figure of eight, in an order drawn anew. Plans of `hybrid` are sampled
+at 100 Hz and flown as they are, in calm air, and with gusts of 0.02 N and 5% more mass than the drones' controller
+reckons with. With those, D4orm-C2F flies the teams in a `Controller`: in mode "nominal" drones get position, velocity
+and acceleration of the reference, in mode "measured" the acceleration alone. It needs crazyflow, `--trials` does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from examples.outputs import require, save_table, study_parser, study_rows
+
+from d4orm_env import Problem, make_problem
+from d4orm_env.core.robot_types import find_robot
+from d4orm_planners import Controller, make_planner
+
+ROBOT, RATE, FIRST_SEED = "crazyflie", 100, 1000
+DISTURBED = {"gust": 0.02, "mass_factor": 1.05}
+CONDITIONS: dict[str, dict[str, float]] = {
+    "open loop": {},
+    "open loop, disturbed": DISTURBED,
+    "nominal, disturbed": DISTURBED,
+    "measured, disturbed": DISTURBED,
+}
+HORIZON, RESERVE = 150, 0.5
+CALM = 10
+"""Steps to fly on when all have arrived."""
+
+
+def figure(seed: int) -> Problem:
+    """Ten drones from a grid above the floor to two rings one above the other."""
+    angles = 2 * np.pi * np.arange(5) / 5
+    rings = [np.stack([0.5 * np.sin(angles), 0 * angles, z + side * 0.5 * np.cos(angles)], axis=1)
+             for z, side in ((1.0, -1), (2.3, 1))]  # fmt: skip
+    grid = [[0.6 * x, 0.6 * y, 0.5, 0, 0, 0] for x in range(-2, 3) for y in (-1, 0)]
+    goals = np.random.default_rng(seed).permutation(np.concatenate(rings))
+    return make_problem(
+        "circle", 10, robot=ROBOT, height=1.0, horizon=HORIZON, bounds=[[-3, -3, 0.2], [3, 3, 3]]
+    ).replace(start=grid, goal=goals, name="figure")
+
+
+def problem_of(scenario: str, seed: int) -> Problem:
+    """The team's problem."""
+    common: dict[str, Any] = {"robot": ROBOT, "height": 1.0, "horizon": HORIZON}
+    if scenario == "figure of ten":
+        return figure(seed)
+    if scenario == "circle of eight":
+        return make_problem("circle", 8, seed, diameter=4.0, bounds=[[-3, -3, 0.75], [3, 3, 1.25]], **common)
+    return make_problem("swap", 10, seed, num_obstacles=4, bounds=[[-4, -3, 0.3], [4, 3, 2]], **common)
+
+
+SCENARIOS = ("swap of ten", "circle of eight", "figure of ten")
+
+
+def setpoints_of_a_plan(problem: Problem, seed: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """The setpoints of each step of a plan; none where it is not solved."""
+    plan = make_planner().solve(problem, seed=seed, time_limit=60)
+    if not plan.solved:
+        return
+    sampled = plan.sample(rate=RATE)
+    parts = [np.concatenate([part, np.repeat(part[-1:], RATE, axis=0)]) for part in
+             (sampled.position, sampled.velocity, sampled.acceleration)]  # fmt: skip
+    each = round(problem.dt * RATE)
+    for first in range(0, len(parts[0]), each):
+        yield tuple(part[first : first + each] for part in parts)
+
+
+def setpoints_of_a_controller(problem: Problem, seed: int, mode: Any, bodies: Any) -> Iterator[tuple[np.ndarray, ...]]:
+    """The setpoints of each step of D4orm-C2F, which sees where the drones are."""
+    from d4orm_env.crazyflow.drone_bodies import between
+
+    count, dt = round(problem.dt * RATE), problem.dt
+    trim = problem.start[:, :3] - bodies.states[:, :3]  # what drones that hover are off
+    with Controller("d4orm-c2f", mode=mode, reserve=RESERVE, lag=find_robot(ROBOT).lag, refine="sync") as controller:
+        last, former = bodies.states, np.zeros_like(trim)
+        controller.begin(problem, last, seed=seed)
+        step = calm = 0
+        while calm < CALM:
+            setpoint = controller.step(bodies.states, step * dt)
+            after = np.concatenate([setpoint.position, setpoint.velocity], axis=1).astype(np.float32)
+            if mode == "measured":
+                last = bodies.states
+                velocity = last[:, 3:] + dt * setpoint.control
+                position = last[:, :3] + trim + dt / 2 * (last[:, 3:] + velocity)
+                last[:, :3] += trim
+                after = np.concatenate([position, velocity], axis=1)
+            position, velocity, acceleration = between(last, after, dt, count)
+            # Acceleration that jumps by twice the limit ten times a second is more than the attitude can follow.
+            ramp = (np.arange(1, count + 1) / count)[:, None, None]
+            yield position, velocity, former + ramp * (acceleration - former)
+            last, former, step, calm = after, acceleration[-1], step + 1, calm + controller.over
+
+
+def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
+    """The row of a flight."""
+    from d4orm_env.crazyflow import DroneBodies, DronePhysics
+
+    problem, mode = problem_of(scenario, seed), condition.partition(",")[0]
+    bodies = DroneBodies(problem, np.zeros(0, np.float32), DronePhysics(**CONDITIONS[condition]))
+    bodies.begin(seed)
+    steps = (
+        setpoints_of_a_plan(problem, seed)
+        if mode == "open loop"
+        else setpoints_of_a_controller(problem, seed, mode, bodies)
+    )
+    touched, arrived = np.zeros((2, problem.num_robots), np.bool_)
+    for setpoints in steps:
+        touched |= bodies.follow(*setpoints)
+        position, velocity = bodies.states[:, :3], bodies.states[:, 3:]
+        near = np.linalg.norm(position - problem.goal, axis=1) <= problem.goal_radius
+        arrived |= near & (np.linalg.norm(velocity, axis=1) <= problem.goal_speed)
+    record = bodies.record
+    return {
+        "scenario": scenario, "condition": condition, "seed": seed, "robots": problem.num_robots,
+        "flown": record.samples > 0, "arrived": int(arrived.sum()), "fallen": int(record.fallen.sum()),
+        "contacts": int((touched & ~record.fallen).sum()),
+        "mean_squared_error": float(record.mean_squared_error.mean()), "error": float(record.largest_error.max()),
+        "gap": float(record.least_gap.min()), "clearance": float(record.least_clearance.min()),
+        "radius": float(problem.team.radius[0]), "seconds": record.samples / RATE,
+    }  # fmt: skip
+
+
+def measure(seeds: int) -> list[dict[str, Any]]:
+    """A row of every flight."""
+    rows = []
+    for scenario in SCENARIOS:
+        for condition in CONDITIONS:
+            rows += [fly(scenario, condition, FIRST_SEED + seed) for seed in range(seeds)]
+            print(f"{scenario}, {condition}: {sum(row['contacts'] for row in rows[-seeds:])} in contact", flush=True)
+    return rows
+
+
+def row_of(scenario: str, condition: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The table's row of some flights."""
+    flown = [row for row in rows if row["flown"]]
+    drones, tracked = sum(row["robots"] for row in flown), not condition.startswith("measured")
+    rms = np.sqrt(np.mean([row["mean_squared_error"] for row in flown]))
+    return {
+        "scenario": scenario, "flown": condition, "teams": f"{len(flown)} of {len(rows)}",
+        "arrived": f"{sum(row['arrived'] for row in flown)} of {drones}",
+        "in contact": sum(row["contacts"] for row in flown), "fallen": sum(row["fallen"] for row in flown),
+        "error RMS [m]": f"{rms:.3f}" if tracked else "-",
+        "most [m]": f"{max(row['error'] for row in flown):.3f}" if tracked else "-",
+        "least distance of centres [m]": f"{min(row['gap'] + 2 * row['radius'] for row in flown):.3f}",
+        "least gap to obstacles [m]": f"{min(row['clearance'] for row in flown):.3f}",
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Fly all teams and write the table."""
+    arguments = study_parser(__doc__, seeds=20).parse_args()
+    if arguments.trials is None:
+        require("drones", "crazyflow")
+    rows = study_rows(arguments, "zero_shot", lambda: measure(1 if arguments.quick else arguments.seeds))
+    groups = {(row["scenario"], row["condition"]): [] for row in rows}
+    for row in rows:
+        groups[row["scenario"], row["condition"]].append(row)
+    save_table([row_of(*key, group) for key, group in groups.items()], arguments.out / "zero_shot.csv")
+
+
+if __name__ == "__main__":
+    main()

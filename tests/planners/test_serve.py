@@ -1,0 +1,261 @@
+"""``d4orm serve`` against robots that speak the same bytes: ROS 2 messages by rosbags, over Zenoh."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from d4orm_env import Problem, Team
+from d4orm_planners import Controller
+from d4orm_planners.cli.app import main
+from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
+
+pytest.importorskip("pycdr2", reason="pycdr2 is not installed: pip install 'd4orm-env[ros]'")
+zenoh = pytest.importorskip("zenoh")
+typesys = pytest.importorskip("rosbags.typesys")
+
+from d4orm_planners.serve import messages  # noqa: E402
+from d4orm_planners.serve.fleet_server import FleetServer  # noqa: E402
+from d4orm_planners.serve.team_messages import state_from, twist  # noqa: E402
+from d4orm_planners.serve.wire import RosSession  # noqa: E402
+
+STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+DT, DEADLINE = 0.05, 0.3
+
+
+def ros_name(kind: Any) -> str:
+    return str(messages.type_name(kind)).replace("::dds_::", "/").replace("::", "/").rstrip("_")
+
+
+def key(topic: str, ros_type: str) -> str:
+    """The key as rmw_zenoh has it, made independently of the package."""
+    package, _, name = ros_type.split("/")
+    return f"0/{topic}/{package}::msg::dds_::{name}_/{STORE.hash_rihs01(ros_type)}"
+
+
+class Fleet:
+    """Robots that do as ``cmd_vel`` says, and tell where they are; each may be off, and messages may be lost."""
+
+    def __init__(self, endpoint: str, start: np.ndarray, loss: float = 0.0) -> None:
+        config = zenoh.Config()
+        config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self.session, self.position, self.heading = zenoh.open(config), start.copy(), np.array([0.0, 0.7])
+        self.velocity, self.on = np.zeros_like(start), [True] * len(start)
+        self.heard, self.diagnosis, self.setpoints = [0.0] * len(start), [""], [None] * len(start)
+        self.loss, self.random, self.moved_at = loss, np.random.default_rng(0), 0.0
+        self._over, self._subscribers = threading.Event(), [
+            self.session.declare_subscriber(key("*/cmd_vel", "geometry_msgs/msg/Twist"), self._command),
+            self.session.declare_subscriber(
+                key("*/setpoint", "trajectory_msgs/msg/MultiDOFJointTrajectory"), self._setpoint
+            ),
+            self.session.declare_subscriber(key("diagnostics", "diagnostic_msgs/msg/DiagnosticArray"), self._diagnose),
+        ]  # fmt: skip
+        self._thread = threading.Thread(target=self._live)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+        self.session.close()
+
+    def say(self, topic: str, ros_type: str, message: Any) -> None:
+        self.session.put(key(topic, ros_type), bytes(STORE.serialize_cdr(message, ros_type)))
+
+    def e_stop(self, wanted: bool) -> None:
+        self.say("e_stop", "std_msgs/msg/Bool", STORE.types["std_msgs/msg/Bool"](wanted))
+
+    def goal(self, robot: int, place: list[float]) -> None:
+        message = STORE.deserialize_cdr(messages.PoseStamped().serialize(), "geometry_msgs/msg/PoseStamped")
+        message.pose.position.x, message.pose.position.y = place
+        self.say(f"robot_{robot}/goal", "geometry_msgs/msg/PoseStamped", message)
+
+    def _command(self, sample: Any) -> None:
+        number, sequence = int(str(sample.key_expr).split("/")[1][-1]), sample.attachment.to_bytes()
+        count, _, size, _ = struct.unpack("<qqB16s", sequence)
+        assert (size, count > 0) == (16, True)
+        command = STORE.deserialize_cdr(sample.payload.to_bytes(), "geometry_msgs/msg/Twist")
+        cos, sin = math.cos(self.heading[number]), math.sin(self.heading[number])
+        x, y = command.linear.x, command.linear.y
+        if self.random.random() >= self.loss:
+            self.velocity[number], self.heard[number] = (cos * x - sin * y, sin * x + cos * y), time.monotonic()
+
+    def _setpoint(self, sample: Any) -> None:
+        message = STORE.deserialize_cdr(sample.payload.to_bytes(), "trajectory_msgs/msg/MultiDOFJointTrajectory")
+        self.setpoints[int(message.joint_names[0][-1])] = message.points[0]
+
+    def _diagnose(self, sample: Any) -> None:
+        array = STORE.deserialize_cdr(sample.payload.to_bytes(), "diagnostic_msgs/msg/DiagnosticArray")
+        self.diagnosis.append(array.status[0].message)
+
+    def _live(self) -> None:
+        odometry = STORE.deserialize_cdr(messages.Odometry().serialize(), "nav_msgs/msg/Odometry")
+        while not self._over.wait(DT / 5):
+            self.position += DT / 5 * self.velocity
+            if (np.abs(self.velocity) > 1e-6).any():
+                self.moved_at = time.monotonic()
+            for robot in np.flatnonzero(self.on).tolist():
+                if self.random.random() < self.loss:
+                    continue
+                pose, speed = odometry.pose.pose, odometry.twist.twist.linear
+                pose.position.x, pose.position.y = self.position[robot].tolist()
+                half, heading = self.heading[robot] / 2, -self.heading[robot]
+                pose.orientation.z, pose.orientation.w = math.sin(half), math.cos(half)
+                vx, vy = self.velocity[robot].tolist()
+                speed.x = math.cos(heading) * vx - math.sin(heading) * vy
+                speed.y = math.sin(heading) * vx + math.cos(heading) * vy
+                self.say(f"robot_{robot}/odom", "nav_msgs/msg/Odometry", odometry)
+
+
+def problem() -> Problem:
+    team = Team(("holonomic2d",) * 2, radius=0.1, max_acceleration=2.0)
+    return Problem(team, [[0, 0, 0, 0], [0, 1, 0, 0]], [[0.6, 0], [0.6, 1]], dt=DT, horizon=200, goal_radius=0.06)
+
+
+@contextlib.contextmanager
+def served(endpoint: str) -> Iterator[FleetServer]:
+    over = threading.Event()
+    with RosSession(ZenohSettings(listen=(endpoint,)), 0, "d4orm") as session:
+        names = ("robot_0", "robot_1")
+        controller = Controller("go-to-goal", mode="measured", timeout=2.0)
+        server = FleetServer(session, problem(), controller, names, DEADLINE)
+        thread = threading.Thread(target=server.run, args=(over,))
+        thread.start()
+        try:
+            yield server
+        finally:
+            over.set()
+            thread.join()
+            time.sleep(0.05)  # for the last commands to get away
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.005)
+
+
+def test_robots_arrive_though_messages_are_lost_and_get_new_goals(endpoint: str) -> None:
+    with served(endpoint) as server:
+        fleet = Fleet(endpoint, problem().start[:, :2].astype(float), loss=0.2)
+        try:
+            until(lambda: bool((np.linalg.norm(fleet.position - problem().goal, axis=1) < 0.1).all()))
+            fleet.goal(0, [0.3, 0.2])
+            fleet.goal(1, [math.nan, 0])
+            until(lambda: bool(np.linalg.norm(fleet.position[0] - [0.3, 0.2]) < 0.1))
+            assert "goal of robot_1" in server.refusal
+            point = fleet.setpoints[1]
+            assert point.transforms[0].translation.x == pytest.approx(fleet.position[1, 0], abs=0.1)
+            assert {"driving", "planning"} <= set(fleet.diagnosis)
+        finally:
+            fleet.close()
+
+
+def test_emergency_stop_silence_and_restart(endpoint: str) -> None:
+    with served(endpoint):
+        fleet = Fleet(endpoint, problem().start[:, :2].astype(float))
+        until(lambda: bool((fleet.position[:, 0] > 0.1).all()))
+        fleet.e_stop(True)
+        told = time.monotonic()
+        until(lambda: bool((fleet.velocity == 0).all()))
+        assert time.monotonic() - told <= 2 * DT + 0.1  # and what a loaded machine takes
+        time.sleep(3 * DT)
+        assert (fleet.velocity == 0).all()
+        assert fleet.diagnosis[-1] == "stopped"
+        fleet.e_stop(False)
+        until(lambda: bool((fleet.velocity[:, 0] != 0).all()))
+        fleet.on[1] = False
+        until(lambda: bool((fleet.velocity == 0).all()))
+        assert fleet.diagnosis[-1] == "waiting"
+        fleet.on[1] = True
+        until(lambda: bool((fleet.velocity != 0).any()))
+    until(lambda: bool((fleet.velocity == 0).all()))  # a server that ends leaves nobody moving
+    with served(endpoint):
+        try:
+            until(lambda: bool((np.linalg.norm(fleet.position - problem().goal, axis=1) < 0.1).all()))
+        finally:
+            fleet.close()
+
+
+def test_types_are_those_of_ros() -> None:
+    for kind, expected in messages.HASHES.items():
+        assert f"RIHS01_{expected}" == STORE.hash_rihs01(ros_name(kind))
+        read = STORE.deserialize_cdr(kind().serialize(), ros_name(kind))
+        assert bytes(STORE.serialize_cdr(read, ros_name(kind))) == kind().serialize()
+        assert kind.deserialize(kind().serialize()) == kind()
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "velocity2d", "differential_drive", "unicycle", "holonomic3d"])
+def test_states_and_velocities_are_in_the_robots_own_frame(model: str) -> None:
+    team = Team((model,))
+    d = 3 if model == "holonomic3d" else 2
+    alone = Problem(team, [[0] * team.state_size], [[3] * d])
+    odometry = messages.Odometry()
+    odometry.pose.pose.position = messages.Point(1.0, 2.0, 3.0)
+    odometry.pose.pose.orientation.z = odometry.pose.pose.orientation.w = math.sqrt(0.5)
+    odometry.twist.twist.linear.x = 0.4
+    state = state_from(alone, 0, odometry)
+    expected = {
+        "holonomic2d": [1, 2, 0, 0.4], "velocity2d": [1, 2], "differential_drive": [1, 2, math.pi / 2, 0.4],
+        "unicycle": [1, 2, math.pi / 2], "holonomic3d": [1, 2, 3, 0, 0.4, 0],
+    }  # fmt: skip
+    np.testing.assert_allclose(sorted(state), sorted(expected[model]), atol=1e-6)
+    control = {"velocity2d": [0, 0.4], "unicycle": [0.4, 0], "holonomic3d": [0, 0, 0]}.get(model, [0, 0])
+    command = twist(alone, 0, state, np.float32(control), math.pi / 2)
+    assert (command.linear.x, command.linear.y, command.angular.z) == pytest.approx((0.4, 0, 0), abs=1e-6)
+
+
+def test_strangers_bytes_are_counted(endpoint: str) -> None:
+    with RosSession(ZenohSettings(listen=(endpoint,)), 0, "d4orm") as session:
+        subscriber = session.subscriber("e_stop", messages.Bool)
+        fleet = Fleet(endpoint, np.zeros((2, 2)))
+        try:
+            until(
+                lambda: bool(
+                    fleet.session.put(key("e_stop", "std_msgs/msg/Bool"), b"")
+                    or subscriber.take()
+                    or subscriber.refused
+                )
+            )
+        finally:
+            fleet.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("policy: orca", "field 'problem' is missing"),
+        ("problem: {scenario: circle}\nspeed: 2", "unknown field 'speed'"),
+        ("problem: {scenario: circle}\nzenoh: {namespace: a}", "zenoh has 'namespace'"),
+        ("problem: {scenario: circle}\nrobots: [a/b]", "robots is ['a/b']"),
+        ("problem: {scenario: circle}\npolicy: nobody", "nobody"),
+        ("problem: {scenario: circle}\nrobots: [a, b]", "there are 2 names for 8 robots"),
+        ("problem: {scenario: circle}\ncontroller: {mode: wild}", "mode is 'wild'"),
+    ],
+)
+def test_bad_files_are_one_line(text: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "serve.yaml").write_text(text)
+    with pytest.raises(SystemExit) as ended:
+        main(["serve", "--config", str(tmp_path / "serve.yaml")])
+    error = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert complaint in error
+    assert error.count("\n") == 1
