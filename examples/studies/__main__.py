@@ -21,7 +21,8 @@ DATA = Path(__file__).parent / "data"
 STUDIES = (
     "ablation", "amswarm_gaps", "contact_penalty", "credit_by_update", "disturbance_study", "fewer_samples",
     "gradient_dilution", "head_to_head", "imitate_expert", "lifelong", "multimodality", "multimodality_team",
-    "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners", "tuned_rivals", "warm_start", "zero_shot",
+    "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners", "tuned_rivals", "warm_start",
+    "zero_shot",
 )  # fmt: skip
 """Studies whose trials are in a file of their name."""
 TIMED = ("big-teams", "coarseness", "ipopt")
