@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Ints, positive_number, shown
+from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, shown
 from d4orm_env.core.errors import unknown
 
 __all__ = ["Box", "Capsule", "Disc", "Ellipsoid", "Footprint", "Polygon"]
@@ -118,7 +118,7 @@ class Disc(Footprint):
         return Core(np.zeros((1, 2)), self.radius)
 
 
-class _Planar(Footprint):
+class Planar(Footprint):
     """A footprint that turns with the robot."""
 
     def outline(self) -> Floats:
@@ -142,7 +142,7 @@ class _Planar(Footprint):
 
 
 @dataclass(frozen=True)
-class Box(_Planar):
+class Box(Planar):
     """A rectangle, its length along the heading.
 
     Attributes:
@@ -167,7 +167,7 @@ class Box(_Planar):
 
 
 @dataclass(frozen=True)
-class Capsule(_Planar):
+class Capsule(Planar):
     """A rectangle with round ends: all within a radius of a segment along the heading.
 
     Attributes:
@@ -190,7 +190,7 @@ class Capsule(_Planar):
 
 
 @dataclass(frozen=True)
-class Polygon(_Planar):
+class Polygon(Planar):
     """A convex polygon.
 
     Attributes:
@@ -267,61 +267,6 @@ class Ellipsoid(Footprint):
 
 KINDS: dict[str, type[Footprint]] = {kind.__name__.lower(): kind for kind in (Disc, Box, Capsule, Polygon, Ellipsoid)}
 """Footprints by their names in files."""
-
-
-class FootprintArrays(NamedTuple):
-    """A team's footprints as the engines read them, float32 unless said; without rows where all robots are discs.
-
-    Attributes:
-        corners: ``(K, 8, 2)`` of the cores, the last one repeated.
-        num_corners: ``(K,)`` int32.
-        axes: ``(K, 8, 2)`` see :attr:`Core.axes`, zeros on padding.
-        extents: ``(K, 8)`` how far the core reaches along each.
-        num_axes: ``(K,)`` int32.
-        rounding: ``(K,)``.
-        inner: ``(K,)`` inner radii, a little less for rounding.
-        heading: ``(K,)`` int32 number of the state component that turns the footprint, -1 for none.
-        semi_axes: ``(K, 3)`` of ellipsoids and balls; zero in the plane.
-    """
-
-    corners: FloatArray
-    num_corners: Ints
-    axes: FloatArray
-    extents: FloatArray
-    num_axes: Ints
-    rounding: FloatArray
-    inner: FloatArray
-    heading: Ints
-    semi_axes: FloatArray
-
-
-def as_arrays(footprints: tuple[Footprint, ...], headings: list[int | None]) -> FootprintArrays:
-    """The arrays of these; ``headings`` are the numbers of the state components that are headings."""
-    size = len(footprints)
-    arrays = FootprintArrays(
-        np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros(size, np.int32),
-        np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros((size, MAX_CORNERS), np.float32),
-        np.zeros(size, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32),
-        np.full(size, -1, np.int32), np.zeros((size, 3), np.float32),
-    )  # fmt: skip
-    for robot, footprint in enumerate(footprints):
-        arrays.inner[robot] = footprint.inner_radius * (1 - 2.0**-20)
-        if isinstance(footprint, Disc | Ellipsoid):
-            arrays.semi_axes[robot] = footprint.semi_axes
-        if not isinstance(footprint, Disc | _Planar):
-            continue
-        corners, rounding = footprint.core
-        axes, extents = footprint.core.axes
-        arrays.corners[robot, : len(corners)] = corners
-        arrays.corners[robot, len(corners) :] = corners[-1]
-        arrays.num_corners[robot], arrays.num_axes[robot] = len(corners), len(axes)
-        arrays.axes[robot, : len(axes)], arrays.extents[robot, : len(axes)] = axes, extents
-        arrays.rounding[robot] = rounding
-        heading = headings[robot]
-        arrays.heading[robot] = -1 if heading is None else heading
-    for array in arrays:
-        array.setflags(write=False)
-    return arrays
 
 
 def described(footprint: Footprint) -> dict[str, Any]:

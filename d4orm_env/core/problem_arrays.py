@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.footprints import FootprintArrays
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.geometry.world_index import WorldIndex
 
 

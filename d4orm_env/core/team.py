@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, shown
+from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
-from d4orm_env.footprints import Disc, Footprint, FootprintArrays, as_arrays
+from d4orm_env.footprints import Disc, Footprint
 
 DEFAULT_RADIUS = 0.15
 """Radius of a robot [m]."""

@@ -14,12 +14,12 @@ import numpy as np
 from numba.cpython.unsafe import numbers
 
 from d4orm_env.core.arrays import FloatArray, Whole
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import collision
 from d4orm_env.engine.compiling import ONE, ZERO, compiled
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.simd import NOWHERE, TILE
-from d4orm_env.footprints import FootprintArrays
 
 _BIT = np.uint64(1)
 _HALF = np.float32(0.5)

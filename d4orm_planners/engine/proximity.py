@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Ints, Whole
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import simd
 from d4orm_env.engine.compiling import ZERO, aligned_zeros, compiled, inlined
@@ -36,7 +37,6 @@ from d4orm_env.engine.simd import (
     worlds_overlap_3,
 )
 from d4orm_env.engine.tiles import near_round
-from d4orm_env.footprints import FootprintArrays
 from d4orm_planners.engine.sampling_types import MovingObstacles
 
 DIGITS = 7

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.team import Team
 from d4orm_env.engine.types import Engine
-from d4orm_env.footprints import FootprintArrays, as_arrays
 
 DISCS = as_arrays((), [])
 """Footprints of bodies that are all discs."""
