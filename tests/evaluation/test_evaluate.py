@@ -695,14 +695,14 @@ def test_a_worker_lost_on_a_cluster_is_a_row(tmp_path: Path) -> None:
     options = "num_cpus=2, log_to_driver=False, runtime_env={'worker_process_setup_hook': 'trouble.hook'}"
     start = f"import ray\nray.init(address='local', {options})\n"
     # A worker that takes the place of a lost one has to start within it too.
-    body = start + EVALUATE.format(policies='"go-to-goal"', arguments='ray="auto", trial_timeout=30')
-    result = program(tmp_path, body.replace("[0, 0.1]", "0"))
+    body = start + EVALUATE.format(policies='"go-to-goal"', arguments='ray="auto", trial_timeout=45')
+    result = program(tmp_path, body.replace("[0, 0.1]", "[0]"))
     # Ray may have something to say before and after.
     assert "(6, 3)" in result.stdout.splitlines(), result.stderr
     errors = {row.seed: row.error for row in TrialStore(tmp_path / "out" / STORE).trials() if row.error}
     assert errors[1] == "RuntimeError: out of luck"
     assert errors[2].startswith("ChildProcessError: the worker was lost (WorkerCrashedError: ")
-    assert errors[3] == "TimeoutError: took longer than 30 s"
+    assert errors[3] == "TimeoutError: took longer than 45 s"
 
 
 @pytest.mark.parametrize(

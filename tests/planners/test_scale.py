@@ -21,7 +21,7 @@ PROBLEMS: dict[str, tuple[str, dict[str, Any]]] = {
     "open": ("heterogeneous", {"num_robots": 4, "max_acceleration": [0.5, 1, 2, 1]}),
     "walls": ("rooms", {"num_robots": 3, "radius": [0.15, 0.12, 0.15], "goal_speed": 0.3}),
     "space": ("random", {"num_robots": 3, "model": "holonomic3d", "num_obstacles": 4}),
-    "wheels": ("random", {"num_robots": 4, "model": ("car", "differential_drive") * 2}),
+    "wheels": ("random", {"num_robots": 4, "model": ("car", "holonomic2d") * 2}),
 }
 FACTORS = st.integers(-6, 6).map(lambda exponent: 2.0**exponent)
 
