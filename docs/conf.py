@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))  # for replays.py
+os.environ["SCIPY_ARRAY_API"] = "1"  # without which d4orm_env.crazyflow is not imported beside SciPy
 
 project = "d4orm-env"
 author = "d4orm-env contributors"
@@ -44,6 +46,7 @@ autodoc_preserve_defaults = True
 autodoc_mock_imports = [
     "benchmarl",
     "casadi",
+    "crazyflow",
     "h5py",
     "jaxmarl",
     "minari",

@@ -52,7 +52,7 @@ def _periods(problem: Problem) -> int:
 
 
 class DroneBodies:
-    """The drones of a problem's team; see :class:`~d4orm_env.envs.body_simulation.Bodies`.
+    """The drones of a problem's team; see :class:`~d4orm_env.envs.body_simulation.SimulatedBodies`.
 
     Drones follow setpoints, which move as the team's model does under the controls and stay at the goal where that has
     arrived. Drones that are held hover.

@@ -36,7 +36,7 @@ class Moved(NamedTuple):
     touched: BoolArray
 
 
-class Bodies(Protocol):
+class SimulatedBodies(Protocol):
     """The bodies of a problem's team in another physics.
 
     Attributes:
@@ -86,9 +86,9 @@ class BodySimulation(TeamSimulation):
         self,
         options: EnvOptions,
         check: Callable[[Problem], None],
-        make_bodies: Callable[[Problem, FloatArray], Bodies],
+        make_bodies: Callable[[Problem, FloatArray], SimulatedBodies],
     ) -> None:
-        self.bodies: Bodies | None = None
+        self.bodies: SimulatedBodies | None = None
         self._make_bodies = make_bodies
         super().__init__(EnvSetup(options, slack=_slack_of))
         check(self.problem)

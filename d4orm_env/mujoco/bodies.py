@@ -76,7 +76,7 @@ class TeamBodies:
         self._held[robots] = True
 
     def advance(self, controls: FloatArray, arrays: ProblemArrays, intruders: FloatArray) -> Moved:
-        """See :class:`~d4orm_env.envs.body_simulation.Bodies`.
+        """See :class:`~d4orm_env.envs.body_simulation.SimulatedBodies`.
 
         Raises:
             RuntimeError: If the simulation has become unstable.

@@ -8,9 +8,27 @@ from pycdr2 import IdlStruct
 from pycdr2.types import array, float64, int32, sequence, uint8, uint32
 
 __all__ = [
-    "HASHES", "Bool", "DiagnosticArray", "DiagnosticStatus", "Duration", "Header", "KeyValue",
-    "MultiDOFJointTrajectory", "MultiDOFJointTrajectoryPoint", "Odometry", "Point", "Pose", "PoseStamped",
-    "PoseWithCovariance", "Quaternion", "Time", "Transform", "Twist", "TwistWithCovariance", "Vector3", "type_name",
+    "HASHES",
+    "Bool",
+    "DiagnosticArray",
+    "DiagnosticStatus",
+    "Duration",
+    "KeyValue",
+    "MultiDOFJointTrajectory",
+    "MultiDOFJointTrajectoryPoint",
+    "Odometry",
+    "Point",
+    "Pose",
+    "PoseStamped",
+    "PoseWithCovariance",
+    "Quaternion",
+    "RosHeader",
+    "Time",
+    "Transform",
+    "Twist",
+    "TwistWithCovariance",
+    "Vector3",
+    "type_name",
 ]  # fmt: skip
 
 
@@ -31,7 +49,7 @@ class Duration(IdlStruct, typename="builtin_interfaces.msg.dds_.Duration_"):
 
 
 @dataclass
-class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+class RosHeader(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
     """When, and in which frame."""
 
     stamp: Time = field(default_factory=Time)
@@ -85,7 +103,7 @@ class Pose(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
 class PoseStamped(IdlStruct, typename="geometry_msgs.msg.dds_.PoseStamped_"):
     """A pose, and when."""
 
-    header: Header = field(default_factory=Header)
+    header: RosHeader = field(default_factory=RosHeader)
     pose: Pose = field(default_factory=Pose)
 
 
@@ -117,7 +135,7 @@ class TwistWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.TwistWithC
 class Odometry(IdlStruct, typename="nav_msgs.msg.dds_.Odometry_"):
     """A pose in ``header.frame_id``, and velocities in ``child_frame_id``, which is the robot's own."""
 
-    header: Header = field(default_factory=Header)
+    header: RosHeader = field(default_factory=RosHeader)
     child_frame_id: str = ""
     pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
     twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
@@ -145,7 +163,7 @@ class MultiDOFJointTrajectoryPoint(IdlStruct, typename="trajectory_msgs.msg.dds_
 class MultiDOFJointTrajectory(IdlStruct, typename="trajectory_msgs.msg.dds_.MultiDOFJointTrajectory_"):
     """Full states of robots over time."""
 
-    header: Header = field(default_factory=Header)
+    header: RosHeader = field(default_factory=RosHeader)
     joint_names: sequence[str] = field(default_factory=list)
     points: sequence[MultiDOFJointTrajectoryPoint] = field(default_factory=list)
 
@@ -173,7 +191,7 @@ class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticS
 class DiagnosticArray(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticArray_"):
     """States of parts."""
 
-    header: Header = field(default_factory=Header)
+    header: RosHeader = field(default_factory=RosHeader)
     status: sequence[DiagnosticStatus] = field(default_factory=list)
 
 

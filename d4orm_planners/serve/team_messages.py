@@ -88,7 +88,7 @@ def quaternion(heading: float) -> Any:
 def header() -> Any:
     """A ``std_msgs/Header`` of now."""
     seconds, nanoseconds = divmod(time.time_ns(), 10**9)
-    return messages.Header(messages.Time(seconds, nanoseconds), FRAME)
+    return messages.RosHeader(messages.Time(seconds, nanoseconds), FRAME)
 
 
 def diagnostics(node: str, level: int, state: str, values: dict[str, str]) -> Any:
