@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport, verify
-from d4orm_planners.base.conflict_groups import conflicts
+from d4orm_planners.base.conflict_groups import Graph, conflicts
 from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.provenance import Provenance
 
@@ -171,26 +172,33 @@ class Plan(DisplayMixin):
 
     def _faults(self) -> dict[int, list[str]]:
         """Return the faults of robots at the steps."""
+        near = conflicts(self.trajectory.positions, self.problem.team.radius, self.problem.margin)
+        rounding = ["comes so near to the margin of something that rounding decides"]
+        failed = np.flatnonzero(failed_robots(self.trajectory)).tolist()
+        return {robot: [*self._not_there(robot), *self._too_near(robot, near)] or rounding for robot in failed}
+
+    def _not_there(self, robot: int) -> Iterator[str]:
         problem, trajectory = self.problem, self.trajectory
-        reach = np.asarray(problem.team.radius) + problem.margin
-        near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
-        unreachable = {robot for record in self.history for robot in record.unreachable}
-        reasons: dict[int, list[str]] = {}
-        for robot in np.flatnonzero(failed_robots(trajectory)).tolist():
-            faults = reasons[robot] = []
-            if not trajectory.arrived[-1, robot]:
-                gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
-                faults.append(f"ends {gap:.2g} m from its goal")
-            if robot in unreachable:
-                faults.append(f"has no path from start to goal that is {reach[robot]:.4g} m clear of obstacles")
-            others = [f"robot_{other}" for other in sorted(near[robot])]
-            if others:
-                faults.append(f"comes within the margin of {', '.join(others)}")
-            if problem.world.clearance(trajectory.positions[1:, robot]).min() <= reach[robot]:
-                faults.append("comes within the margin of an obstacle or the bounds")
-            if not faults:
-                faults.append("comes so near to the margin of something that rounding decides")
-        return reasons
+        if not trajectory.arrived[-1, robot]:
+            gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
+            turns = (problem.team.headings(trajectory.states[-1]) - problem.goal_heading)[robot] / (2 * np.pi)
+            missed = 2 * np.pi * abs(turns - np.round(turns))
+            yield f"ends {gap:.2g} m from its goal" + (f", {missed:.2g} rad off" if missed > 0 else "")
+        if any(robot in record.unreachable for record in self.history):
+            reach = problem.team.radius[robot] + problem.margin
+            yield f"has no path from start to goal that is {reach:.4g} m clear of obstacles"
+
+    def _too_near(self, robot: int, near: Graph) -> Iterator[str]:
+        problem, trajectory = self.problem, self.trajectory
+        if problem.team.shapes:  # the discs round them do not tell what touches what
+            if trajectory.margin_violated[1:, robot].any():
+                yield "comes within the margin of something"
+            return
+        if near[robot]:
+            yield f"comes within the margin of {', '.join(f'robot_{other}' for other in sorted(near[robot]))}"
+        reach = problem.team.radius[robot] + problem.margin
+        if problem.world.clearance(trajectory.positions[1:, robot]).min() <= reach:
+            yield "comes within the margin of an obstacle or the bounds"
 
     def sample(
         self, rate: float = 100.0, *, max_acceleration: ArrayLike | None = None, max_jerk: ArrayLike | None = None
