@@ -20,7 +20,7 @@ from d4orm_env.scenarios.free_space import FreeSpace, free_space
 from d4orm_env.scenarios.grid_map import MAX_BYTES, GridMap
 from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.movingai import parse_map, parse_scenario
-from d4orm_env.scenarios.occupancy_image import read_occupancy_image
+from d4orm_env.scenarios.occupancy_image import grid_of_fields, read_occupancy_image
 from d4orm_env.scenarios.placement import Points
 from d4orm_env.scenarios.settings import Settings, bounded, require_plane
 from d4orm_env.scenarios.well_formed import populate, reach_of, with_obstacles
@@ -28,7 +28,10 @@ from d4orm_env.scenarios.well_formed import populate, reach_of, with_obstacles
 PathLike: TypeAlias = str | os.PathLike[str]
 
 
-def load_map(path: PathLike, cell: float = 0.6) -> World:
+IMAGES = (".png", ".pgm")
+
+
+def load_map(path: PathLike, cell: float = 0.6, resolution: float | None = None) -> World:
     """The world of a map: its blocked cells, merged into few boxes, and bounds around it; y goes up.
 
     Args:
@@ -36,22 +39,29 @@ def load_map(path: PathLike, cell: float = 0.6) -> World:
             ``S`` and ``E`` are free, ``@``, ``O``, ``T`` and ``W`` are blocked. Or the YAML file of ROS's map_server,
             with its ``.png`` or ``.pgm`` image beside it: what is not known to be free is blocked, transparent pixels
             too. Where its origin is so far out that float32 does not resolve the cells, as UTM coordinates are, the
-            world begins at zero and has the origin as its :attr:`~d4orm_env.World.origin`.
+            world begins at zero and has the origin as its :attr:`~d4orm_env.World.origin`. Or such an image alone.
         cell: Side of a cell of a ``.map`` file [m]; a map_server file has a resolution of its own.
+        resolution: Side of a pixel of an image without a YAML file [m], whose lower left corner is at the origin.
 
     Raises:
         ValueError: If the file cannot be read or is no map, one line that names it.
     """
-    return read_map(path, cell).world
+    return read_map(path, cell, resolution).world
 
 
-def read_map(path: PathLike, cell: float = 0.6) -> GridMap:
+def read_map(path: PathLike, cell: float = 0.6, resolution: float | None = None) -> GridMap:
     """Read a map as :func:`load_map`; the same object for the same content."""
     cell = bounded(cell, "cell")
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"the path of a map must be text or a path, not {shown(path)}")
     file = Path(path)
     with _named(file):
+        if file.suffix.lower() in IMAGES:
+            if resolution is None:
+                raise ValueError("is an image without its map_server YAML file; give resolution=, its metres per pixel")
+            return grid_of_fields({"image": file.name, "resolution": resolution, "origin": [0, 0, 0]}, file.parent)
+        if resolution is not None:
+            raise ValueError("is no image, and only images take a resolution; leave it out")
         if is_yaml_path(file):
             return read_occupancy_image(file)
         return _parse(read_limited(file, "a map", MAX_BYTES), cell)
@@ -61,8 +71,9 @@ _parse = lru_cache(maxsize=4)(parse_map)
 
 
 def map(
-    settings: Settings, *, map: PathLike | None = None, cell: float = 0.6, scenario_file: PathLike | None = None
-) -> Problem:
+    settings: Settings, *, map: PathLike | None = None, cell: float = 0.6, resolution: float | None = None,
+    scenario_file: PathLike | None = None,
+) -> Problem:  # fmt: skip
     """A map from a file; starts and goals anywhere on it, or those of a Moving AI scenario.
 
     Places are drawn from the largest connected region that is wide enough for the largest robot, and set by the seed.
@@ -71,6 +82,7 @@ def map(
         settings: The common arguments.
         map: A Moving AI ``.map`` file, or the YAML file of ROS's map_server; see :func:`load_map`.
         cell: Side of a cell of a ``.map`` file [m].
+        resolution: Side of a pixel of an image without a YAML file [m].
         scenario_file: A Moving AI ``.scen`` file, whose first ``num_robots`` rows say from where to where robots go.
     """
     if map is None:
@@ -78,7 +90,7 @@ def map(
             f"scenario {settings.scenario!r} needs map=, the path of a .map file or a map_server .yaml file"
         )
     require_plane(settings)
-    grid, reach = read_map(map, cell), reach_of(settings)
+    grid, reach = read_map(map, cell, resolution), reach_of(settings)
     step = grid.lattice_step(reach)
     space = free_space(grid.world, reach, step)
     if scenario_file is None:

@@ -36,6 +36,11 @@ def read_occupancy_image(path: Path) -> GridMap:
     fields = read_yaml(path)
     if not isinstance(fields, dict):
         raise ValueError("is not a map_server file; expected fields such as 'image: map.pgm' and 'resolution: 0.05'")
+    return grid_of_fields(fields, path.parent)
+
+
+def grid_of_fields(fields: dict[str, Any], folder: Path) -> GridMap:
+    """The map that the fields of a map_server file mean, its image in this folder; see :func:`read_occupancy_image`."""
     missing = [name for name in ("image", "resolution", "origin") if name not in fields]
     if missing:
         raise ValueError(f"has no field {missing[0]!r}; a map_server file needs image, resolution and origin")
@@ -53,7 +58,7 @@ def read_occupancy_image(path: Path) -> GridMap:
     if free > occupied:
         raise ValueError(f"free_thresh is {free:g}; it must be at most occupied_thresh, which is {occupied:g}")
     low = _corner(fields["origin"])
-    blocked = ~(_occupancy(read_limited(path.parent / image, "an image", MAX_BYTES), mode, bool(negate)) < free)
+    blocked = ~(_occupancy(read_limited(folder / image, "an image", MAX_BYTES), mode, bool(negate)) < free)
     _require_no_turn(fields["origin"], blocked.shape)
     return _grid_map(blocked.tobytes(), blocked.shape, resolution, low)
 

@@ -158,6 +158,21 @@ class TestOccupancyImage:
         assert world.boxes.tolist() == [[-1, 2.5, 0, 3]]
         assert world.bounds.tolist() == [[-1, 2], [0.5, 3]]
 
+    def test_an_image_alone_needs_its_resolution(self, tmp_path: Path) -> None:
+        image = tmp_path / "floor.png"
+        Image.fromarray(np.array([[0, 255], [255, 255]], np.uint8)).save(image)
+        world = load_map(image, resolution=0.5)
+        np.testing.assert_allclose(world.boxes, [[0, 0.5, 0.5, 1]])
+        assert load_map(image, resolution=0.5).upper.tolist() == [1, 1]  # type: ignore[union-attr]
+        with pytest.raises(
+            ValueError, match=r"floor.png: is an image without its map_server YAML file; give resolution="
+        ):
+            load_map(image)
+        grid = tmp_path / "floor.map"
+        grid.write_text("type octile\nheight 1\nwidth 1\nmap\n.\n")
+        with pytest.raises(ValueError, match="is no image, and only images take a resolution"):
+            load_map(grid, resolution=0.5)
+
     def test_negated_coloured_and_deep_images(self, tmp_path: Path) -> None:
         Image.fromarray(255 - SHADES).save(tmp_path / "map.png")
         path = written(tmp_path, FIELDS.format("map.png").replace("negate: 0", "negate: 1"), "map.yaml")
