@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import Floats
+from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.footprints import Core, Footprint
 
@@ -26,6 +29,23 @@ def pair_gap(one: Footprint, pose: Floats, other: Footprint, its_pose: Floats) -
     if len(pose) == 4:
         return _ball_gap(its_pose[:3] - pose[:3], _semi_axes(one), _semi_axes(other))
     return _core_gap(_placed(one, pose), _placed(other, its_pose))
+
+
+def touching(team: Team, states: FloatArray, among: NDArray[np.intp], rounding: float) -> dict[int, list[int]]:
+    """Return which robots, of those ``among`` ``(C,)``, touch each other in states ``(K, n)``, each by its number.
+
+    Gaps of no more than ``rounding`` count as none [m].
+    """
+    d, headings = team.dimension, team.headings(states)
+    poses = np.column_stack([states[:, :d], headings]).astype(np.float64)
+    footprints = team.footprint
+    partners: dict[int, list[int]] = {}
+    for one, other in combinations(among.tolist(), 2):
+        apart = np.linalg.norm(poses[one, :d] - poses[other, :d]) - team.radius[one] - team.radius[other]
+        if apart <= rounding and pair_gap(footprints[one], poses[one], footprints[other], poses[other]) <= rounding:
+            partners.setdefault(one, []).append(other)
+            partners.setdefault(other, []).append(one)
+    return partners
 
 
 def world_gap(world: World, footprint: Footprint, pose: Floats) -> float:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.disturbance_events import DisturbanceEvents
+from d4orm_env.core.footprint_gaps import touching
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed
 from d4orm_env.disturbances.recorded_events import marks_of
@@ -151,5 +152,7 @@ class TeamSimulation(Simulation):
         self._trail.append(self.states[:, : self.setup.layout.dimension].copy())
         flags = worlds.collided[0].copy(), worlds.violated[0].copy()
         terms = {name: values[0] for name, values in self.terms.items()}
-        self.last = TeamStep(observations[0], rewards, arrived, *flags, worlds.distance[0].copy(), terms)
+        problem, collided = self.problem, np.flatnonzero(flags[0])
+        partners = touching(problem.team, self.states, collided, problem.rounding) if len(collided) > 1 else {}
+        self.last = TeamStep(observations[0], rewards, arrived, *flags, worlds.distance[0].copy(), partners, terms)
         return self.last

@@ -24,6 +24,7 @@ class TeamStep(NamedTuple):
         collided: ``(K,)`` bool, hard contact.
         margin_violated: ``(K,)`` bool.
         distances: ``(K,)`` to the present goals [m].
+        partners: Robots that each robot in contact with others touches, by number.
         terms: ``(K,)`` each, what the rewards were made of, where the reward says so.
     """
 
@@ -33,6 +34,7 @@ class TeamStep(NamedTuple):
     collided: BoolArray
     margin_violated: BoolArray
     distances: FloatArray
+    partners: Mapping[int, list[int]] = MappingProxyType({})
     terms: Mapping[str, FloatArray] = MappingProxyType({})
 
 
@@ -47,6 +49,7 @@ def agent_infos(names: Iterable[str], robots: Iterable[int], step: TeamStep) -> 
             "collided": collided[robot],
             "margin_violated": margin_violated[robot],
             "distance_to_goal": distances[robot],
+            "contacts": [f"robot_{other}" for other in step.partners.get(robot, ())],
             **{name: values[robot] for name, values in terms.items()},
         }
         for name, robot in zip(names, robots)

@@ -217,7 +217,9 @@ def test_the_environment_goes_by_footprints() -> None:
     env = navigation_v0.parallel_env(problem=Problem(team, [[0, 0, 0], [0, 0.3, 0]], [[0, 3], [3, 0.3]]))
     _, infos = env.reset(seed=0)
     assert not infos["robot_0"]["collided"]
+    assert infos["robot_0"]["contacts"] == []
     for _ in range(10):
         infos = env.step({"robot_0": np.array([0, 1.5], np.float32), "robot_1": np.zeros(2, np.float32)})[-1]
     assert infos["robot_0"]["collided"]
     assert infos["robot_1"]["collided"]
+    assert infos["robot_0"]["contacts"] == ["robot_1"]
