@@ -7,7 +7,9 @@ from functools import cached_property
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import gymnasium
 import numpy as np
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
@@ -17,6 +19,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.disturbances.recorded_events import marks_of
+from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
@@ -124,7 +127,8 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
     """Reset ``env``, reset ``policy``, and step until no agent is left.
 
     Args:
-        env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
+        env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not; or the joint Gymnasium environment,
+            with no wrappers but those of ``gymnasium.make``: the parallel one of the same options runs in its place.
         policy: A policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
         seed: Seeds both.
         physics: One of :data:`PHYSICS`, to run an environment like ``env`` with that in its place.
@@ -138,6 +142,8 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
         ImportError: If the physics needs a library that is not installed.
     """
     whole_number(seed, "seed", 0)
+    if isinstance(env, gymnasium.Env):
+        env = _parallel(env)
     if physics is not None:
         env = _moved_by(env, physics)
     actor = make_policy(policy)
@@ -162,6 +168,20 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
     marks = None if all(part is None for part in effects[0]) else marks_of(effects, problem)
     goals = np.stack([joint.goals for joint in joints])
     return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals, marks)
+
+
+def _parallel(env: gymnasium.Env[Any, Any]) -> ParallelEnv:
+    """The parallel environment of the options of a joint one."""
+    joint: Any = env.unwrapped
+    layer: Any = env
+    while isinstance(layer, OrderEnforcing | PassiveEnvChecker):
+        layer = layer.env
+    if isinstance(joint, JointNavigationEnv) and layer is joint:
+        return navigation_v0.parallel_env(**joint.options.keywords())
+    raise ValueError(
+        f"{env} is no environment of this package, or is wrapped; give navigation_v0.parallel_env(...), or what "
+        f"gymnasium.make returns"
+    )
 
 
 def _moved_by(env: ParallelEnv, physics: str) -> ParallelEnv:

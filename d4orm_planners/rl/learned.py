@@ -32,7 +32,8 @@ class LearnedConfig(CheckedSettings):
 
     Attributes:
         path: A ``.safetensors`` file of ``d4orm train``, or a ``.zip`` that Stable-Baselines3 saved after training on
-            the environment's own observations and actions, as through SuperSuit. A zip holds pickled Python, which can
+            the environment's own observations and actions, each robot's, as through SuperSuit, or the team's, in the
+            joint Gymnasium environment. A zip holds pickled Python, which can
             run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
             comes with the package for the robots' model, and for open ground or a world with walls or many obstacles.
 
@@ -105,7 +106,7 @@ class LearnedPolicy(Policy):
         # Team and world may be others at every reset.
         if (path := self._file()) != self._actor.path:
             self._use(path)
-        agent = env.possible_agents[0]
+        agent, self._env = env.possible_agents[0], env
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
@@ -117,7 +118,14 @@ class LearnedPolicy(Policy):
         among_obstacles = self.problem.world.num_obstacles > 0
         if among_obstacles and isinstance(self._actor, _NetworkActor) and self._actor.network.header.shortest_paths:
             self._look_along_paths(self._actor.network, robots, seen, state)
-        controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
+        if isinstance(self._actor, _ZipActor) and self._actor.is_joint:
+            # It wants to see those too that have left.
+            everybody = self._env.unwrapped.last_step.observations.copy()
+            everybody[robots] = seen
+            controls = self._actor.controls(everybody.reshape(1, -1), self.problem.team.control_limits)
+            controls = controls.reshape(len(everybody), -1)[robots]
+        else:
+            controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
         if isinstance(self._actor, _NetworkActor) and not self._actor.network.header.brakes:
             controls = self._braking(robots, controls, split_state(self.problem, state))
         return within_limits(self.problem, dict(zip(observations, controls)))
@@ -183,7 +191,13 @@ class _NetworkActor:
 
 
 class _ZipActor:
-    """Acts by a Stable-Baselines3 model."""
+    """Acts by a Stable-Baselines3 model.
+
+    Attributes:
+        is_joint: True if the model, by the last check, steers the whole team at once.
+    """
+
+    is_joint = False
 
     def __init__(self, algorithm: str, path: Path) -> None:
         try:
@@ -202,15 +216,15 @@ class _ZipActor:
         self.path = path
 
     def check(self, problem: Problem, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
-        for what, mine, theirs in (
-            ("observations", self.model.observation_space.shape, observation_shape),
-            ("actions", self.model.action_space.shape, action_shape),
-        ):
-            if mine != theirs:
-                raise ValueError(
-                    f"the policy in {self.path.name} was trained for {what} of shape {mine}, and this environment's "
-                    f"have shape {theirs}; make the environment as it was in training"
-                )
+        trained = self.model.observation_space.shape, self.model.action_space.shape
+        joint = tuple((problem.num_robots * np.prod(shape, dtype=int),) for shape in (observation_shape, action_shape))
+        self.is_joint = trained == joint and problem.num_robots > 1
+        if trained not in ((observation_shape, action_shape), joint):
+            raise ValueError(
+                f"the policy in {self.path.name} was trained for observations and actions of shapes {trained[0]} and "
+                f"{trained[1]}; a robot's here have {observation_shape} and {action_shape}, and the team's "
+                f"{joint[0]} and {joint[1]}; make the environment as it was in training, with as many robots"
+            )
 
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
         actions: FloatArray = self.model.predict(observations, deterministic=True)[0]

@@ -341,5 +341,32 @@ def test_a_zip_of_sb3_trained_on_the_environment_itself(tmp_path: Path) -> None:
     assert np.abs(episode.trajectory.controls).max() > 0
     other = navigation_v0.parallel_env(problem=problem, observed_robots=1)
     other.reset(seed=0)
-    with pytest.raises(ValueError, match="trained for observations of shape"):
+    with pytest.raises(ValueError, match="trained for observations and actions of shapes"):
         policy.reset(other)
+
+
+def test_a_zip_of_sb3_trained_on_the_joint_environment(tmp_path: Path) -> None:
+    import gymnasium
+    import stable_baselines3
+
+    joint = gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=3)
+    model = stable_baselines3.PPO("MlpPolicy", joint, device="cpu", n_steps=8, batch_size=8)
+    model.save(tmp_path / "joint.zip")
+    policy = make_policy("ppo", path=str(tmp_path / "joint.zip"))
+    episode = run_episode(joint, policy, seed=0)
+    observation, _ = joint.reset(seed=0)
+    action = model.predict(observation, deterministic=True)[0].reshape(3, 2)
+    action /= np.maximum(np.linalg.norm(action, axis=1, keepdims=True), 1)
+    np.testing.assert_allclose(episode.trajectory.controls[0], action, atol=1e-5)
+    other = navigation_v0.parallel_env("circle", num_robots=4)
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match="with as many robots"):
+        policy.reset(other)
+
+
+def test_wrapped_joint_environments_are_refused() -> None:
+    import gymnasium
+
+    joint = gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=2, max_episode_steps=5)
+    with pytest.raises(ValueError, match="is no environment of this package, or is wrapped"):
+        run_episode(joint, "go-to-goal", seed=0)
