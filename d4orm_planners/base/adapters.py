@@ -24,7 +24,7 @@ tensordict: Any = LazyModule("tensordict")
 tensordict_nn: Any = LazyModule("tensordict.nn")
 torch: Any = LazyModule("torch")
 
-__all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torchrl"]
+__all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torch", "from_torchrl"]
 
 Key: TypeAlias = str | tuple[str, ...]
 """A key of a ``TensorDict``."""
@@ -78,6 +78,16 @@ def from_sb3(model: Model, deterministic: bool = True) -> SharedPolicy:
     return SharedPolicy(partial(_ask_sb3, model, deterministic), model.policy)
 
 
+def from_torch(module: Model, normalized: bool = False) -> SharedPolicy:
+    """A ``torch.nn.Module`` that maps observations ``(B, n)`` to actions ``(B, m)``, asked without gradients.
+
+    Args:
+        module: The module, on the CPU.
+        normalized: Whether its actions are in ``[-1, 1]``.
+    """
+    return SharedPolicy(partial(_ask_torch, module), module, normalized)
+
+
 def from_torchrl(module: Model, observation_key: Key = "observation", action_key: Key = "action") -> SharedPolicy:
     """A module of TorchRL (or TensorDict), which is asked for its deterministic action, without gradients.
 
@@ -101,6 +111,11 @@ def from_rllib(module: Model, normalized: bool = True) -> SharedPolicy:
 
 def _ask_sb3(model: Model, deterministic: bool, observations: FloatArray) -> ArrayLike:
     return model.predict(observations, deterministic=deterministic)[0]
+
+
+def _ask_torch(module: Model, observations: FloatArray) -> ArrayLike:
+    with torch.no_grad():
+        return module(torch.as_tensor(observations)).numpy()
 
 
 def _ask_torchrl(module: Model, observation_key: Key, action_key: Key, observations: FloatArray) -> ArrayLike:

@@ -10,7 +10,7 @@ import pytest
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_planners import run_episode
-from d4orm_planners.base.adapters import from_rllib, from_sb3, from_torchrl
+from d4orm_planners.base.adapters import from_rllib, from_sb3, from_torch, from_torchrl
 from d4orm_planners.tracking.steering import limit_controls
 
 torch = pytest.importorskip("torch")
@@ -41,6 +41,13 @@ def test_stable_baselines3() -> None:
     for observation, action in zip(observed, actions):
         np.testing.assert_allclose(action, model.predict(observation, deterministic=True)[0], rtol=1e-5, atol=1e-6)
     assert from_sb3(model).identity() == from_sb3(model).identity() != from_sb3(other).identity()
+
+
+def test_a_module_of_torch() -> None:
+    module = torch.nn.Linear(navigation_v0.parallel_env(problem=PROBLEM).observation_space("robot_0").shape[0], 2)
+    observed, actions, _ = first_actions(from_torch(module))
+    wanted = module(torch.as_tensor(observed)).detach().numpy()
+    np.testing.assert_allclose(actions, limit_controls(PROBLEM, wanted), rtol=1e-5, atol=1e-6)
 
 
 def test_torchrl() -> None:
