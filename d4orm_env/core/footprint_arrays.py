@@ -11,7 +11,7 @@ from d4orm_env.footprints import MAX_CORNERS, Disc, Ellipsoid, Footprint, Planar
 
 
 class FootprintArrays(NamedTuple):
-    """A team's footprints as the engines read them, float32 unless said; without rows where all robots are discs.
+    """A team's footprints as the engines read them, float32 unless said.
 
     Attributes:
         corners: ``(K, 8, 2)`` of the cores, the last one repeated.

@@ -236,7 +236,7 @@ class Problem(Frozen):
     @property
     def _within(self) -> float:
         """The distance within which all obstacles count [m]: of a disc none but the nearest does."""
-        return self._reach if len(self.team.footprint_arrays.inner) else 0.0
+        return self._reach if self.team.shapes else 0.0
 
     @property
     def stride(self) -> float:
@@ -252,6 +252,7 @@ class Problem(Frozen):
     @cached_property
     def arrays(self) -> ProblemArrays:
         """The problem as the engines read it."""
+        turns = not np.isnan(self.goal_heading).all()
         arrays = ProblemArrays(
             model_codes=np.array([MODEL_CODES[name] for name in self.team.models], np.int32),
             limits=self.team.limits.copy(),
@@ -271,8 +272,9 @@ class Problem(Frozen):
             squared_goal_speed=np.square(docking_speed(self.goal_speed, self.team.max_speed)),
             docks=np.bool_(self.docks),
             collision_penalty=np.float32(self.collision_penalty),
-            goal_direction=goal_directions(self.goal_heading),
-            squared_goal_chord=squared_chords(self.goal_heading, self.goal_heading_tolerance),
+            turns_at_goals=np.bool_(True) if turns else None,
+            goal_direction=goal_directions(self.goal_heading) if turns else None,
+            squared_goal_chord=squared_chords(self.goal_heading, self.goal_heading_tolerance) if turns else None,
             footprints=self.team.footprint_arrays,
         )
         for array in arrays:
@@ -332,9 +334,9 @@ class Problem(Frozen):
         sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {goal_speed!r}".encode())
         if not self.docks:
             sha.update(self.arrival.encode())
-        if not np.isnan(self.goal_heading).all():
+        if arrays.goal_direction is not None and arrays.squared_goal_chord is not None:
             sha.update(arrays.goal_direction.tobytes() + arrays.squared_goal_chord.tobytes())
-        if len(arrays.footprints.inner):
+        if self.team.shapes:
             sha.update(repr(self.team.shapes).encode())
         if self.collision_penalty != 1:
             sha.update(f"collision_penalty {self.collision_penalty!r}".encode())

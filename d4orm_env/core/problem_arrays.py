@@ -33,9 +33,11 @@ class ProblemArrays(NamedTuple):
         squared_goal_speed: ``(K,)`` with the allowance for rounding; infinite without a limit.
         docks: ``()`` bool: a robot that has arrived stays there for good.
         collision_penalty: ``()``.
+        turns_at_goals: ``()`` bool, true; ``None`` if no robot has a goal heading, and so are the next two.
         goal_direction: ``(K, 2)`` goal headings as unit vectors, zero for none.
         squared_goal_chord: ``(K,)`` square of the chord by which they may be missed, infinite for none.
-        footprints: Of robots that are no discs; their radii are those of discs round them.
+        footprints: Of a team that is not all discs; the radii are then those of discs round them. Else ``None``:
+            numba leaves out of a kernel what asks whether an argument is ``None`` and would go on if it were not.
     """
 
     model_codes: NDArray[np.int32]
@@ -54,9 +56,10 @@ class ProblemArrays(NamedTuple):
     squared_goal_speed: FloatArray
     docks: np.bool_
     collision_penalty: np.float32
-    goal_direction: FloatArray
-    squared_goal_chord: FloatArray
-    footprints: FootprintArrays
+    turns_at_goals: np.bool_ | None
+    goal_direction: FloatArray | None
+    squared_goal_chord: FloatArray | None
+    footprints: FootprintArrays | None
 
 
 def goal_directions(headings: FloatArray) -> FloatArray:

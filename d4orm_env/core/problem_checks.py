@@ -181,7 +181,7 @@ def check_places(
     """
     radius = team.radius.astype(np.float64)
     gaps = world.clearance(places) - radius
-    shaped = bool(len(team.footprint_arrays.inner))
+    shaped = bool(team.shapes)
     poses = np.column_stack([places, np.full(len(places), np.nan) if headings is None else headings]).astype(np.float64)
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
         gaps[robot] = world_gap(world, team.footprint[robot], poses[robot])

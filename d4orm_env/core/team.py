@@ -116,7 +116,7 @@ class Team(Frozen):
     @property
     def inner_radius(self) -> Floats:
         """``(K,)`` radii of the discs or balls that the footprints cover however they turn [m]."""
-        return (self.footprint_arrays.inner if self.shapes else self.radius).astype(np.float64)
+        return (self.all_footprint_arrays.inner if self.shapes else self.radius).astype(np.float64)
 
     def headings(self, states: FloatArray) -> FloatArray:
         """``(..., K)`` what turns the robots' footprints in states ``(..., K, n)`` [rad]; zero without a heading."""
@@ -125,9 +125,14 @@ class Team(Frozen):
         return np.where([column is None for column in columns], np.float32(0), turned)
 
     @cached_property
-    def footprint_arrays(self) -> FootprintArrays:
-        """The footprints as the engines read them; without rows where all robots are discs."""
-        return as_arrays(self.shapes, [model.heading_index for model in self.robot_models])
+    def footprint_arrays(self) -> FootprintArrays | None:
+        """The footprints as the engines read them; ``None`` where all robots are discs, which need none."""
+        return self.all_footprint_arrays if self.shapes else None
+
+    @cached_property
+    def all_footprint_arrays(self) -> FootprintArrays:
+        """The same, discs too: for teams that others have other footprints than."""
+        return as_arrays(self.footprint, [model.heading_index for model in self.robot_models])
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):

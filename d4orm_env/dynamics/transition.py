@@ -9,7 +9,7 @@ problem says that a robot may be moved again: then it has arrived for as long as
 
 from __future__ import annotations
 
-from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth, Vector
+from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth
 
 __all__ = ["TimeStep", "advance", "arrives"]
 
@@ -31,9 +31,9 @@ def arrives(
     return (squared_distance <= squared_goal_radius) & (squared_speed <= squared_goal_speed)
 
 
-def faces(cosine: Number, sine: Number, goal_direction: Vector, squared_chord: Number) -> Flag:
+def faces(cosine: Number, sine: Number, goal_cosine: Number, goal_sine: Number, squared_chord: Number) -> Flag:
     """Check whether a heading differs from the goal's, both as unit vectors, by no more than this chord."""
-    gap_x, gap_y = cosine - goal_direction[0], sine - goal_direction[1]
+    gap_x, gap_y = cosine - goal_cosine, sine - goal_sine
     return gap_x * gap_x + gap_y * gap_y <= squared_chord
 
 

@@ -32,9 +32,9 @@ BISECTIONS = 16
 
 
 @compiled
-def _is_disc(f: FootprintArrays, k: Whole) -> bool:
-    """Check whether a body is a disc or ball of its radius: of number -1, or of a team that has no others."""
-    return bool(k < 0 or f.inner.shape[0] == 0)
+def _is_disc(k: Whole) -> bool:
+    """Check whether a body is no robot, but a disc or ball of its radius: of number -1."""
+    return bool(k < 0)
 
 
 @compiled
@@ -42,7 +42,7 @@ def place_robot(
     f: FootprintArrays, k: Whole, radius: np.float32, x: np.float32, y: np.float32, angle: np.float32, core: FloatArray
 ) -> None:
     """Write the core of robot ``k`` at ``(x, y)`` and this heading, see :func:`_is_disc`."""
-    if _is_disc(f, k):
+    if _is_disc(k):
         core[_COUNT], core[_NUM_AXES], core[_ROUNDING] = ONE, ZERO, radius
         core[_CORNERS], core[_CORNERS + 1] = x, y
         return
@@ -156,7 +156,7 @@ def _semi_axes(
     f: FootprintArrays, k: Whole, radius: np.float32, wider: np.float32
 ) -> tuple[np.float32, np.float32, np.float32]:
     """The semi-axes of robot ``k``, each longer by ``wider``."""
-    if _is_disc(f, k):
+    if _is_disc(k):
         return radius + wider, radius + wider, radius + wider
     return f.semi_axes[k, 0] + wider, f.semi_axes[k, 1] + wider, f.semi_axes[k, 2] + wider
 
@@ -168,8 +168,8 @@ def bodies_within(
     x: np.float32, y: np.float32, z: np.float32, planar: bool, reach: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
     """Check whether robot ``k`` is within ``reach`` of another body, offset by ``(x, y, z)`` from it."""
-    inner = own_radius if _is_disc(f, k) else f.inner[k]
-    inner += radius if _is_disc(others, other) else others.inner[other]
+    inner = own_radius if _is_disc(k) else f.inner[k]
+    inner += radius if _is_disc(other) else others.inner[other]
     inner += reach
     if x * x + y * y + z * z <= inner * inner:
         return True
@@ -185,20 +185,23 @@ def bodies_within(
 @compiled
 def angle_of(f: FootprintArrays, k: Whole, turns: FloatArray, begin: Whole) -> np.float32:
     """The heading that turns robot ``k``."""
-    return turns[begin] if not _is_disc(f, k) and f.heading[k] >= 0 else ZERO
+    return turns[begin] if not _is_disc(k) and f.heading[k] >= 0 else ZERO
 
 
 @compiled
 def refine_pair(
-    arrays: ProblemArrays, k: Whole, other: Whole, near: np.uint64, reach: np.float32, dimension: int,
-    places: FloatArray, a: Whole, b: Whole, turns: FloatArray, turn_a: Whole, turn_b: Whole, buffer: FloatArray,
+    f: FootprintArrays | None, arrays: ProblemArrays, k: Whole, other: Whole, near: np.uint64, reach: np.float32,
+    dimension: int, places: FloatArray, a: Whole, b: Whole, turns: FloatArray, turn_a: Whole, turn_b: Whole,
+    buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     """Return where, of the samples ``near``, two robots are within ``reach`` of each other.
 
     Their places are in the rows of ``places`` from ``a`` and ``b`` on, their headings in ``turns`` from ``turn_a`` and
-    ``turn_b`` on.
+    ``turn_b`` on. ``f`` is the team's footprints; of discs, for which it is ``None``, it is known already.
     """
-    f, sure, unsure = arrays.footprints, near, near
+    if f is None:
+        return near
+    sure, unsure = near, near
     while unsure != NOWHERE:
         s = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
@@ -215,11 +218,11 @@ def refine_pair(
 
 @compiled
 def _leaves_bounds(
-    arrays: ProblemArrays, k: Whole, place: tuple[np.float32, np.float32, np.float32], extra: np.float32,
-    core: FloatArray,
+    f: FootprintArrays, arrays: ProblemArrays, k: Whole, place: tuple[np.float32, np.float32, np.float32],
+    extra: np.float32, core: FloatArray,
 ) -> bool:  # fmt: skip
     """Check whether robot ``k``, whose core is placed about its reference point, comes within ``extra`` of a bound."""
-    f, dimension = arrays.footprints, arrays.goal.shape[1]
+    dimension = arrays.goal.shape[1]
     for axis in range(dimension):
         low = high = ZERO
         if dimension == 3:
@@ -254,15 +257,15 @@ def _ball_meets_box(boxes: FloatArray, i: Whole, x: np.float32, y: np.float32, z
 
 @compiled
 def touches_static(
-    arrays: ProblemArrays, k: Whole, x: np.float32, y: np.float32, z: np.float32, angle: np.float32,
+    f: FootprintArrays, arrays: ProblemArrays, k: Whole, x: np.float32, y: np.float32, z: np.float32, angle: np.float32,
     extra: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
     """Check whether robot ``k`` at ``(x, y, z)`` and this heading comes within ``extra`` of an obstacle or a bound."""
-    f, index, dimension = arrays.footprints, arrays.grid, arrays.goal.shape[1]
+    index, dimension = arrays.grid, arrays.goal.shape[1]
     own_core, core = buffer[:TILE], buffer[TILE : 2 * TILE]
     if dimension == 2:
         place_robot(f, k, arrays.radius[k], ZERO, ZERO, angle, own_core)
-    if _leaves_bounds(arrays, k, (x, y, z), extra, own_core):
+    if _leaves_bounds(f, arrays, k, (x, y, z), extra, own_core):
         return True
     if index.clearance.shape[0] == 0:
         return False
@@ -288,20 +291,22 @@ def touches_static(
 
 @compiled
 def refine_static(
-    arrays: ProblemArrays, k: Whole, near: np.uint64, extra: np.float32,
+    f: FootprintArrays | None, arrays: ProblemArrays, k: Whole, near: np.uint64, extra: np.float32,
     places: FloatArray, begin: Whole, turns: FloatArray, turn: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     """Return where, of the samples ``near``, robot ``k`` comes within ``extra`` of an obstacle or a bound.
 
     Its places are in the rows of ``places`` from ``begin`` on, its headings in ``turns`` from ``turn`` on; ``buffer``
-    is two rows to overwrite.
+    is two rows to overwrite. ``f`` is as in :func:`refine_pair`.
     """
+    if f is None:
+        return near
     sure, unsure, planar = near, near, arrays.goal.shape[1] == 2
     while unsure != NOWHERE:
         s = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
         z = ZERO if planar else places[begin + 2 * TILE + s]
-        angle = angle_of(arrays.footprints, k, turns, turn + s)
-        if not touches_static(arrays, k, places[begin + s], places[begin + TILE + s], z, angle, extra, buffer):
+        angle = angle_of(f, k, turns, turn + s)
+        if not touches_static(f, arrays, k, places[begin + s], places[begin + TILE + s], z, angle, extra, buffer):
             sure &= ~(_BIT << np.uint64(s))
     return sure

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import Whole
+from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.winding import Unwinding, unwinding
 from d4orm_env.dynamics import transition
@@ -27,19 +27,31 @@ from d4orm_env.engine.compiling import ZERO, inlined
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.tile_layout import PICK, SQUARED_GAP, SQUARED_NORM, Row
 
-Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_, Row, np.float32]
-"""Squares of the goal radius and of the goal speed, whether a robot that has arrived stays there for good, the goal
-heading as a unit vector, and the square of the chord by which it may be missed, infinite without a goal heading."""
+GoalHeading: TypeAlias = tuple[np.bool_ | None, np.float32, np.float32, np.float32]
+"""``None`` in a team without goal headings, which leaves what they ask for out of a kernel; a robot's own as a unit
+vector, and the square of the chord by which it may be missed, infinite for none."""
+Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_, GoalHeading]
+"""Squares of the goal radius and of the goal speed, whether a robot that has arrived stays there for good, and its goal
+heading."""
 Mover: TypeAlias = Callable[[bool, Row, Row, Row, TimeStep], Row]
 Docker: TypeAlias = Callable[[bool, Row, Row, Row, Row, Docking], tuple[Row, np.float32, bool]]
 
 
 @inlined
 def docking_of(arrays: ProblemArrays, k: Whole) -> Docking:
-    """Return how robot ``k`` docks."""
-    direction = (arrays.goal_direction[k, 0], arrays.goal_direction[k, 1])
-    chord2 = arrays.squared_goal_chord[k]
-    return arrays.squared_goal_radius, arrays.squared_goal_speed[k], arrays.docks, direction, chord2
+    """Return how robot ``k`` docks.
+
+    Numbers only: a function without reference counts must not hand out arrays.
+    """
+    x, y, chord2 = _goal_heading(arrays.goal_direction, arrays.squared_goal_chord, k)
+    return arrays.squared_goal_radius, arrays.squared_goal_speed[k], arrays.docks, (arrays.turns_at_goals, x, y, chord2)
+
+
+@inlined
+def _goal_heading(directions: FloatArray | None, chords2: Any, k: Whole) -> tuple[np.float32, np.float32, np.float32]:
+    if directions is None:
+        return ZERO, ZERO, ZERO
+    return directions[k, 0], directions[k, 1], chords2[k]
 
 
 def models_of_kernel(models: tuple[str, ...]) -> tuple[str, ...]:
@@ -93,28 +105,32 @@ def make_stepper(model: Model) -> tuple[Mover, Docker]:
     def dock(standing: bool, x: Row, u: Row, limits: Row, goal: Row, docking: Docking) -> tuple[Row, np.float32, bool]:
         gap2 = squared_gap(x, goal)
         speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
-        arrives = transition.arrives(gap2, speed2, docking[0], docking[1]) & faces(x, docking[3], docking[4])
+        arrives = transition.arrives(gap2, speed2, docking[0], docking[1]) & faces(docking[3][0], x, docking[3])
         docks = transition.stands(arrives, docking[2])
         return pick_x(docks, functions.rest(x, ZERO), x), gap2, standing | arrives
 
     return move, dock
 
 
-def _facing(model: Model) -> Callable[[Row, Row, np.float32], bool]:
-    """``faces(x, direction, squared chord)``: whether the robot faces its goal heading, if it has one."""
+def _facing(model: Model) -> Callable[[np.bool_ | None, Row, GoalHeading], bool]:
+    """``faces(turns, x, goal heading)``: whether the robot faces its goal heading, if it has one."""
     index = model.heading_index
     if index is None:
 
         @inlined
-        def anyhow(x: Row, direction: Row, chord2: np.float32) -> bool:
+        def anyhow(turns: np.bool_ | None, x: Row, heading: GoalHeading) -> bool:
             return True
 
         return anyhow
 
     @inlined
-    def faces(x: Row, direction: Row, chord2: np.float32) -> bool:
+    def faces(turns: np.bool_ | None, x: Row, heading: GoalHeading) -> bool:
+        if turns is None:
+            return True
         # Without a goal heading nothing is computed.
-        return chord2 == np.float32(np.inf) or transition.faces(cosine(x[index]), sine(x[index]), direction, chord2)
+        if heading[3] == np.float32(np.inf):
+            return True
+        return bool(transition.faces(cosine(x[index]), sine(x[index]), heading[1], heading[2], heading[3]))
 
     return faces
 

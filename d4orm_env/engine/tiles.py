@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Whole
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS
@@ -24,7 +25,7 @@ from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.footprint_contacts import refine_pair
-from d4orm_env.engine.simd import NOWHERE, TILE, at_most, use_wide_registers, within_2, within_3
+from d4orm_env.engine.simd import TILE, at_most, use_wide_registers, within_2, within_3
 from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_stepper
 from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
 
@@ -112,9 +113,11 @@ def near_pair(reach: np.float32, a: int, b: int, dimension: int, w: FloatArray) 
 
 
 @inlined
-def turn_row(arrays: ProblemArrays, k: Whole) -> Whole:
-    """Return where the row of the state component that turns the footprint of robot ``k`` begins."""
-    return k * STRIDE + (STATE + max(arrays.footprints.heading[k], 0)) * TILE
+def turn_row(f: FootprintArrays | None, k: Whole) -> Whole:
+    """Return where the row of the state component that turns the footprint of robot ``k`` begins; 0 without any."""
+    if f is None:
+        return 0
+    return k * STRIDE + (STATE + max(f.heading[k], 0)) * TILE
 
 
 @inlined
@@ -127,9 +130,8 @@ def mark_pairs(
             reach = arrays.radius[k] + arrays.radius[other] + extra
             a, b, dimension = k * STRIDE, other * STRIDE, arrays.goal.shape[1]
             touch = near_pair(reach, a, b, dimension, w)
-            if touch != NOWHERE and arrays.footprints.inner.shape[0] > 0:
-                turns = turn_row(arrays, k), turn_row(arrays, other)
-                touch = refine_pair(arrays, k, other, touch, extra, dimension, w, a, b, w, turns[0], turns[1], buffer)
+            f, turn_a, turn_b = arrays.footprints, turn_row(arrays.footprints, k), turn_row(arrays.footprints, other)
+            touch = refine_pair(f, arrays, k, other, touch, extra, dimension, w, a, b, w, turn_a, turn_b, buffer)
             near[k, ROBOT] |= touch
             near[other, ROBOT] |= touch
 

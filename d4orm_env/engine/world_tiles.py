@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import reward
 from d4orm_env.engine import obstacles
@@ -93,12 +94,18 @@ def store_world(worlds: WorldArrays | WorldBatch, b: int, s: Whole, w: FloatArra
 
 
 @compiled
-def _meets_body(arrays: ProblemArrays, body: FloatArray, k: int, s: int, extra: np.float32, w: FloatArray) -> bool:
-    """Check whether robot ``k`` in lane ``s`` is within ``extra`` of a round body ``(2 d + 1,)``."""
-    f, dimension, place = arrays.footprints, arrays.goal.shape[1], k * STRIDE + STATE * TILE + s
+def _meets_body(
+    f: FootprintArrays | None, arrays: ProblemArrays, body: FloatArray, k: int, s: int, extra: np.float32, w: FloatArray
+) -> bool:
+    """Check whether robot ``k`` in lane ``s``, which the disc round it is, is within ``extra`` of a round body
+    ``(2 d + 1,)``.
+    """
+    if f is None:
+        return True
+    dimension, place = arrays.goal.shape[1], k * STRIDE + STATE * TILE + s
     x, y = body[0] - w[place], body[1] - w[place + TILE]
     z = body[2] - w[place + 2 * TILE] if dimension == 3 else ZERO
-    angle, buffer = angle_of(f, k, w, turn_row(arrays, k) + s), w[k * STRIDE + BUFFER * TILE : k * STRIDE + ROWS * TILE]
+    angle, buffer = angle_of(f, k, w, turn_row(f, k) + s), w[k * STRIDE + BUFFER * TILE : k * STRIDE + ROWS * TILE]
     radius = body[2 * dimension]
     return bodies_within(f, k, arrays.radius[k], angle, f, -1, radius, ZERO, x, y, z, dimension == 2, extra, buffer)
 
@@ -117,8 +124,8 @@ def _mark_bodies(
                     gap = bodies[first + s, i, axis] - w[k * STRIDE + (STATE + axis) * TILE + s]
                     gap2 += gap * gap
                 distance = arrays.radius[k] + bodies[first + s, i, 2 * dimension] + extra
-                if gap2 <= distance * distance and (
-                    arrays.footprints.inner.shape[0] == 0 or _meets_body(arrays, bodies[first + s, i], k, s, extra, w)
+                if gap2 <= distance * distance and _meets_body(
+                    arrays.footprints, arrays, bodies[first + s, i], k, s, extra, w
                 ):
                     near[k, DYNAMIC] |= np.uint64(1) << np.uint64(s)
 
@@ -144,8 +151,8 @@ def check_contacts(
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
             touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
-            if touch != NOWHERE and arrays.footprints.inner.shape[0] > 0:
-                touch = refine_static(arrays, k, touch, extra, places, 0, w, turn_row(arrays, k), buffer)
+            f = arrays.footprints
+            touch = refine_static(f, arrays, k, touch, extra, places, 0, w, turn_row(f, k), buffer)
             near[k, OBSTACLE] |= touch
         _mark_bodies(arrays, worlds.bodies, first, extra, w, near)
         flags = worlds.collided if level == 0 else worlds.violated

@@ -213,6 +213,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "squared_goal_speed": transition.docking_speed(goal_speed, jnp.asarray(team.max_speed)) ** 2,
         "docks": problem.arrival == "dock",
         "collision_penalty": penalty,
+        "turns_at_goals": True,
         "goal_direction": jnp.nan_to_num(jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)),
         "squared_goal_chord": jnp.where(jnp.isnan(heading), jnp.inf, 4 * jnp.sin(tolerance / 2) ** 2),
         "footprints": team.footprint_arrays,

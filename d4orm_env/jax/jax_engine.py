@@ -84,10 +84,11 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
         speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
         slow2 = arrays.squared_goal_speed[robots][:, None]
         arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, slow2)
-        if model.heading_index is not None:
+        if model.heading_index is not None and arrays.goal_direction is not None:
             heading, aim = y[model.heading_index], jnp.asarray(arrays.goal_direction)[robots]
             missed = jnp.asarray(arrays.squared_goal_chord)[robots][:, None]
-            arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), tuple(aim.T[..., None]), missed)
+            cosine, sine = aim[:, :1], aim[:, 1:]
+            arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), cosine, sine, missed)
         standing = transition.stands(worlds.docked[robots], arrays.docks)
         docks = transition.stands(arrives, arrays.docks)
         zero = jnp.zeros_like(gap2)
@@ -106,7 +107,7 @@ def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float3
     reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
     reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, reach * reach)
     near = gaps.sum(axis=2) <= reach2[..., None]
-    if len(arrays.footprints.inner):
+    if arrays.footprints is not None:
         bodies = footprints.place_robots(arrays.footprints, state, arrays.goal.shape[1])
         near &= footprints.pairs_within(bodies, bodies, extra)
     return near.sum(axis=1)
@@ -119,7 +120,7 @@ def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, e
     gaps = (place[:, None] - others.places[None, :, :, None]) ** 2
     reach = arrays.radius[:, None] + others.radius[None, :] + extra
     near = gaps.sum(axis=2) <= (reach * reach)[..., None]
-    if len(arrays.footprints.inner) or len(others.footprints.inner):
+    if arrays.footprints is not None or others.footprints is not None:
         bodies = footprints.place_robots(arrays.footprints, state, d, arrays.radius)
         near &= footprints.pairs_within(bodies, footprints.place_bodies(others), extra)
     return near.sum(axis=1)
@@ -128,7 +129,7 @@ def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, e
 def obstacle_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` bool: whether it is within that of static obstacles or bounds."""
     place = state[:, : arrays.goal.shape[1]]
-    if len(arrays.footprints.inner):
+    if arrays.footprints is not None:
         return footprints.static_contacts(arrays, state, extra)
     reach = (arrays.radius + extra)[:, None]
     hit = jnp.zeros((place.shape[0], place.shape[2]), bool)

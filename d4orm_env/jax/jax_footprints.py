@@ -28,13 +28,13 @@ class MovingBodies(NamedTuple):
         places: ``(O, d)``.
         headings: ``(O,)``, or ``None`` where all are discs.
         radius: ``(O,)`` outer radii.
-        footprints: Theirs, with ``O`` rows or none.
+        footprints: Theirs; ``None`` where all are discs.
     """
 
     places: Array | FloatArray
     headings: Array | FloatArray | None
     radius: Array | FloatArray
-    footprints: FootprintArrays
+    footprints: FootprintArrays | None
 
 
 class Bodies(NamedTuple):
@@ -57,10 +57,10 @@ class Bodies(NamedTuple):
     semi_axes: Array
 
 
-def place_robots(f: FootprintArrays, state: Array, dimension: int, radius: Given | None = None) -> Bodies:
+def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius: Given | None = None) -> Bodies:
     """Robots in ``state`` ``(K, n, S)``; discs of this ``radius`` ``(K,)`` if there are no footprints."""
     place = jnp.moveaxis(state[:, :dimension], 1, 0)
-    if not len(f.inner):
+    if f is None:
         return _discs(place, jnp.asarray(radius))
     heading = state[jnp.arange(len(state)), jnp.maximum(jnp.asarray(f.heading), 0)]
     return _bodies(f, place, jnp.where(jnp.asarray(f.heading)[:, None] >= 0, heading, 0))
@@ -69,7 +69,7 @@ def place_robots(f: FootprintArrays, state: Array, dimension: int, radius: Given
 def place_bodies(bodies: MovingBodies) -> Bodies:
     """Other bodies, the same in all samples."""
     place = jnp.asarray(bodies.places).T[..., None]
-    if not len(bodies.footprints.inner) or bodies.headings is None:
+    if bodies.footprints is None or bodies.headings is None:
         return _discs(place, jnp.asarray(bodies.radius))
     return _bodies(bodies.footprints, place, jnp.asarray(bodies.headings)[:, None])
 

@@ -269,7 +269,7 @@ class TeamLayer:
             return panel.outlines(places, self.radius)
         if team.dimension == 3:
             balls = panel.outlines(np.zeros_like(places), 1.0)
-            sizes = panel.flatten(team.footprint_arrays.semi_axes)
+            sizes = panel.flatten(team.all_footprint_arrays.semi_axes)
             corners: Array = panel.flatten(places)[:, None] + balls * sizes[:, None]
             return corners
         turn = team.headings(states)[:, None]

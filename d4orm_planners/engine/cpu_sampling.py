@@ -7,12 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
 from d4orm_env.engine import noise
 from d4orm_env.engine.cpu import CpuEngine, typed
 from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.sample_noise import Drawing
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.threads import Threads
+from d4orm_env.footprints import Disc
 from d4orm_planners.engine import average, score
 from d4orm_planners.engine.proximity import bound_boxes, make_bodies
 from d4orm_planners.engine.sampling_types import (
@@ -77,20 +79,30 @@ class CpuSamplingEngine(CpuEngine):
         return SamplingResult(mean, mean_rewards[:done], excluded, factor)
 
 
+def _nobody(task: SamplingTask) -> MovingObstacles:
+    nowhere = np.zeros((len(task.base), 0, task.problem.dimension), np.float32)
+    return MovingObstacles(nowhere, np.zeros(0, np.float32))
+
+
+def _discs(radius: FloatArray) -> FootprintArrays:
+    return as_arrays(tuple(Disc(size) for size in radius.tolist()), [None] * len(radius))
+
+
 class Sampling:
     """One denoising run: its arrays and the threads that share its tiles."""
 
     def __init__(self, task: SamplingTask, rules: SamplingRules, num_samples: int, seed: int, threads: Threads) -> None:
         problem = task.problem
         self.task, self.threads = task, threads
-        self.arrays = typed(task.arrays)
+        self.arrays, moving = typed(task.arrays), task.moving or _nobody(task)
         self.kernel = score.score_kernel(problem.team.models)
         self.spaces: dict[int, score.Workspace] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-        moving = task.moving or MovingObstacles(
-            np.zeros((len(self.base), 0, problem.dimension), np.float32), np.zeros(0, np.float32)
-        )
+        if self.arrays.footprints is not None or moving.footprints is not None:
+            # A disc among others that are none has a footprint too.
+            self.arrays = self.arrays._replace(footprints=problem.team.all_footprint_arrays)
+            moving = moving._replace(footprints=moving.footprints or _discs(moving.radius))
         self.scoring = score.Scoring(
             docked=np.ascontiguousarray(docked, bool),
             collisions=task.collisions,
@@ -99,7 +111,7 @@ class Sampling:
             penalties=task.penalties,
             per_pair=task.penalty_per_pair,
         )
-        self.shaped = bool(len(self.arrays.footprints.inner) or len(moving.footprints.inner))
+        self.shaped = self.arrays.footprints is not None
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
         num_tiles, pairs = -(-num_samples // TILE), (problem.control_size + 1) // 2

@@ -8,7 +8,7 @@ that two robots keep apart in all of them. Every robot gets a list of those befo
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,14 +78,14 @@ class Bodies(NamedTuple):
         radius: ``(O,)``.
         boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
             margin.
-        footprints: Theirs.
+        footprints: Theirs, or ``None`` where all bodies and robots are discs.
         headings: ``(H, O)``, or ``(0, 0)`` where all are discs.
     """
 
     places: FloatArray
     radius: FloatArray
     boxes: FloatArray
-    footprints: FootprintArrays
+    footprints: FootprintArrays | None
     headings: FloatArray
 
 
@@ -223,11 +223,10 @@ def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, turns: 
                 for step in range(BLOCK):
                     a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
                     touch = _near_pair(reach, a, b, dimension, places)
-                    if turns.shape[0] > 0 and touch != NOWHERE:
-                        own, its = turn_of(k, step) + chunk, turn_of(other, step) + chunk
-                        touch = refine_pair(
-                            arrays, k, other, touch, margin, dimension, places, a, b, turns, own, its, s.buffer
-                        )
+                    own, its, f = turn_of(k, step) + chunk, turn_of(other, step) + chunk, arrays.footprints
+                    touch = refine_pair(
+                        f, arrays, k, other, touch, margin, dimension, places, a, b, turns, own, its, s.buffer
+                    )
                     touch <<= np.uint64(chunk)
                     _count(digits, k, step, touch, s.near)
                     _count(digits, other, step, touch, s.near)
@@ -250,19 +249,21 @@ def _mark_bodies(
                     begin = place_of(k, step, dimension)
                     rows = places[begin : place_of(k, step + 1, dimension)]
                     touch = near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
-                    if turns.shape[0] > 0 and touch != NOWHERE:
-                        touch = _refine_body(
-                            arrays, bodies, body, first + step, k, touch, rows, turns, turn_of(k, step), s
-                        )
+                    f, turn = arrays.footprints, turn_of(k, step)
+                    touch = _refine_body(
+                        f, bodies.footprints, arrays, bodies, body, first + step, k, touch, rows, turns, turn, s
+                    )
                     _count(digits, k, step, touch, s.near)
 
 
 @compiled
 def _refine_body(
-    arrays: ProblemArrays, bodies: Bodies, body: int, t: int, k: int, near: np.uint64, rows: FloatArray,
-    turns: FloatArray, turn: Whole, s: Scratch,
+    f: FootprintArrays | None, others: Any, arrays: ProblemArrays, bodies: Bodies, body: int, t: int,
+    k: int, near: np.uint64, rows: FloatArray, turns: FloatArray, turn: Whole, s: Scratch,
 ) -> np.uint64:  # fmt: skip
     """Return where, of the samples ``near``, robot ``k`` is within the margin of a body at time ``t``."""
+    if f is None:
+        return near
     sure, dimension = near, arrays.goal.shape[1]
     angle = bodies.headings[t, body] if bodies.headings.shape[0] > 0 else ZERO
     for sample in range(TILE):
@@ -271,9 +272,9 @@ def _refine_body(
             continue
         x, y = bodies.places[t, body, 0] - rows[sample], bodies.places[t, body, 1] - rows[TILE + sample]
         z = bodies.places[t, body, 2] - rows[2 * TILE + sample] if dimension == 3 else ZERO
-        own_angle = angle_of(arrays.footprints, k, turns, turn + sample)
+        own_angle = angle_of(f, k, turns, turn + sample)
         if not bodies_within(
-            arrays.footprints, k, arrays.radius[k], own_angle, bodies.footprints, body, bodies.radius[body], angle,
+            f, k, arrays.radius[k], own_angle, others, body, bodies.radius[body], angle,
             x, y, z, dimension == 2, arrays.margin, s.buffer,
         ):  # fmt: skip
             sure &= ~bit

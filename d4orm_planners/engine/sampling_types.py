@@ -9,14 +9,11 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.team import Team
 from d4orm_env.engine.types import Engine
-
-DISCS = as_arrays((), [])
-"""Footprints of bodies that are all discs."""
 
 
 class MovingObstacles(NamedTuple):
@@ -25,19 +22,20 @@ class MovingObstacles(NamedTuple):
     Attributes:
         positions: ``(H, O, d)`` where each body is after every step [m].
         radius: ``(O,)`` [m]; outer radii of bodies that are no discs.
-        footprints: Theirs, with ``O`` rows or none.
+        footprints: Theirs; ``None`` where all are discs.
         headings: ``(H, O)`` what turns them [rad], or ``None`` where all are discs.
     """
 
     positions: FloatArray
     radius: FloatArray
-    footprints: FootprintArrays = DISCS
+    footprints: FootprintArrays | None = None
     headings: FloatArray | None = None
 
 
 def moving_robots(team: Team, states: FloatArray) -> MovingObstacles:
     """The robots of a team as moving obstacles; ``states`` ``(H, K, n)`` are theirs after every step."""
-    return MovingObstacles(states[..., : team.dimension], team.radius, team.footprint_arrays, team.headings(states))
+    turning = team.headings(states) if team.shapes else None
+    return MovingObstacles(states[..., : team.dimension], team.radius, team.footprint_arrays, turning)
 
 
 @dataclass(frozen=True, eq=False)

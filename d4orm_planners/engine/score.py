@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import reward, transition
 from d4orm_env.dynamics.models import MODELS
@@ -210,6 +211,13 @@ def _stay(dimension: int, w: FloatArray, places: FloatArray) -> None:
 
 
 @inlined
+def _stay_turned(f: FootprintArrays | None, k: int, w: FloatArray, turns: FloatArray) -> None:
+    """Fill the headings of every step of a block with the robot's."""
+    if f is not None:
+        _stay(1, w[max(f.heading[k], 0) * TILE :], turns)
+
+
+@inlined
 def _punish_near(near: NDArray[np.uint64], digits: int, count: int, penalties: FloatArray, w: FloatArray) -> None:
     """Take the penalties from the robots that are near each other or a body, in the steps of a block."""
     for k in range(near.shape[1]):
@@ -234,7 +242,7 @@ def _score_tile(
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     moved, keys, scratch, offset, scale = space.moved, space.keys, space.scratch, drawing.offset, drawing.scale
-    turns, shaped = space.turns, arrays.footprints.inner.shape[0] > 0
+    turns, footprints = space.turns, arrays.footprints
     penalties, bounds, digits = scoring.penalties, scoring.bounds, DIGITS if scoring.per_pair else 1
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
@@ -257,8 +265,7 @@ def _score_tile(
             own_turns = turns[turn_of(k, 0) : turn_of(k + 1, 0)] if turns.shape[0] > 0 else turns
             if standing[k]:
                 _stay(dimension, robot, own_places)
-                if shaped:
-                    _stay(1, robot[max(arrays.footprints.heading[k], 0) * TILE :], own_turns)
+                _stay_turned(footprints, k, robot, own_turns)
                 enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
                 continue
             goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
@@ -279,8 +286,8 @@ def _score_tile(
                 for step in range(count):
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
                     touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.buffer)
-                    if shaped and touch != NOWHERE:
-                        touch = refine_static(arrays, k, touch, margin, rows, 0, own_turns, step * TILE, scratch.buffer)
+                    turn, buffer = step * TILE, scratch.buffer
+                    touch = refine_static(footprints, arrays, k, touch, margin, rows, 0, own_turns, turn, buffer)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
                     subtract_where(robot, TOTAL * TILE, touch, steps * penalties[k])
         if scoring.collisions:

@@ -59,11 +59,12 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
     wanted = _by_rows(
         problem, goals.shape[1], (states, goals), lambda model, *rows: model.approach(*rows, h, NUMPY_OPS)
     )
-    if np.isnan(problem.goal_heading).all():
+    directions = problem.arrays.goal_direction
+    if directions is None:
         return wanted
     offset = goals - states[:, : problem.dimension]
     turning = ~np.isnan(problem.goal_heading) & ((offset * offset).sum(axis=1) <= problem.arrays.squared_goal_radius)
-    creep = problem.team.max_speed[:, None] * CREEPING * problem.arrays.goal_direction
+    creep = problem.team.max_speed[:, None] * CREEPING * directions
     return np.where(turning[:, None], creep, wanted)
 
 

@@ -38,14 +38,20 @@ def velocity_step(model: Model) -> VelocityStep:
     """
     move, dock = make_stepper(model)
     track, limit_control = inlined(model.functions.track), inlined(model.functions.limit_control)
-    squared_gap, turns = SQUARED_GAP[model.dimension], model.heading_index is not None
+    squared_gap, has_heading = SQUARED_GAP[model.dimension], model.heading_index is not None
     heading = model.heading_index or 0
 
     @inlined
-    def towards_pose(x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep) -> Row:
-        gap2, creep = squared_gap(x, goal), limits[SPEED] * CREEPING
+    def towards_pose(
+        turns: np.bool_ | None, x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep
+    ) -> Row:
+        if turns is None:
+            return velocity
+        gap2, creep, wanted = squared_gap(x, goal), limits[SPEED] * CREEPING, docking[3]
+        if wanted[3] == np.inf:
+            return velocity
         if gap2 <= docking[0]:
-            return (creep * docking[3][0], creep * docking[3][1])
+            return (creep * wanted[1], creep * wanted[2])
         # Nearer than it can drive round, it faces the goal first.
         facing_x, facing_y = cosine(x[heading]), sine(x[heading])
         along = facing_x * velocity[0] + facing_y * velocity[1]
@@ -57,8 +63,8 @@ def velocity_step(model: Model) -> VelocityStep:
 
     @inlined
     def step(x: Row, velocity: Row, limits: Row, goal: Row, docking: Docking, h: TimeStep) -> tuple[Row, Row, bool]:
-        if turns and docking[4] < np.inf:
-            velocity = towards_pose(x, velocity, limits, goal, docking, h)
+        if has_heading:
+            velocity = towards_pose(docking[3][0], x, velocity, limits, goal, docking, h)
         control = limit_control(track(x, velocity, limits, h, OPS), limits, OPS)
         x, _, arrived = dock(False, move(False, x, control, limits, h), control, limits, goal, docking)
         return control, x, arrived
