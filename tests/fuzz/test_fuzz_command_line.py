@@ -70,11 +70,15 @@ def options_of(command: str) -> list[Any]:
     return [option for option in options if option.name != "out" or command not in FOLDER]
 
 
+OPTIONS = {command: options_of(command) for command in SMALL}
+"""Asked for here: a strategy may not draw what importing a command's libraries draws."""
+
+
 @st.composite
 def calls(draw: st.DrawFn) -> list[str]:
     command = draw(st.one_of(st.sampled_from(list(SMALL)), st.just("plan"), st.just("run")))
     arguments = [command, *SMALL[command]]
-    known = options_of(command)
+    known = OPTIONS[command]
     for option in draw(st.lists(st.sampled_from(known), max_size=3, unique=True)) if known else []:
         name = draw(st.sampled_from([*option.opts, *option.secondary_opts]))
         arguments += [name] if option.is_flag else [name, draw(VALUES.get(option.opts[0], TEXT))]
