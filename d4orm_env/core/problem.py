@@ -384,9 +384,16 @@ class Problem(Frozen):
         return pictures.plot(self, None, axes)
 
     def replace(self, **changes: object) -> Self:
-        """A copy with some attributes changed, checked again; a goal speed that follows from the team goes with it."""
+        """A copy with some attributes changed, checked again.
+
+        What the robots' goals have by default, or in common, another team has too.
+        """
         if np.array_equal(self.goal_speed, goal_speeds(self.team, self.dt, None)):
             changes = {"goal_speed": None} | changes
+        if np.isnan(self.goal_heading).all():
+            changes = {"goal_heading": None} | changes
+        if (self.goal_heading_tolerance == self.goal_heading_tolerance[0]).all():
+            changes = {"goal_heading_tolerance": self.goal_heading_tolerance[0]} | changes
         return super().replace(**changes)
 
     def with_state(self, start: ArrayLike, goal: ArrayLike, **changes: object) -> Problem:

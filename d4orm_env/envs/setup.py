@@ -143,6 +143,7 @@ class EnvSetup:
         points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
         if (
             drawn.team.models != old.team.models
+            or drawn.team.shapes != old.team.shapes
             or (drawn.team.control_limits != old.team.control_limits).any()
             or (points < region[0]).any()
             or (points > region[1]).any()
@@ -153,7 +154,7 @@ class EnvSetup:
             )
         if self.along_paths:
             drawn.check_reachable()
-        names = set(drawn.arrays._fields) - {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid"} if self._batched else ()
+        names = set(drawn.arrays._fields) - {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid", "footprints"} if self._batched else ()
         differing = self._differing(drawn, names)
         if differing:
             raise ValueError(

@@ -231,6 +231,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "predict_horizon": (9, {}),
         "execute_horizon": (2, {}),
         "subgoal_offset": (8, {}),
+        "mean_of_all": (True, {"scenario": "random", "max_cycles": 80}),
         "num_samples": (24, {}),
         "num_steps": (6, {}),
         "temperature": (0.6, {}),
