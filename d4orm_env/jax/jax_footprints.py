@@ -37,7 +37,7 @@ class MovingBodies(NamedTuple):
     footprints: FootprintArrays | None
 
 
-class Bodies(NamedTuple):
+class PlacedBodies(NamedTuple):
     """Placed bodies: ``R`` robots in ``S`` samples, or one.
 
     Attributes:
@@ -57,7 +57,7 @@ class Bodies(NamedTuple):
     semi_axes: Array
 
 
-def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius: Given | None = None) -> Bodies:
+def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius: Given | None = None) -> PlacedBodies:
     """Robots in ``state`` ``(K, n, S)``; discs of this ``radius`` ``(K,)`` if there are no footprints."""
     place = jnp.moveaxis(state[:, :dimension], 1, 0)
     if f is None:
@@ -66,7 +66,7 @@ def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius
     return _bodies(f, place, jnp.where(jnp.asarray(f.heading)[:, None] >= 0, heading, 0))
 
 
-def place_bodies(bodies: MovingBodies) -> Bodies:
+def place_bodies(bodies: MovingBodies) -> PlacedBodies:
     """Other bodies, the same in all samples."""
     place = jnp.asarray(bodies.places).T[..., None]
     if bodies.footprints is None or bodies.headings is None:
@@ -74,13 +74,13 @@ def place_bodies(bodies: MovingBodies) -> Bodies:
     return _bodies(bodies.footprints, place, jnp.asarray(bodies.headings)[:, None])
 
 
-def _discs(place: Array, radius: Array) -> Bodies:
+def _discs(place: Array, radius: Array) -> PlacedBodies:
     size = radius[:, None]
     nothing = jnp.zeros((2, 1, *size.shape), jnp.float32)
-    return Bodies(place, nothing, nothing, nothing[0], size, jnp.broadcast_to(size, (3, *size.shape)))
+    return PlacedBodies(place, nothing, nothing, nothing[0], size, jnp.broadcast_to(size, (3, *size.shape)))
 
 
-def _bodies(f: FootprintArrays, place: Array, heading: Array) -> Bodies:
+def _bodies(f: FootprintArrays, place: Array, heading: Array) -> PlacedBodies:
     turns = jnp.asarray(f.heading)[:, None] >= 0
     cosine, sine = jnp.where(turns, jnp.cos(heading), 1), jnp.where(turns, jnp.sin(heading), 0)
 
@@ -90,20 +90,20 @@ def _bodies(f: FootprintArrays, place: Array, heading: Array) -> Bodies:
 
     extents = jnp.asarray(f.extents).T[..., None]
     rounding, semi_axes = jnp.asarray(f.rounding)[:, None], jnp.asarray(f.semi_axes).T[..., None]
-    return Bodies(place, turned(f.corners), turned(f.axes), extents, rounding, semi_axes)
+    return PlacedBodies(place, turned(f.corners), turned(f.axes), extents, rounding, semi_axes)
 
 
-def pairs_within(bodies: Bodies, others: Bodies, reach: Given) -> Array:
+def pairs_within(bodies: PlacedBodies, others: PlacedBodies, reach: Given) -> Array:
     """``(R, O, S)`` whether bodies are within ``reach`` of others."""
-    a = Bodies(*(jnp.expand_dims(part, part.ndim - 1) for part in bodies))
-    b = Bodies(*(jnp.expand_dims(part, part.ndim - 2) for part in others))
+    a = PlacedBodies(*(jnp.expand_dims(part, part.ndim - 1) for part in bodies))
+    b = PlacedBodies(*(jnp.expand_dims(part, part.ndim - 2) for part in others))
     offset, reach = b.place - a.place, jnp.asarray(reach)
     if len(offset) == 3:
         return _balls_within(offset, a.semi_axes + reach / 2, b.semi_axes + reach / 2)
     return _cores_within(a, b, offset, reach)
 
 
-def _cores_within(a: Bodies, b: Bodies, offset: Array, reach: Array) -> Array:
+def _cores_within(a: PlacedBodies, b: PlacedBodies, offset: Array, reach: Array) -> Array:
     """Whether cores, those of ``b`` offset by ``offset`` ``(2, ...)``, are within reach of each other."""
     total = a.rounding + b.rounding + reach
     corners = b.corners + offset[:, None]
@@ -178,7 +178,7 @@ def static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
     return jax.lax.fori_loop(0, len(triangles), meet, hit)
 
 
-def _meets_box(bodies: Bodies, box: Array, extra: Array) -> Array:
+def _meets_box(bodies: PlacedBodies, box: Array, extra: Array) -> Array:
     """``(R, S)`` whether bodies are within ``extra`` of a rounded box."""
     dimension = len(bodies.place)
     lower, upper, rounding = box[:dimension], box[dimension:-1], box[-1]
@@ -192,7 +192,7 @@ def _meets_box(bodies: Bodies, box: Array, extra: Array) -> Array:
     return jnp.where(rounding > 0, _balls_within(gap, axes, jnp.broadcast_to(ball, (3, 1, 1))), sharp)
 
 
-def _polygon(corners: Array, rounding: Array) -> Bodies:
+def _polygon(corners: Array, rounding: Array) -> PlacedBodies:
     """A polygon of these corners ``(2, n)``, counterclockwise, in all samples; of no size it is a point."""
     edges = jnp.roll(corners, -1, axis=1) - corners
     length = jnp.sqrt((edges * edges).sum(axis=0))
@@ -200,4 +200,4 @@ def _polygon(corners: Array, rounding: Array) -> Bodies:
     extents = (axes[:, :, None] * corners[:, None]).sum(axis=0).max(axis=1)
     parts = corners[..., None, None], axes[..., None, None], extents[:, None, None]
     nowhere = jnp.zeros((2, 1, 1), jnp.float32)
-    return Bodies(nowhere, *parts, jnp.full((1, 1), rounding, jnp.float32), nowhere)
+    return PlacedBodies(nowhere, *parts, jnp.full((1, 1), rounding, jnp.float32), nowhere)

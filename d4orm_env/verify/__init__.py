@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
-from d4orm_env.verify.footprints import Shapes, TurningPairs, turning_watches
+from d4orm_env.verify.footprints import ConvexBodies, TurningPairs, turning_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
@@ -102,7 +102,7 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
 def make_watches(problem: Problem, robot: NDArray[np.intp]) -> tuple[Pairs, list[Watch]]:
     """Return the watch over bodies, those of ``robot`` ``(B,)``, and those over their surroundings."""
     if problem.team.shapes:
-        shapes = Shapes.of(problem.team)
+        shapes = ConvexBodies.of(problem.team)
         return TurningPairs(robot, shapes), turning_watches(problem.world, robot, shapes)
     radius = problem.team.radius.astype(np.float64)
     return Pairs(robot, radius), surroundings(problem.world, robot, radius)
@@ -113,7 +113,7 @@ class _Course:
 
     def __init__(self, motion: TeamMotion, sub_steps: int, problem: Problem) -> None:
         self._motion, self._sub_steps, start = motion, sub_steps, problem.start.astype(np.float64)
-        self._shapes = Shapes.of(problem.team) if problem.team.shapes else None
+        self._shapes = ConvexBodies.of(problem.team) if problem.team.shapes else None
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
         displacements = [self._displacement(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]

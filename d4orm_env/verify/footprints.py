@@ -32,7 +32,7 @@ RESOLUTION = 1 / 15_000
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class ConvexBodies:
     """Convex bodies, one row each.
 
     Attributes:
@@ -50,7 +50,7 @@ class Shapes:
     stretch: Floats
 
     @classmethod
-    def of(cls, team: Team) -> Shapes:
+    def of(cls, team: Team) -> ConvexBodies:
         """The footprints of a team."""
         size = len(team.models)
         corners, rounding, semi_axes = np.zeros((size, MAX_CORNERS, 2)), np.zeros(size), np.ones((size, 3))
@@ -63,9 +63,9 @@ class Shapes:
         outer = team.radius.astype(np.float64)
         return cls(corners, rounding, semi_axes, outer, semi_axes.max(axis=1) / semi_axes.min(axis=1))
 
-    def take(self, index: Indices) -> Shapes:
+    def take(self, index: Indices) -> ConvexBodies:
         """Some of them, in the order given."""
-        return Shapes(
+        return ConvexBodies(
             self.corners[index], self.rounding[index], self.semi_axes[index], self.outer[index], self.stretch[index]
         )
 
@@ -79,7 +79,7 @@ class Shapes:
 class Turning(Watch):
     """A watch over bodies that are no discs."""
 
-    shapes: Shapes
+    shapes: ConvexBodies
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
         """``(N,)`` gap of these pairs, their bodies at places ``(N, d)`` and headings ``(N,)``."""
@@ -140,7 +140,7 @@ class Turning(Watch):
 class TurningPairs(Turning, Pairs):
     """Robots against each other."""
 
-    def __init__(self, robot: Indices, shapes: Shapes) -> None:
+    def __init__(self, robot: Indices, shapes: ConvexBodies) -> None:
         super().__init__(robot, shapes.outer)
         self.shapes = shapes.take(robot)
 
@@ -164,7 +164,7 @@ class TurningPairs(Turning, Pairs):
 class TurningStatic(Turning, Static):
     """Robots against the obstacles of a world, or its bounds: one column each."""
 
-    def __init__(self, kind: str, robot: Indices, shapes: Shapes, names: Sequence[str]) -> None:
+    def __init__(self, kind: str, robot: Indices, shapes: ConvexBodies, names: Sequence[str]) -> None:
         super().__init__(kind, robot, shapes.outer, names)
         self.shapes = shapes.take(robot)
 
@@ -177,7 +177,7 @@ class TurningStatic(Turning, Static):
 class Obstacles(TurningStatic):
     """Robots against obstacles, each a convex core with a rounding, or a polygon."""
 
-    def __init__(self, robot: Indices, shapes: Shapes, world: World) -> None:
+    def __init__(self, robot: Indices, shapes: ConvexBodies, world: World) -> None:
         super().__init__("obstacle contact", robot, shapes, _names(world))
         self._world = world
         self._round = np.asarray(world.circles if world.dimension == 2 else world.spheres, np.float64)
@@ -248,7 +248,7 @@ class Obstacles(TurningStatic):
 class Sides(TurningStatic):
     """Robots against the sides of the world."""
 
-    def __init__(self, robot: Indices, shapes: Shapes, lower: Floats, upper: Floats) -> None:
+    def __init__(self, robot: Indices, shapes: ConvexBodies, lower: Floats, upper: Floats) -> None:
         axes = "xyz"[: len(lower)]
         names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
         super().__init__("bounds contact", robot, shapes, names)
@@ -278,7 +278,7 @@ def _names(world: World) -> list[str]:
     return [f"{kind}[{index}]" for kind in kinds for index in range(len(getattr(world, kind)))]
 
 
-def turning_watches(world: World, robot: Indices, shapes: Shapes) -> list[Watch]:
+def turning_watches(world: World, robot: Indices, shapes: ConvexBodies) -> list[Watch]:
     """Return a watch for the obstacles, if there are any, and for the bounds."""
     watches: list[Watch] = [Obstacles(robot, shapes, world)] if world.num_obstacles else []
     if world.lower is not None:
