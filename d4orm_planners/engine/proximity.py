@@ -112,14 +112,15 @@ def bound_boxes(arrays: ProblemArrays) -> FloatArray:
 
 def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
     """The bodies, with their boxes."""
-    places, radius = (np.ascontiguousarray(values, np.float32) for values in (moving.positions, moving.radius))
+    # Copies, for which one compilation serves: read-only arrays are of another type.
+    places, radius = (np.array(values, np.float32, order="C") for values in (moving.positions, moving.radius))
     num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
     # A last block that is short goes on with its last place.
     blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
     blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
     boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
     headings = np.zeros((0, 0)) if moving.headings is None else moving.headings
-    return Bodies(places, radius, boxes, moving.footprints, np.ascontiguousarray(headings, np.float32))
+    return Bodies(places, radius, boxes, moving.footprints, np.array(headings, np.float32, order="C"))
 
 
 def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
