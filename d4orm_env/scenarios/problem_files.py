@@ -15,6 +15,7 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import read_yaml
+from d4orm_env.scenarios.dynobench import load_dynobench
 from d4orm_env.scenarios.schema import describe, parse
 
 
@@ -23,7 +24,8 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
 
     Args:
         path: A YAML file of at most 10 MB, 10,000 robots and 5 * 10^7 robots times steps, in the explicit form (every
-            robot listed) or the short form (a scenario and its arguments).
+            robot listed) or the short form (a scenario and its arguments); or an instance of dynobench or db-CBS, see
+            :func:`~d4orm_env.scenarios.dynobench.load_dynobench`.
 
     Warns:
         UserWarning: If it is proved that nothing solves the problem, with the robots and why.
@@ -35,7 +37,9 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
     try:
-        problem = parse(read_yaml(path))
+        content = read_yaml(path)
+        is_dynobench = isinstance(content, dict) and "environment" in content
+        problem = load_dynobench(path) if is_dynobench else parse(content)
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
     proofs = [f"robot_{robot} {proof}" for robot, proof in prove_infeasible(problem).items()]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from d4orm_env import load_dynobench
+from d4orm_env import load_dynobench, load_problem
 from d4orm_env.footprints import Box, Disc
 from d4orm_planners import make_planner
 
@@ -36,6 +36,7 @@ def instance(tmp_path: Path) -> Path:
 def test_an_instance_means_what_it_says(instance: Path) -> None:
     problem = load_dynobench(instance)
     assert problem.name == "swap"
+    assert load_problem(instance) == problem
     assert problem.team.models == ("unicycle", "unicycle", "holonomic2d")
     assert problem.team.footprint == (Box(0.5, 0.25), Box(0.5, 0.25), Disc(0.1))
     np.testing.assert_allclose(problem.start[1, :3], [4, 1.6, 3.14], rtol=1e-6)
