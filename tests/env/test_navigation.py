@@ -27,7 +27,7 @@ from d4orm_env.envs.joint_state import split_state
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_env.scenarios import make_problem
 
-INFO_TYPES = {"arrived": bool, "collided": bool, "margin_violated": bool, "distance_to_goal": float}
+INFO_TYPES = {"arrived": bool, "collided": bool, "margin_violated": bool, "distance_to_goal": float, "contacts": list}
 
 
 def run(env: Any, controls: np.ndarray, seed: int | None = 0) -> list[tuple[Any, ...]]:
