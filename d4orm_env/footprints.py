@@ -27,6 +27,12 @@ DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 """``(64, 2)`` unit vectors all round."""
 
 
+def _lengths(vectors: Floats) -> Floats:
+    """``(n,)`` lengths of ``(n, 2)``, with the same bits on every processor, which ``hypot`` has not."""
+    lengths: Floats = np.sqrt(vectors[:, 0] * vectors[:, 0] + vectors[:, 1] * vectors[:, 1])
+    return lengths
+
+
 class Core(NamedTuple):
     """A footprint's convex core and how far it is widened.
 
@@ -48,7 +54,7 @@ class Core(NamedTuple):
         if len(corners) == 1:
             return np.zeros((0, 2)), np.zeros(0)
         edges = np.roll(corners, -1, axis=0) - corners
-        edges /= np.hypot(edges[:, 0], edges[:, 1])[:, None]
+        edges /= _lengths(edges)[:, None]
         axes = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
         axes = np.concatenate([axes, edges]) if len(corners) == 2 else axes
         return axes, (axes[:, None] * corners).sum(axis=2).max(axis=1)
@@ -134,7 +140,7 @@ class Planar(Footprint):
     @property
     def outer_radius(self) -> float:
         corners, rounding = self.core
-        return float(np.hypot(corners[:, 0], corners[:, 1]).max()) + rounding
+        return float(_lengths(corners).max()) + rounding
 
     @property
     def inner_radius(self) -> float:

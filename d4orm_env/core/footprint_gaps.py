@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -71,7 +72,7 @@ def _placed(footprint: Footprint, pose: Floats) -> Core:
     if np.isnan(pose[2]):
         return Core(pose[None, :2], footprint.inner_radius)
     corners, rounding = footprint.core  # type: ignore[attr-defined] # all in the plane have one
-    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    sine, cosine = portable.sin_cos(pose[2])
     turned = np.stack([cosine * corners[:, 0] - sine * corners[:, 1], sine * corners[:, 0] + cosine * corners[:, 1]], 1)
     return Core(pose[:2] + turned, rounding)
 

@@ -104,7 +104,7 @@ def pairs_within(bodies: PlacedBodies, others: PlacedBodies, reach: Given) -> Ar
 
 
 def _cores_within(a: PlacedBodies, b: PlacedBodies, offset: Array, reach: Array) -> Array:
-    """Whether cores, those of ``b`` offset by ``offset`` ``(2, ...)``, are within reach of each other."""
+    """Check whether cores, those of ``b`` offset by ``offset`` ``(2, ...)``, are within reach of each other."""
     total = a.rounding + b.rounding + reach
     corners = b.corners + offset[:, None]
     apart = jnp.maximum(
@@ -125,7 +125,7 @@ def _separation(axes: Array, extents: Array, corners: Array) -> Array:
 
 
 def _corner_near_edge(corners: Array, others: Array, reach: Array) -> Array:
-    """Whether one of the first corners is within reach of an edge between the others."""
+    """Check whether one of the first corners is within reach of an edge between the others."""
     near = jnp.zeros((), bool)
     for j in range(others.shape[1]):
         begin, along = others[:, j], others[:, (j + 1) % others.shape[1]] - others[:, j]
@@ -139,7 +139,7 @@ def _corner_near_edge(corners: Array, others: Array, reach: Array) -> Array:
 
 
 def _balls_within(offset: Array, a: Array, b: Array) -> Array:
-    """Whether ellipsoids with these semi-axes touch (Perram and Wertheim, 1985)."""
+    """Check whether ellipsoids with these semi-axes touch (Perram and Wertheim, 1985)."""
     square, a2, b2 = offset * offset, a * a, b * b
 
     def halve(_: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

@@ -32,7 +32,7 @@ from d4orm_planners.sampling.weights import GroupWeights
 
 @dataclass(frozen=True, eq=False)
 class NextStep:
-    """Where a run of the sampling loop would go on.
+    """State from which a run of the sampling loop would go on.
 
     Attributes:
         mean: ``(H, K, m)`` mean of the samples.

@@ -27,7 +27,7 @@ TELL = 1.0
 
 @dataclass
 class Robot:
-    """What is known of a robot.
+    """A robot as it was last heard.
 
     Attributes:
         name: Name of its topics.

@@ -116,7 +116,7 @@ class Subscriber:
         self._subscriber, self._kind, self.refused = subscriber, kind, 0
 
     def take(self) -> list[Received]:
-        """What has come since the last call, oldest first."""
+        """Return the messages since the last call, oldest first."""
         received = []
         while (sample := self._subscriber.try_recv()) is not None:
             try:
