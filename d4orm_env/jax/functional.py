@@ -30,7 +30,8 @@ from d4orm_env.core.world import World
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 from d4orm_env.envs.rewards import RewardFunction, RewardInput, find_reward, term_names
-from d4orm_env.jax.jax_engine import Worlds, advance_worlds, check_contacts, goal_distance
+from d4orm_env.jax.jax_engine import check_contacts, goal_distance
+from d4orm_env.jax.jax_motion import Worlds, advance_worlds
 from d4orm_env.jax.jax_observation import observe_team
 
 __all__ = ["State", "Step", "observe", "reset", "step"]

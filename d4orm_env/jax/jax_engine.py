@@ -7,7 +7,7 @@ compiled loop; nothing returns to the host before it ends, or before the next lo
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,18 +19,18 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.dynamics import collision, reward, transition
-from d4orm_env.dynamics.models import MODELS, names_of_codes
-from d4orm_env.dynamics.robot_model import Ops
+from d4orm_env.dynamics import collision, reward
+from d4orm_env.dynamics.models import names_of_codes
 from d4orm_env.engine import noise
 from d4orm_env.engine.types import (
     StepResult,
     checked_controls,
 )
 from d4orm_env.jax import jax_footprints as footprints
+from d4orm_env.jax.gpu_kernels import LANES, count_near, on_gpu
 from d4orm_env.jax.jax_footprints import MovingBodies
+from d4orm_env.jax.jax_motion import OPS, Given, Worlds, advance_worlds, roll_out
 
-OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 BIT_OPS = noise.BitOps(
     uint32=lambda x: x.astype(jnp.uint32),
     int32=lambda x: x.astype(jnp.int32),
@@ -40,77 +40,28 @@ BIT_OPS = noise.BitOps(
     sqrt=jnp.sqrt,
 )
 
-
-class Worlds(NamedTuple):
-    """A block of worlds on the way.
-
-    Attributes:
-        state: ``(K, n, S)``.
-        docked: ``(K, S)`` bool.
-        control: ``(K, m, S)`` executed last.
-    """
-
-    state: Array
-    docked: Array
-    control: Array
-
-
-Given: TypeAlias = Array | FloatArray
-"""An array of the problem: inside a compiled function it is traced."""
 Contacts: TypeAlias = tuple[Array, Array, Array]
 """Flags of collision and of margin violation, and rewards, each ``(K, S)``."""
 
 
-def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> Worlds:
-    """One step of every robot in every world, docking included.
-
-    Args:
-        models: The team's model names; static.
-        arrays: The problem.
-        worlds: Before the step.
-        control: ``(K, m, S)`` not yet clipped.
-    """
-    h = transition.TimeStep(*arrays.time_step)
-    state, executed, docked = worlds.state, jnp.zeros_like(control), worlds.docked
-    for name in dict.fromkeys(models):
-        model = MODELS[name]
-        functions = model.functions
-        robots = np.flatnonzero(np.array(models) == name)
-        limits = tuple(arrays.limits[robots, i][:, None] for i in range(len(model.limit_names)))
-        x = tuple(worlds.state[robots, i] for i in range(model.state_size))
-        u = functions.limit_control(tuple(control[robots, i] for i in range(model.control_size)), limits, OPS)
-        y = transition.advance(functions, x, u, limits, h, OPS)
-        gap2 = sum((y[i] - arrays.goal[robots, i][:, None]) ** 2 for i in range(model.dimension))
-        speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
-        slow2 = arrays.squared_goal_speed[robots][:, None]
-        arrives = transition.arrives(gap2, speed2, arrays.squared_goal_radius, slow2)
-        if model.heading_index is not None and arrays.goal_direction is not None:
-            heading, aim = y[model.heading_index], jnp.asarray(arrays.goal_direction)[robots]
-            missed = jnp.asarray(arrays.squared_goal_chord)[robots][:, None]
-            cosine, sine = aim[:, :1], aim[:, 1:]
-            arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), cosine, sine, missed)
-        standing = transition.stands(worlds.docked[robots], arrays.docks)
-        docks = transition.stands(arrives, arrays.docks)
-        zero = jnp.zeros_like(gap2)
-        for i, (old, rest, new) in enumerate(zip(x, functions.rest(y, zero), y, strict=True)):
-            state = state.at[robots, i].set(jnp.where(standing, old, jnp.where(docks, rest, new)))
-        for i, component in enumerate(u):
-            executed = executed.at[robots, i].set(jnp.where(standing, zero, component))
-        docked = docked.at[robots].set(standing | arrives)
-    return Worlds(state, docked, executed)
-
-
 def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` how many others a robot in ``state`` ``(K, n, S)`` is within ``extra`` of."""
-    place = state[:, : arrays.goal.shape[1]]
-    gaps = (place[:, None] - place[None, :]) ** 2
+    dimension = arrays.goal.shape[1]
     reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
     reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, reach * reach)
-    near = gaps.sum(axis=2) <= reach2[..., None]
-    if arrays.footprints is not None:
-        bodies = footprints.place_robots(arrays.footprints, state, arrays.goal.shape[1])
-        near &= footprints.pairs_within(bodies, bodies, extra)
-    return near.sum(axis=1)
+
+    def count(state: Array, reach2: Array) -> Array:
+        place = state[:, :dimension]
+        near = ((place[:, None] - place[None, :]) ** 2).sum(axis=2) <= reach2[..., None]
+        if arrays.footprints is not None:
+            bodies = footprints.place_robots(arrays.footprints, state, dimension)
+            near &= footprints.pairs_within(bodies, bodies, extra)
+        return near.sum(axis=1, dtype=jnp.int32)
+
+    if arrays.footprints is not None or state.shape[-1] < LANES:
+        return count(state, reach2)
+    counted: Array = on_gpu(partial(count_near, dimension), count, jax.lax.stop_gradient(state), reach2)
+    return counted
 
 
 def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, extra: Array | np.float32) -> Array:
@@ -227,12 +178,9 @@ def _step(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, contro
 def _rollout(
     models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, controls: Array
 ) -> tuple[Contacts, tuple[Worlds, Contacts]]:
-    def advance(worlds: Worlds, control: Array) -> tuple[Worlds, tuple[Worlds, Contacts]]:
-        worlds, contacts = _step(models, arrays, worlds, control)
-        return worlds, (worlds, contacts)
-
-    first = check_contacts(arrays, worlds.state)
-    return first, jax.lax.scan(advance, worlds, controls)[1]
+    after = roll_out(models, arrays, worlds, controls)
+    contacts = jax.vmap(partial(check_contacts, arrays))(after.state)
+    return check_contacts(arrays, worlds.state), (after, contacts)
 
 
 class JaxEngine:

@@ -16,7 +16,7 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.jax.jax_engine import OPS, Worlds
+from d4orm_env.jax.jax_motion import OPS, Worlds
 
 T = TypeVar("T")
 

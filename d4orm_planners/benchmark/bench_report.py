@@ -9,12 +9,17 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.lazy import LazyModule
+from d4orm_env.engine.choice import resolve_engine
 from d4orm_planners.base.machine import commit, describe_machine, versions
 from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Measurement, Spread
 from d4orm_planners.evaluation.tables import table
+
+jax: Any = LazyModule("jax")
 
 FORMAT = "d4orm-bench-1"
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")
@@ -23,7 +28,8 @@ LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "gymnasium", "pettingzoo")
 def circumstances(command: str) -> Measurement:
     """Under which a benchmark runs that begins now: date, command, commit, machine with its load, and libraries."""
     load = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
-    machine = {**describe_machine(), "load_average": load, "libraries": versions(LIBRARIES)}
+    accelerator = jax.devices()[0].device_kind if resolve_engine("auto") == "jax" else None
+    machine = {**describe_machine(), "accelerator": accelerator, "load_average": load, "libraries": versions(LIBRARIES)}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return {"date": date, "command": command, "commit": commit(), "machine": machine}
 
@@ -62,7 +68,8 @@ def markdown(settings: BenchmarkSettings, begun: Measurement, results: dict[str,
         f"- command: `{begun['command']}`\n"
         f"- commit: {begun['commit'] or 'none'}\n"
         f"- processor: {machine['processor']}, {machine['cores_used']} of {machine['cores']} cores\n"
-        f"- Python {machine['python']}, {libraries}",
+        + (f"- accelerator: {machine['accelerator']}\n" if machine.get("accelerator") else "")
+        + f"- Python {machine['python']}, {libraries}",
         f"M = {settings.num_samples} samples, H = {settings.horizon} steps, {settings.num_steps} denoising steps in an "
         "iteration. Medians, quartiles in brackets.",
     ]
@@ -167,6 +174,7 @@ _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
     }),
     "plans": _tabulated("First feasible verified plan, circle of 5 m", {
         "robots": itemgetter("num_robots"),
+        "engine": lambda row: row.get("engine", "cpu"),
         "preset": itemgetter("rules"),
         "solved": lambda row: f"{row['solved']} of {row['seeds']}",
         "planning, s": lambda row: seconds(row["seconds"]),

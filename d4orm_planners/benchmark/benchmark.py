@@ -12,6 +12,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import COMMON
+from d4orm_env.engine.choice import resolve_engine
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import reference as plain
@@ -64,10 +65,15 @@ def thread_counts() -> list[int]:
 
 def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     """``(section, what, measurement)`` for everything that the settings ask for."""
+    return (part for part in _parts(settings) if part[0] in settings.sections)
+
+
+def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
+    fast = {"cpu", resolve_engine("auto")}  # JAX where it has an accelerator
     for model in settings.models:
         for num_robots in settings.num_robots:
             for engine in settings.engines:
-                slow = engine != "cpu" and num_robots > settings.most_robots_slow
+                slow = engine not in fast and num_robots > settings.most_robots_slow
                 if slow or (engine == "plain" and model not in COMMON):
                     continue
                 # The default planner's weights, by robot and with a cut-off, on the engine that it is meant for.
@@ -102,9 +108,11 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
     size = settings.memory_robots
     memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
     yield "memory", f"memory of {size} robots", memory
-    for preset in PRESETS:
-        for num_robots in settings.plan_robots:
-            yield "plans", f"first plans of {num_robots} robots", partial(_measure_plans, settings, preset, num_robots)
+    for engine in sorted(fast.intersection(settings.engines)):
+        for preset in PRESETS:
+            for num_robots in settings.plan_robots:
+                work = partial(_measure_plans, settings, engine, preset, num_robots)
+                yield "plans", f"first plans of {num_robots} robots on {engine}", work
 
 
 def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], object]) -> dict[str, list[Measurement]]:
@@ -205,15 +213,17 @@ def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where
     return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
 
 
-def _measure_plans(settings: BenchmarkSettings, preset: str | None, num_robots: int) -> Measurement:
+def _measure_plans(settings: BenchmarkSettings, engine: str, preset: str | None, num_robots: int) -> Measurement:
     """Planning time to the first feasible plan; a seed without one counts with the time it took to give up."""
-    planner = make_planner("d4orm", preset=preset)
-    problem = make_problem("circle", num_robots=num_robots)
+    planner = make_planner("d4orm", preset=preset, engine=engine)
+    problem = make_problem("circle", num_robots=num_robots, goal_speed=np.inf)  # as in the paper
+    planner.solve(problem, seed=settings.seeds, time_limit=settings.plan_time_limit)  # compiles
     plans = [
         planner.solve(problem, seed=seed, time_limit=settings.plan_time_limit) for seed in range(settings.seeds)
     ]  # fmt: skip
     return {
         "planner": "d4orm",
+        "engine": engine,
         "rules": preset or "default",
         "num_robots": num_robots,
         "seeds": settings.seeds,

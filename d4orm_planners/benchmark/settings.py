@@ -12,6 +12,9 @@ from d4orm_env.dynamics.models import COMMON, get_model
 from d4orm_planners.base.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
 
 ENGINES = ("cpu", "jax", "plain")
+SECTIONS = (
+    "denoising", "threads", "environments", "obstacles", "index", "robots", "startup", "memory", "plans",
+)  # fmt: skip
 MODELS = (*COMMON, "unicycle", "car")
 
 Robots = Annotated[Count, Field(le=10_000)]
@@ -23,6 +26,7 @@ class BenchmarkSettings(CheckedSettings):
     """Settings of a benchmark.
 
     Attributes:
+        sections: Parts to measure, of :data:`SECTIONS`.
         num_robots: Team sizes.
         models: Robot models.
         engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.reference`, which has the common models.
@@ -32,7 +36,7 @@ class BenchmarkSettings(CheckedSettings):
         repetitions: Calls per measurement at most.
         time_limit: Seconds per measurement, after which no further call begins.
         iteration_limit: Whole iterations expected to take longer than this are left out [s].
-        most_robots_slow: Largest team for the engines other than the CPU engine.
+        most_robots_slow: Largest team for engines other than the CPU engine and, on an accelerator, JAX.
         env_steps: Environment steps per repetition.
         num_worlds: Worlds in the batched environment.
         plan_robots: Team sizes for the first feasible plan.
@@ -48,6 +52,7 @@ class BenchmarkSettings(CheckedSettings):
         ValueError: If a value makes no sense; the message names it.
     """
 
+    sections: tuple[str, ...] = SECTIONS
     num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
     models: tuple[str, ...] = MODELS
     engines: tuple[str, ...] = ENGINES
@@ -73,9 +78,10 @@ class BenchmarkSettings(CheckedSettings):
         super().__post_init__()
         for model in self.models:
             get_model(model)
-        for engine in self.engines:
-            if engine not in ENGINES:
-                raise ValueError(f"engine {engine!r} is no engine of the benchmark; choose from {', '.join(ENGINES)}")
+        for what, given, known in (("engine", self.engines, ENGINES), ("section", self.sections, SECTIONS)):
+            for name in given:
+                if name not in known:
+                    raise ValueError(f"{what} {name!r} is no {what} of the benchmark; choose from {', '.join(known)}")
 
 
 QUICK: Mapping[str, object] = {

@@ -10,7 +10,7 @@ import typer
 
 from d4orm_planners.benchmark.bench_report import circumstances, write_report
 from d4orm_planners.benchmark.benchmark import parts, run_parts
-from d4orm_planners.benchmark.settings import QUICK, BenchmarkSettings
+from d4orm_planners.benchmark.settings import QUICK, SECTIONS, BenchmarkSettings
 from d4orm_planners.cli.arguments import MOST_SEEDS, names, numbers, output_folder
 from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.cli.progress import parts_progress
@@ -26,6 +26,9 @@ def bench(
     ] = None,
     models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
     engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
+    sections: Annotated[
+        str | None, typer.Option("--sections", help=f"Of {', '.join(SECTIONS)}, with commas; all by default.")
+    ] = None,
     seeds: Annotated[
         int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
     ] = None,
@@ -36,6 +39,7 @@ def bench(
         "num_robots": numbers("--num-robots", num_robots),
         "models": names(models),
         "engines": names(engines),
+        "sections": names(sections),
         "seeds": seeds,
     }
     chosen = {name: value for name, value in given.items() if value is not None}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +21,13 @@ from d4orm_env.engine import noise
 from d4orm_env.jax.jax_engine import (
     BIT_OPS,
     JaxEngine,
-    Worlds,
-    advance_worlds,
     moving_contacts,
     obstacle_contacts,
     rewards_of,
     robot_contacts,
 )
 from d4orm_env.jax.jax_footprints import MovingBodies
+from d4orm_env.jax.jax_motion import Worlds, roll_out
 from d4orm_planners.engine.sampling_types import (
     MovingObstacles,
     SamplingResult,
@@ -64,56 +63,58 @@ class _Inputs(NamedTuple):
     seed: tuple[Array, Array]
 
 
-def _deformations(static: _Static, inputs: _Inputs, step: Array, time: Array, mean: Array, scale: Array) -> Array:
-    """``(K, m, M)`` samples of the deformation at one time step."""
-    num_robots, size = mean.shape
-    counters, cosine, sine = noise.turned(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, :], BIT_OPS)
-    robots = jnp.arange(num_robots, dtype=jnp.uint32)[:, None]
+def _deformations(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> Array:
+    """``(H, K, m, M)`` samples of the deformation."""
+    horizon, num_robots, size = mean.shape
+    counters, cosine, sine = noise.turned(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, None], BIT_OPS)
+    times = jnp.arange(horizon, dtype=jnp.uint32)[:, None, None]
+    robots = jnp.arange(num_robots, dtype=jnp.uint32)[None, :, None]
     low, high = inputs.seed
     draws: list[Array] = []
     for pair in range((size + 1) // 2):
-        key = noise.stream_key(low, high, step, robots, time, jnp.uint32(pair), BIT_OPS)
+        key = noise.stream_key(low, high, step, robots, times, jnp.uint32(pair), BIT_OPS)
         x, y = noise.normal_pair(counters, key, BIT_OPS)
         draws += [cosine * x - sine * y, sine * x + cosine * y]
-    return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=1)
+    return mean[..., None] + scale[..., None] * jnp.stack(draws[:size], axis=2)
 
 
 def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
-    """Roll all samples out; returns rewards ``(K, M)`` summed over time and the deformations ``(H, K, m, M)``."""
+    """Roll all samples out; returns rewards ``(K, M)``, means over time, and the deformations ``(H, K, m, M)``."""
     arrays = inputs.arrays
-    d = arrays.goal.shape[1]
-    num_robots = arrays.goal.shape[0]
-
-    def advance(
-        carry: tuple[Worlds, Array], xs: tuple[Array, Array, Array, Array, tuple[FloatArray, FloatArray | None] | None]
-    ) -> tuple[tuple[Worlds, Array], Array]:
-        worlds, total = carry
-        time, base, mean_now, scale_now, obstacle = xs
-        deformation = _deformations(static, inputs, step, time, mean_now, scale_now)
-        worlds = advance_worlds(static.models, arrays, worlds, base[..., None] + deformation)
-        place = worlds.state[:, :d]
-        near_robot = jnp.zeros((num_robots, static.num_samples), int)
-        if static.collisions:
-            near_robot = robot_contacts(arrays, worlds.state, arrays.margin)
-            if inputs.moving is not None and obstacle is not None:
-                bodies = MovingBodies(obstacle[0], obstacle[1], inputs.moving.radius, inputs.moving.footprints)
-                near_robot += moving_contacts(arrays, worlds.state, bodies, arrays.margin)
-        if not static.per_pair:
-            near_robot = near_robot > 0
-        near_obstacle = obstacle_contacts(arrays, worlds.state, arrays.margin)
-        reward = rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalties[:, None])
-        return (worlds, total + reward), deformation
-
-    worlds = Worlds(
-        jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, static.num_samples)),
-        jnp.broadcast_to(inputs.docked[:, None], (num_robots, static.num_samples)),
-        jnp.zeros((num_robots, mean.shape[2], static.num_samples), jnp.float32),
+    num_robots, num_samples = len(arrays.goal), static.num_samples
+    begin = Worlds(
+        jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, num_samples)),
+        jnp.broadcast_to(inputs.docked[:, None], (num_robots, num_samples)),
+        jnp.zeros((num_robots, mean.shape[2], num_samples), jnp.float32),
     )
-    times = jnp.arange(len(mean), dtype=jnp.uint32)
+    deformations = _deformations(static, inputs, step, mean, scale)
+    after = roll_out(static.models, arrays, begin, inputs.base[..., None] + deformations)
     obstacles = None if inputs.moving is None else (inputs.moving.positions, inputs.moving.headings)
-    carry = (worlds, jnp.zeros((num_robots, static.num_samples), jnp.float32))
-    (_, total), deformations = jax.lax.scan(advance, carry, (times, inputs.base, mean, scale, obstacles))
-    return total / len(mean), deformations
+    rewards = jax.vmap(partial(_step_rewards, static, inputs))(after.state, obstacles)
+    return rewards.mean(axis=0), deformations
+
+
+def _step_rewards(
+    static: _Static, inputs: _Inputs, state: Array, obstacle: tuple[FloatArray, FloatArray | None] | None
+) -> Array:
+    """``(K, M)`` rewards of one step, which led to ``state`` ``(K, n, M)``."""
+    arrays = inputs.arrays
+    near_robot = jnp.zeros((len(state), static.num_samples), int)
+    if static.collisions:
+        near_robot = robot_contacts(arrays, state, arrays.margin)
+        if inputs.moving is not None and obstacle is not None:
+            bodies = MovingBodies(*obstacle, inputs.moving.radius, inputs.moving.footprints)
+            near_robot += moving_contacts(arrays, state, bodies, arrays.margin)
+    if not static.per_pair:
+        near_robot = near_robot > 0
+    near_obstacle = obstacle_contacts(arrays, state, arrays.margin)
+    place = state[:, : arrays.goal.shape[1]]
+    return rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalties[:, None])
+
+
+def _weighted_mean(samples: Array, weights: Array) -> Array:
+    """``(H, K, m)`` means of samples ``(H, K, m, M)``; a product of matrices would be rounded to 10 bits on a GPU."""
+    return (samples * weights[None, :, None]).sum(axis=-1)
 
 
 class _DenoisingState(NamedTuple):
@@ -141,16 +142,16 @@ def _denoise(
         extra: tuple[Array, ...] = ()
         if static.rules.importance:
             slope = (inputs.base + mean) / scale**2
-            ratio = -jnp.einsum("tkms,tkm->ks", usable - mean[..., None], slope)
+            ratio = -((usable - mean[..., None]) * slope[..., None]).sum(axis=(0, 2))
             ratio = ratio.sum(axis=0, keepdims=True) if static.credit == "team" else ratio
             extra = (static.rules.importance * ratio,)
         weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp, *extra)
         weights = jnp.broadcast_to(jnp.asarray(weights, jnp.float32), (mean.shape[1], static.num_samples))
-        new_mean = jnp.einsum("tkms,ks->tkm", usable, weights)
+        new_mean = _weighted_mean(usable, weights)
         # Nothing to go by: every sample was excluded.
         new_mean = jnp.where((weights.sum(axis=-1) > 0)[None, :, None], new_mean, mean)
         if static.rules.adapt is not None:
-            deviation2 = jnp.einsum("tkms,ks->tkm", (usable - new_mean[..., None]) ** 2, weights)
+            deviation2 = _weighted_mean((usable - new_mean[..., None]) ** 2, weights)
             factor = jnp.asarray(static.rules.adapt(deviation2 / inputs.units[None] ** 2, jnp), jnp.float32)
         usable_samples = finite.sum(dtype=jnp.int32)
         average = jnp.where(finite, rewards, 0).sum() / jnp.maximum(usable_samples, 1).astype(jnp.float32)
@@ -180,19 +181,18 @@ class JaxSamplingEngine(JaxEngine):
         noise_scale: FloatArray,
         num_samples: int,
         seed: int,
-    ) -> tuple[jax.stages.Compiled, tuple[_Inputs, Array, _DenoisingState, Array, Array]]:
+    ) -> tuple[jax.stages.Compiled, tuple[Any, ...]]:
         problem = task.problem
         docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-        scored = (
+        scored: tuple[Any, ...] = (
             task.arrays, task.penalties, problem.team.control_units, task.base, docked, task.moving,
             noise.seed_words(seed),
         )  # fmt: skip
         static = _Static(problem.team.models, rules, num_samples, task.collisions, task.penalty_per_pair, task.credit)
         scale = np.asarray(noise_scale, np.float32)
-        begun = (mean, task.first_factor, np.zeros_like(scale), np.int32(0))
-        scored, scale, begun = jax.tree.map(jnp.asarray, (scored, scale, begun))
-        arguments = (_Inputs(*scored), scale, _DenoisingState(*begun), jnp.int32(0), jnp.int32(len(scale)))
-        leaves, treedef = jax.tree.flatten(arguments)
+        begun: tuple[Any, ...] = mean, task.first_factor, np.zeros_like(scale), np.int32(0)
+        arguments = _Inputs(*scored), scale, _DenoisingState(*begun), np.int32(0), np.int32(len(scale))
+        leaves, treedef = jax.tree.flatten(jax.tree.map(np.asarray, arguments))
         return _compiled_denoise(static, treedef, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), arguments
 
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
@@ -217,13 +217,14 @@ class JaxSamplingEngine(JaxEngine):
         """
         if watcher is not None:
             raise ValueError("engine 'jax' runs all denoising steps as one program; to watch them, use engine='cpu'")
-        compiled, (inputs, scale, run, *_) = self._lower(task, rules, mean, noise_scale, num_samples, seed)
+        compiled, arguments = self._lower(task, rules, mean, noise_scale, num_samples, seed)
+        inputs, scale, run, *_ = jax.device_put(arguments)
         done, total = 0, len(noise_scale)
         part = total if should_stop is None else 1
         while done < total and not (should_stop is not None and should_stop()):
             start, first = time.perf_counter(), done
             done = min(done + part, total)
-            run = jax.block_until_ready(compiled(inputs, scale, run, jnp.int32(first), jnp.int32(done)))
+            run = jax.block_until_ready(compiled(inputs, scale, run, np.int32(first), np.int32(done)))
             if time.perf_counter() - start < LOOK:
                 part *= 2
         rewards = np.asarray(run.rewards)[:done]

@@ -1,0 +1,174 @@
+"""Robots' motion in JAX: a step of all worlds, and rollouts, which are one kernel on a GPU.
+
+Nobody's motion depends on the others: a rollout needs no more than a robot's own numbers. A loop over time steps would
+start some twenty small kernels a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.dynamics import transition
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.dynamics.robot_model import Model, Ops
+from d4orm_env.jax.gpu_kernels import Components, move_robots, on_gpu
+
+OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
+
+Given: TypeAlias = Array | FloatArray
+"""An array of the problem: inside a compiled function it is traced."""
+
+
+class Worlds(NamedTuple):
+    """A block of worlds on the way.
+
+    Attributes:
+        state: ``(K, n, S)``.
+        docked: ``(K, S)`` bool.
+        control: ``(K, m, S)`` executed last.
+    """
+
+    state: Array
+    docked: Array
+    control: Array
+
+
+class Numbers(NamedTuple):
+    """What a robot's motion depends on, each a number or an array that fits its state's components.
+
+    Attributes:
+        time_step: Four, see :class:`~d4orm_env.dynamics.transition.TimeStep`.
+        limits: The model's.
+        goal: ``d``.
+        squared_goal_radius: Arriving within its root.
+        squared_goal_speed: And no faster than its root.
+        docks: Positive if a robot that has arrived stays.
+        facing: Cosine and sine of the goal heading, and the squared chord by which it may be missed; empty without.
+    """
+
+    time_step: tuple[Given, ...]
+    limits: tuple[Given, ...]
+    goal: tuple[Given, ...]
+    squared_goal_radius: Given
+    squared_goal_speed: Given
+    docks: Given
+    facing: tuple[Given, ...]
+
+
+def numbers_of(model: Model, robots: np.ndarray[Any, Any], arrays: ProblemArrays) -> Numbers:
+    """Numbers of robots ``(R,)`` of one model, each of shape ``(R, 1)``."""
+
+    def column(values: Given | np.generic) -> Array:
+        return jnp.broadcast_to(jnp.asarray(values), (len(robots),))[:, None]
+
+    facing: tuple[Given, ...] = ()
+    if model.heading_index is not None and arrays.goal_direction is not None:
+        aim = jnp.asarray(arrays.goal_direction)[robots]
+        facing = aim[:, :1], aim[:, 1:], column(jnp.asarray(arrays.squared_goal_chord)[robots])
+    return Numbers(
+        tuple(map(column, arrays.time_step)),
+        tuple(column(arrays.limits[robots, i]) for i in range(len(model.limit_names))),
+        tuple(column(arrays.goal[robots, i]) for i in range(model.dimension)),
+        column(arrays.squared_goal_radius),
+        column(arrays.squared_goal_speed[robots]),
+        column(arrays.docks).astype(jnp.float32),
+        facing,
+    )
+
+
+def advance_robots(
+    model: Model, numbers: Numbers, x: Components, control: Components, docked: Array
+) -> tuple[Components, Components, Array]:
+    """One step of robots of one model, docking included: states, executed controls, and who has docked."""
+    functions, limits = model.functions, numbers.limits
+    u = functions.limit_control(control, limits, OPS)
+    y = transition.advance(functions, x, u, limits, transition.TimeStep(*numbers.time_step), OPS)
+    gap2 = sum((y[i] - aim) ** 2 for i, aim in enumerate(numbers.goal))
+    speed2 = sum(v * v for v in functions.velocity(y, u, limits, OPS))
+    arrives = transition.arrives(gap2, speed2, numbers.squared_goal_radius, numbers.squared_goal_speed)
+    if numbers.facing and model.heading_index is not None:
+        heading = y[model.heading_index]
+        arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), *numbers.facing)
+    standing = transition.stands(docked, numbers.docks > 0)
+    docks, zero = transition.stands(arrives, numbers.docks > 0), jnp.zeros_like(gap2)
+    after = tuple(
+        jnp.where(standing, old, jnp.where(docks, rest, new))
+        for old, rest, new in zip(x, functions.rest(y, zero), y, strict=True)
+    )
+    return after, tuple(jnp.where(standing, zero, component) for component in u), standing | arrives
+
+
+def by_model(models: tuple[str, ...]) -> Iterator[tuple[Model, np.ndarray[Any, Any]]]:
+    """Models of a team, and which robots ``(R,)`` are of each."""
+    for name in dict.fromkeys(models):
+        yield MODELS[name], np.flatnonzero(np.array(models) == name)
+
+
+def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> Worlds:
+    """One step of every robot in every world, docking included.
+
+    Args:
+        models: The team's model names; static.
+        arrays: The problem.
+        worlds: Before the step.
+        control: ``(K, m, S)`` not yet clipped.
+    """
+    state, executed, docked = worlds.state, jnp.zeros_like(control), worlds.docked
+    for model, robots in by_model(models):
+        x = tuple(worlds.state[robots, i] for i in range(model.state_size))
+        u = tuple(control[robots, i] for i in range(model.control_size))
+        numbers = numbers_of(model, robots, arrays)
+        after, done, stands = advance_robots(model, numbers, x, u, worlds.docked[robots])
+        for i, component in enumerate(after):
+            state = state.at[robots, i].set(component)
+        for i, component in enumerate(done):
+            executed = executed.at[robots, i].set(component)
+        docked = docked.at[robots].set(stands)
+    return Worlds(state, docked, executed)
+
+
+def roll_out(models: tuple[str, ...], arrays: ProblemArrays, begin: Worlds, controls: Array) -> Worlds:
+    """Worlds after each of the controls ``(H, K, m, S)``, as arrays with the time first."""
+    kernel, elsewhere = partial(_roll_out_by_kernel, models, arrays), partial(_roll_out_in_steps, models, arrays)
+    worlds: Worlds = on_gpu(kernel, elsewhere, begin, controls)
+    return worlds
+
+
+def _roll_out_in_steps(models: tuple[str, ...], arrays: ProblemArrays, begin: Worlds, controls: Array) -> Worlds:
+    def advance(worlds: Worlds, control: Array) -> tuple[Worlds, Worlds]:
+        worlds = advance_worlds(models, arrays, worlds, control)
+        return worlds, worlds
+
+    return jax.lax.scan(advance, begin, controls)[1]
+
+
+def _roll_out_by_kernel(models: tuple[str, ...], arrays: ProblemArrays, begin: Worlds, controls: Array) -> Worlds:
+    def move(model: Model, robots: np.ndarray[Any, Any], begin: Worlds, controls: Array) -> Worlds:
+        numbers = numbers_of(model, robots, arrays)
+        return Worlds(*move_robots(partial(advance_robots, model), numbers, begin.state, begin.docked, controls))
+
+    groups = list(by_model(models))
+    if len(groups) == 1:
+        return move(*groups[0], begin, controls)
+    horizon, (num_robots, num_samples) = len(controls), begin.docked.shape
+    state, docked = jnp.zeros((horizon, *begin.state.shape)), jnp.zeros((horizon, num_robots, num_samples), bool)
+    after = Worlds(state, docked, jnp.zeros_like(controls))
+    for model, robots in groups:
+        n, m = model.state_size, model.control_size
+        before = Worlds(begin.state[robots, :n], begin.docked[robots], begin.control)
+        moved = move(model, robots, before, controls[:, robots, :m])
+        after = Worlds(
+            after.state.at[:, robots, :n].set(moved.state),
+            after.docked.at[:, robots].set(moved.docked),
+            after.control.at[:, robots, :m].set(moved.control),
+        )
+    return after
