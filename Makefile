@@ -49,7 +49,7 @@ wheel: $(VENV)/.created ## Build source distribution and wheel into dist/
 	$(INSTALL) build
 	$(BIN)/python -m build --outdir dist .
 
-wheel-test: wheel ## Install the wheel into fresh environments of $(PYTHONS), those that are here, and try it
+wheel-test: wheel ## Install the wheel into a fresh environment of each of PYTHONS that is here, and try it
 	$(BIN)/python tests/release/fresh_environment.py dist/*.whl $(PYTHONS)
 
 lint: $(DEV_STAMP) ## Check style, formatting, types and the layers
