@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev,rl,ipopt
+PYTHONS ?= python3.11 python3.12 python3.13
 PYTEST_ARGS ?=
 
 # A stamp is as new as the last install that succeeded, so an install is repeated only when what it reads has changed.
@@ -15,7 +16,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all integrations portability lint docs bench results format clean
+.PHONY: help demo test test-all integrations portability wheel wheel-test lint docs bench results format clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -42,6 +43,14 @@ integrations: ## Test the integrations whose libraries need an environment of th
 
 portability: $(DEV_STAMP) ## Plan under the instruction sets of other processors and compare to the bit
 	$(BIN)/python tests/portability/processors.py --quick
+
+wheel: $(VENV)/.created ## Build source distribution and wheel into dist/
+	rm -rf dist
+	$(INSTALL) build
+	$(BIN)/python -m build --outdir dist .
+
+wheel-test: wheel ## Install the wheel into a fresh environment of each of PYTHONS that is here, and try it
+	$(BIN)/python tests/release/fresh_environment.py dist/*.whl $(PYTHONS)
 
 lint: $(DEV_STAMP) ## Check style, formatting, types and the layers
 	$(BIN)/ruff check .

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from d4orm_env.jax import functional
     from d4orm_env.scenarios import load_dynobench, load_problem, save_problem
 
-__version__ = "0.1.0"
+__version__ = "1.0.0rc1"
 
 __all__ = [
     "Problem", "Team", "Trajectory", "VerificationReport", "World", "functional", "list_scenarios", "load_dynobench",

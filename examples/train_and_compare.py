@@ -14,7 +14,7 @@ require("orca", "pyrvo")
 require("rl", "stable_baselines3", "tensorboard")
 
 from d4orm_planners import evaluate
-from d4orm_planners.evaluation.robustness import write_robustness
+from d4orm_planners.evaluation import write_robustness
 from d4orm_planners.rl.training import TrainingSettings, train
 
 

@@ -13,6 +13,8 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.problem import Problem
 
+__all__ = ["BoundsSlack", "ObservationLayout"]
+
 WINDING = 10
 """The longest path that an observation tells, over the farthest that anything may be from a robot."""
 

@@ -105,9 +105,9 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
         loops = partial(measure_robots, mode, settings.repetitions, settings.time_limit)
         yield "robots", f"control loops, {mode}", loops
     yield "startup", "first plan of a process", partial(measure_startup, 8, min(settings.repetitions, 5))
-    size = settings.memory_robots
-    memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
-    yield "memory", f"memory of {size} robots", memory
+    for size in (settings.memory_robots,) if find_spec("resource") else ():  # Windows has none
+        memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
+        yield "memory", f"memory of {size} robots", memory
     for engine in sorted(fast.intersection(settings.engines)):
         for preset in PRESETS:
             for num_robots in settings.plan_robots:

@@ -37,6 +37,8 @@ from d4orm_planners.rl.sb3_network import network_of
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
 
+__all__ = ["ImitationSettings", "imitate"]
+
 LEARNER = "ppo"
 """Algorithm whose network learns, and whose policy it is then."""
 HELD_OUT = 10

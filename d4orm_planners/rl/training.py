@@ -37,6 +37,8 @@ from d4orm_planners.rl.sb3_sets import leave_as_they_are
 from d4orm_planners.rl.task_mixture import Instances, MixedVecEnv, TrainTask, gather_parts, parse_mixture
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 
+__all__ = ["TrainingResult", "TrainingSettings", "train"]
+
 Progress = Callable[[str, int, int], object]
 _INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
 """At most so many of each part are chosen among. All are new in each stage, but where robots look along paths, which

@@ -101,9 +101,9 @@ SETS: Mapping[str, Cases] = {
     )),
 }  # fmt: skip
 README = {
-    "paper": tuple(case.label for case in SETS["paper"].cases if case.label != "circle in space, 8"),
-    "big": ("circle, 16", "random, 64 on 8 x 8 m", "random, 200", "random, 1000", "circle of 18 m, 100"),
-    "walls": ("rooms, 20", "maze, 20", "warehouse, 100"),
+    "paper": ("circle, 4 holonomic", "circle, 16 holonomic", "circle, 8 differential drives", "circle in space, 12"),
+    "big": ("random, 1000",),
+    "walls": ("warehouse, 100",),
 }
 """Rows that the README shows."""
 JITTER = 0.005

@@ -356,6 +356,7 @@ def command_line(*arguments: str, shell: str = '"$@"', **environment: str) -> su
     )  # fmt: skip
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a shell and /dev/full")
 @pytest.mark.parametrize(
     ("shell", "status", "lines"),
     [
@@ -372,11 +373,13 @@ def test_what_becomes_of_the_output_decides_on_nothing(shell: str, status: str, 
     assert len(complaint) == 1 + lines
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs a shell")
 def test_without_a_place_for_complaints_the_status_says_it() -> None:
     assert command_line("planners", "nobody", shell='"$@" 2>&-').returncode == 2
     assert command_line("planners", "nobody", shell='"$@" <&- >&- 2>&-').returncode == 2
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs a shell")
 def test_a_character_that_the_output_lacks_ends_nothing(tmp_path: Path) -> None:
     options = ("--policy", "go-to-goal", "--num-robots", "2", "--out", str(tmp_path / "\u00e4\u4e2d.html"))
     outcome = command_line("run", *options, PYTHONIOENCODING="latin-1:strict")

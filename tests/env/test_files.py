@@ -9,6 +9,8 @@ import pytest
 
 from d4orm_env.core.files import replaced_when_done
 
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="names, links and pipes of POSIX")
+
 
 def write(path: Path, text: str = "new") -> None:
     with replaced_when_done(path) as temporary:
