@@ -63,6 +63,9 @@ napoleon_use_ivar = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 
+# The modules' pages are not in the navigation: with hundreds of entries it is most of every page and of the build.
+suppress_warnings = ["toc.not_included"]
+
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["replays.css"]

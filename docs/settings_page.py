@@ -10,6 +10,7 @@ from pathlib import Path
 from d4orm_env.scenarios import describe_scenario, list_scenarios
 from d4orm_planners import list_policies
 from d4orm_planners.base.planner_registry import default_settings, find_policy, preset_names
+from d4orm_planners.sampling.d4orm import D4ormConfig
 
 HEAD = """\
 # Settings and scenarios
@@ -20,6 +21,9 @@ these; `d4orm planners NAME` lists them too. A preset gives the values of its co
 ## Scenarios
 
 """
+
+NODES = {"planner": 'What every node refines its candidate with: `"d4orm"`, `"d4orm-d"` or `"hybrid"`.'}
+"""Settings of D-D4orm that no class lists; others are those of D4orm."""
 
 
 def described(config: type) -> dict[str, str]:
@@ -52,13 +56,12 @@ def section(name: str) -> str:
     defaults, config = default_settings(name), getattr(kind, "config_class", None) or kind
     presets: Mapping[str, Mapping[str, object]] = getattr(kind, "presets", {})
     shown_presets = preset_names(name)
-    # What nodes run has settings of its own.
-    meanings = described(find_policy("d4orm").config_class) | described(config)
+    meanings = NODES | described(D4ormConfig) | described(config)
     head = ["setting", "default", *(f'`"{preset}"`' for preset in shown_presets), "meaning"]
-    rows = [
-        [f"`{key}`", shown(value), *(shown(presets[preset].get(key, value)) for preset in shown_presets), meanings.get(key, "")]
-        for key, value in defaults.items()
-    ]
+    rows = []
+    for key, value in defaults.items():
+        of_presets = [shown(presets[preset].get(key, value)) for preset in shown_presets]
+        rows.append([f"`{key}`", shown(value), *of_presets, meanings.get(key, "")])
     return f"## {name}\n\n{table(head, rows)}" if rows else ""
 
 
@@ -70,7 +73,8 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 
 def write_settings(path: Path) -> None:
     """Write the page."""
-    scenarios = table(["name", "what it is"], [[f"`{name}`", plain(describe_scenario(name))] for name in list_scenarios()])
+    rows = [[f"`{name}`", plain(describe_scenario(name))] for name in list_scenarios()]
+    scenarios = table(["name", "what it is"], rows)
     sections = filter(None, (section(name) for name in list_policies()))
     path.parent.mkdir(exist_ok=True)
     path.write_text(HEAD + scenarios + "\n" + "\n".join(sections), encoding="utf-8")
