@@ -68,7 +68,7 @@ suppress_warnings = ["toc.not_included"]
 
 html_theme = "furo"
 html_static_path = ["_static"]
-html_css_files = ["replays.css"]
+html_css_files = ["pages.css"]
 html_extra_path = ["_extra"]  # what is in it lies beside the pages
 html_title = "d4orm-env"
 

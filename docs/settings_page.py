@@ -62,7 +62,7 @@ def section(name: str) -> str:
     for key, value in defaults.items():
         of_presets = [shown(presets[preset].get(key, value)) for preset in shown_presets]
         rows.append([f"`{key}`", shown(value), *of_presets, meanings.get(key, "")])
-    return f"## {name}\n\n{table(head, rows)}" if rows else ""
+    return f"## {name}\n\n```{{table}}\n:class: settings\n\n{table(head, rows)}```\n" if rows else ""
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
