@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE))  # for replays.py
+sys.path.insert(0, str(HERE))  # for replays.py and settings_page.py
 os.environ["SCIPY_ARRAY_API"] = "1"  # without which d4orm_env.crazyflow is not imported beside SciPy
 
 project = "d4orm-env"
@@ -63,9 +63,12 @@ napoleon_use_ivar = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 
+# The modules' pages are not in the navigation: with hundreds of entries it is most of every page and of the build.
+suppress_warnings = ["toc.not_included"]
+
 html_theme = "furo"
 html_static_path = ["_static"]
-html_css_files = ["replays.css"]
+html_css_files = ["pages.css"]
 html_extra_path = ["_extra"]  # what is in it lies beside the pages
 html_title = "d4orm-env"
 
@@ -76,14 +79,16 @@ def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: boo
     return True if is_alias else None
 
 
-def _write_replays(app: Any, config: Any) -> None:
-    """Have the replays that the pages show."""
+def _write_generated(app: Any, config: Any) -> None:
+    """Have the replays that the pages show, and the page of settings."""
     from replays import write_replays
+    from settings_page import write_settings
 
     write_replays(HERE / "_extra" / "replays")
+    write_settings(HERE / "reference" / "settings.md")
 
 
 def setup(app: Any) -> None:
     """Connect what the extensions leave to the project."""
-    app.connect("config-inited", _write_replays)
+    app.connect("config-inited", _write_generated)
     app.connect("autodoc-skip-member", _skip_described_field)

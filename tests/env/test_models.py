@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +26,6 @@ from d4orm_env.verify.integrated import Integrated
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_planners import make_planner
 
-PAGE = Path(__file__).parents[2] / "docs" / "own_robot.md"
 STEP = TimeStep(0.1, 0.1 / 2, 0.1 / 3, 0.1 / 6)
 
 
@@ -194,14 +191,6 @@ def test_teams_of_common_models_share_kernels_that_know_no_other(boat: Model) ->
     with_boat = world_kernels(("holonomic2d", "boat"))
     assert with_boat.roll_out is not common.roll_out
     assert with_boat.roll_out.py_func.__qualname__.endswith("_holonomic2d_boat")
-
-
-@pytest.mark.slow
-def test_the_page_about_own_robots_runs(tmp_path: Path) -> None:
-    program = tmp_path / "mecanum.py"
-    program.write_text(PAGE.read_text().split("```python\n")[1].partition("```")[0])
-    result = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=300, check=False)
-    assert (result.returncode, result.stdout.split()) == (0, ["solved", "True"]), result.stderr
 
 
 # The unicycle and the car.

@@ -19,8 +19,6 @@ from d4orm_env.scenarios.scenario_registry import SCENARIOS
 from d4orm_planners import OpenLoop, evaluate, make_planner, run_episode
 from d4orm_planners.cli.app import main
 
-PAGE = Path(__file__).parents[2] / "docs" / "own_scenario.md"
-
 
 def lanes(seed: int, num_robots: int, *, gap: float = 1.0) -> Problem:
     """Robots side by side that all drive ahead, for a distance that the seed draws."""
@@ -258,10 +256,3 @@ def test_teams_of_a_batch_are_alike() -> None:
         gymnasium.make_vec(
             "d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point", scenario=sizes, num_robots=1
         )
-
-
-@pytest.mark.usefixtures("registered")
-def test_the_page_runs() -> None:
-    blocks = PAGE.read_text().split("```python\n")[1:]
-    program = "\n".join(block.partition("```")[0] for block in blocks)
-    exec(compile(program, str(PAGE), "exec"), {"__name__": "own_scenario"})

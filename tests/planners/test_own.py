@@ -401,17 +401,3 @@ def test_the_command_line_takes_import_paths(
     assert [name for name, _ in rows_of(tmp_path / "evaluation")] == [
         "from_here.py:Mine", "from_here:Mine", "from_here:f", "go-to-goal",
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("page", "file", "expected"),
-    [
-        ("own_policy", "mine", "3.0 0.0\nin turn 1.0\nat once 0.0\ngently 0.0\ngo-to-goal 0.0\n"),
-        ("own_planner", "waiting", "True solved True\n"),
-    ],
-)
-@pytest.mark.slow
-def test_the_programs_of_the_pages_run(page: str, file: str, expected: str, tmp_path: Path) -> None:
-    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
-    assert f"`{file}.py`" in text
-    assert program(tmp_path, text.split("```python\n")[1].partition("```")[0]) == expected

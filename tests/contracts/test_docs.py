@@ -1,0 +1,102 @@
+"""The pages of the documentation: their programs run, their commands are understood, their paths exist."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from d4orm_planners import list_policies
+from d4orm_planners.cli.app import LazyCommands
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = {
+    page.relative_to(DOCS).with_suffix("").as_posix(): page.read_text(encoding="utf-8")
+    for folder in (DOCS, DOCS / "planners")
+    for page in sorted(folder.glob("*.md"))
+}
+FENCE = re.compile(r"^ *```(\w+)( notest)?\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
+TREE = re.compile(r"^```{toctree}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+PATH = re.compile(r"`((?:examples|d4orm_env|d4orm_planners|tests|docs)/[\w./-]+)`")
+EXTRA = re.compile(
+    r"pip install 'd4orm-env\[\w+\]'|No module named '(stable_baselines3|supersuit|torch|torchrl|jaxmarl|minari)'"
+)
+"""Complaints that an extra is not installed."""
+PRINTS = {
+    "own_policy": "3.0 0.0\nin turn 1.0\nat once 0.0\ngently 0.0\ngo-to-goal 0.0\n",
+    "own_planner": "True solved True\n",
+    "own_robot": "solved True\n",
+}
+"""What the programs of some pages print."""
+
+
+def programs(text: str) -> str:
+    """All of a page's Python in one, but for what needs files, robots or libraries that a test has not."""
+    return "\n".join(code for language, skip, code in FENCE.findall(text) if language == "python" and not skip)
+
+
+def commands(text: str) -> list[str]:
+    """A page's command lines, without comments."""
+    blocks = [code for language, _, code in FENCE.findall(text) if language in ("bash", "console")]
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    return [line.removeprefix("$ ") for line in lines if line.strip()]
+
+
+@pytest.mark.parametrize("page", [page for page, text in PAGES.items() if programs(text) and page != "jax"])
+@pytest.mark.slow
+def test_programs_run(page: str, tmp_path: Path) -> None:
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    name = match.group(1) if (match := re.search(r"Save this as\s+`(\w+\.py)`", PAGES[page])) else "page.py"
+    (tmp_path / name).write_text(programs(PAGES[page]), encoding="utf-8")
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    result = subprocess.run(
+        [sys.executable, name],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    if result.returncode and (missing := EXTRA.search(result.stderr)):
+        pytest.skip(missing.group())
+    assert result.returncode == 0, result.stderr
+    assert PRINTS.get(page, result.stdout) == result.stdout
+
+
+@pytest.mark.parametrize("page", [page for page, text in PAGES.items() if commands(text)])
+def test_commands_are_understood(page: str) -> None:
+    known = LazyCommands()
+    for line in commands(PAGES[page]):
+        words = shlex.split(line, comments=True)
+        if words[0] == "d4orm" and not words[1].startswith("-"):
+            try:
+                known[words[1]].make_context(words[1], words[2:])
+            except ImportError as error:
+                if not EXTRA.search(str(error)):
+                    raise
+        elif words[:2] == ["python", "-m"]:
+            assert importlib.util.find_spec(words[2]), line
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_files_that_a_page_names_exist(page: str) -> None:
+    named = PATH.findall(PAGES[page])
+    missing = [path for path in named if "output" not in path and not (ROOT / path).exists()]
+    assert not missing
+
+
+def test_every_page_is_in_a_table_of_contents() -> None:
+    listed = {line for text in PAGES.values() for code in TREE.findall(text) for line in code.split()}
+    pages = {page for page in PAGES if page != "index"}
+    assert {page for page in pages if page not in listed and page.removeprefix("planners/") not in listed} == set()
+
+
+def test_every_setting_is_described(tmp_path: Path) -> None:
+    runpy.run_path(str(DOCS / "settings_page.py"))["write_settings"](tmp_path / "settings.md")
+    text = (tmp_path / "settings.md").read_text(encoding="utf-8")
+    assert set(re.findall("^## (.+)$", text, re.MULTILINE)) - {"Scenarios"} <= set(list_policies())
+    assert "|  |" not in text
