@@ -10,7 +10,7 @@ from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise,
 from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.intruder import Intruder
-from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
+from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, StateNoise
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "Occlusion",
     "Push",
     "Quantisation",
+    "RayNoise",
     "Scene",
     "Stall",
     "StateDelay",

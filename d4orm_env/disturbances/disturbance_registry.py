@@ -14,12 +14,12 @@ from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
 from d4orm_env.disturbances.intruder import Intruder
-from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
+from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, StateNoise
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
 _BUILT_IN: tuple[type[AnyDisturbance], ...] = (
     ControlNoise, CorrelatedNoise, Bias, Delay, Dropout, Quantisation, Gain, StateNoise, StateDelay, Occlusion, Push,
-    Stall, Intruder, Drag, LimitMismatch, Lag,
+    Stall, Intruder, Drag, LimitMismatch, Lag, RayNoise,
 )  # fmt: skip
 
 

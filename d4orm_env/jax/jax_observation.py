@@ -17,6 +17,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.jax.jax_engine import OPS, Worlds
+from d4orm_env.jax.jax_rays import cast_rays
 
 T = TypeVar("T")
 
@@ -52,6 +53,7 @@ def observe_team(
         arrays.limits[:, 1],
         *_neighbors(arrays, place, velocity, layout.num_neighbors),
         *_obstacles(arrays, place, layout.num_obstacles),
+        *cast_rays(arrays, place, heading, layout),
     ]
     low, high = layout.low, layout.high
     return jnp.stack([jnp.clip(column, low[i], high[i]) for i, column in enumerate(columns)], axis=1)
