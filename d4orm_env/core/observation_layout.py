@@ -189,10 +189,14 @@ class ObservationLayout(ObservationSlices):
     Attributes:
         low: ``(D,)`` float32 lower bounds.
         high: ``(D,)`` float32 upper bounds.
+        communication_range: Distance of centres beyond which neighbours are not observed [m].
+        line_of_sight: Whether neighbours behind obstacles are not observed either.
     """
 
     low: FloatArray
     high: FloatArray
+    communication_range: float = field(default=np.inf, kw_only=True)
+    line_of_sight: bool = field(default=False, kw_only=True)
 
     @classmethod
     def for_problem(
@@ -204,6 +208,8 @@ class ObservationLayout(ObservationSlices):
         slack: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
         num_rays: int = 0,
         ray_range: float = 5.0,
+        communication_range: float | None = None,
+        line_of_sight: bool = False,
     ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
 
@@ -215,12 +221,17 @@ class ObservationLayout(ObservationSlices):
             slack: Slack beyond that, for what disturbs the motion or what is seen of it.
             num_rays: Rays of the range sensor.
             ray_range: What a ray that meets nothing reads [m].
+            communication_range: Distance of centres beyond which neighbours are not observed [m]; ``None`` for none.
+            line_of_sight: Whether those behind obstacles are not observed either.
 
         Raises:
-            ValueError: If a number is negative or not whole, the range is not positive, or the robots cannot have rays.
+            ValueError: If a number is negative or not whole, a range is not positive, or the robots cannot have rays or
+                a line of sight.
         """
-        kinds = {"num_rays": num_rays, "observed_path": observed_path}
-        slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles, **kinds)  # type: ignore[arg-type]
+        sizes = problem.dimension, num_neighbors, num_obstacles
+        slices = ObservationSlices(*sizes, num_rays=num_rays, observed_path=observed_path)
+        if line_of_sight and problem.dimension != 2:
+            raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
         if num_rays:
             _check_rays(problem)
         team, reach = problem.team, _reach(problem, slack)
@@ -254,7 +265,15 @@ class ObservationLayout(ObservationSlices):
             _fill(slices.paths(low), slices.path, {"length": 0})
         for bound in (low, high):
             bound.setflags(write=False)
-        return cls(problem.dimension, num_neighbors, num_obstacles, low, high, **kinds)  # type: ignore[arg-type]
+        return cls(
+            *sizes,
+            low,
+            high,
+            num_rays=num_rays,
+            observed_path=observed_path,
+            communication_range=_checked_range(communication_range),
+            line_of_sight=line_of_sight,
+        )
 
     @property
     def ray_range(self) -> float:
@@ -267,6 +286,10 @@ class ObservationLayout(ObservationSlices):
         bounds: FloatArray = np.stack([self.low, self.high])
         bounds.setflags(write=False)
         return bounds
+
+
+def _checked_range(given: float | None) -> float:
+    return np.inf if given is None else positive_number(given, "communication_range", most=LARGEST)
 
 
 def _check_rays(problem: Problem) -> None:

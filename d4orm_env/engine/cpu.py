@@ -89,7 +89,10 @@ def _kernels(arrays: ProblemArrays) -> WorldKernels:
 
 
 def _view(layout: ObservationLayout) -> ObservationSpec:
-    return ObservationSpec(layout.bounds, layout.num_neighbors, layout.num_obstacles)
+    squared_range = np.float32(layout.communication_range**2)
+    return ObservationSpec(
+        layout.bounds, layout.num_neighbors, layout.num_obstacles, squared_range, layout.line_of_sight
+    )
 
 
 def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray) -> WorldArrays:

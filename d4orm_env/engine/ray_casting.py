@@ -129,17 +129,23 @@ def _meet_bounds(x: np.float32, y: np.float32, bounds: FloatArray, fan: FloatArr
 
 
 @compiled
+def _invert(fan: FloatArray) -> None:
+    """Fill one over the components of the directions."""
+    for i in range(fan.shape[1]):
+        for axis in range(2):
+            component = fan[axis, i]
+            parallel = (component < _PARALLEL) & (component > -_PARALLEL)
+            fan[2 + axis, i] = ONE / (_PARALLEL if parallel else component)
+
+
+@compiled
 def _aim(directions: FloatArray, heading: np.float32, fan: FloatArray) -> None:
     """Turn the rays by a heading, and take one over their components."""
     cosine, sine = np.float32(np.cos(np.float64(heading))), np.float32(np.sin(np.float64(heading)))
     for i in range(directions.shape[0]):
         fan[0, i] = cosine * directions[i, 0] - sine * directions[i, 1]
         fan[1, i] = sine * directions[i, 0] + cosine * directions[i, 1]
-    for i in range(directions.shape[0]):
-        for axis in range(2):
-            component = fan[axis, i]
-            parallel = (component < _PARALLEL) & (component > -_PARALLEL)
-            fan[2 + axis, i] = ONE / (_PARALLEL if parallel else component)
+    _invert(fan)
 
 
 @inlined
@@ -152,21 +158,43 @@ def _meet_round(
 
 
 @compiled
-def _meet_obstacles(x: np.float32, y: np.float32, s: Surroundings, fan: FloatArray, row: FloatArray) -> None:
-    for j in range(s.boxes.shape[0]):
-        low_x, low_y, high_x, high_y = s.boxes[j, 0] - x, s.boxes[j, 1] - y, s.boxes[j, 2] - x, s.boxes[j, 3] - y
-        if s.boxes[j, 4] > ZERO:
-            _meet_round(low_x, low_y, s.boxes[j, 4], s.range, fan, row)
+def _meet_obstacles(
+    x: np.float32,
+    y: np.float32,
+    boxes: FloatArray,
+    triangles: FloatArray,
+    reach: np.float32,
+    fan: FloatArray,
+    row: FloatArray,
+) -> None:
+    for j in range(boxes.shape[0]):
+        low_x, low_y, high_x, high_y = boxes[j, 0] - x, boxes[j, 1] - y, boxes[j, 2] - x, boxes[j, 3] - y
+        if boxes[j, 4] > ZERO:
+            _meet_round(low_x, low_y, boxes[j, 4], reach, fan, row)
             continue
         gap_x, gap_y = max(low_x, -high_x, ZERO), max(low_y, -high_y, ZERO)
-        if gap_x * gap_x + gap_y * gap_y <= s.range * s.range:
+        if gap_x * gap_x + gap_y * gap_y <= reach * reach:
             _meet_box(low_x, low_y, high_x, high_y, fan, row)
-    for j in range(s.triangles.shape[0]):
-        c = s.triangles[j]
+    for j in range(triangles.shape[0]):
+        c = triangles[j]
         gap_x = max(min(c[0], c[2], c[4]) - x, x - max(c[0], c[2], c[4]), ZERO)
         gap_y = max(min(c[1], c[3], c[5]) - y, y - max(c[1], c[3], c[5]), ZERO)
-        if gap_x * gap_x + gap_y * gap_y <= s.range * s.range:
+        if gap_x * gap_x + gap_y * gap_y <= reach * reach:
             _meet_triangle(x, y, c, fan, row)
+
+
+@compiled
+def is_blocked(
+    place: FloatArray, other: FloatArray, boxes: FloatArray, triangles: FloatArray, scratch: FloatArray
+) -> bool:
+    """Check whether an obstacle lies between two positions; ``scratch`` ``(5, 1)`` is overwritten."""
+    fan, row = scratch[:4], scratch[4]
+    x, y = other[0] - place[0], other[1] - place[1]
+    distance = np.sqrt(x * x + y * y)
+    fan[0, 0], fan[1, 0], row[0] = x / distance, y / distance, distance
+    _invert(fan)
+    _meet_obstacles(place[0], place[1], boxes, triangles, distance, fan, row)
+    return row[0] < distance
 
 
 @cached_kernel(**OPTIONS)
@@ -205,6 +233,6 @@ def cast_rays(
             for j in range(bodies.shape[1]):
                 if bodies[b, j, 4] > ZERO:
                     _meet_round(bodies[b, j, 0] - x, bodies[b, j, 1] - y, bodies[b, j, 4], s.range, fan, row)
-            _meet_obstacles(x, y, s, fan, row)
+            _meet_obstacles(x, y, s.boxes, s.triangles, s.range, fan, row)
             for i in range(num_rays):
                 out[b, k, first + i] = row[i]

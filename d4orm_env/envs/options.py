@@ -57,6 +57,8 @@ class EnvOptions:
         observed_obstacles: Nearest obstacles in an observation; likewise.
         observed_rays: Rays of each robot's range sensor (a planar lidar) in an observation; not in space.
         ray_range: Range of that [m]; noise is :class:`~d4orm_env.disturbances.RayNoise`.
+        communication_range: Distance of centres beyond which no neighbour is observed [m]; ``None`` for no limit.
+        line_of_sight: Whether neighbours behind obstacles are not observed either; not in space.
         scenario_settings: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments.
     """
 
@@ -76,6 +78,8 @@ class EnvOptions:
     observed_obstacles: int = 4
     observed_rays: int = 0
     ray_range: float = 5.0
+    communication_range: float | None = None
+    line_of_sight: bool = False
     scenario_settings: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -124,6 +128,8 @@ class EnvOptions:
             raise ValueError(f"observed_path is {shown(self.observed_path)}; it must be True or False")
         if not self.observed_rays and any(isinstance(one, RayNoise) for one in self.disturbances):
             raise ValueError("RayNoise is of range sensors, and these robots have none; give observed_rays")
+        if not isinstance(self.line_of_sight, bool):
+            raise ValueError(f"line_of_sight is {shown(self.line_of_sight)}; it must be True or False")
         if self.lifelong and (self.progress == "path" or self.observed_path):
             raise ValueError(
                 "progress='path' and observed_path need goals that stay; leave them out in lifelong mode, which draws "

@@ -42,7 +42,29 @@ def _nearest(
     arrays: ProblemArrays, others: tuple[Array, Array, Array], x: Array, y: Array, ray_x: Array, ray_y: Array
 ) -> Array:
     """Distance from ``(x, y)`` along a ray to whatever comes first; the other robots' positions are relative."""
-    found = [_to_discs(*others, ray_x, ray_y)]
+    found = [_to_discs(*others, ray_x, ray_y), *_to_obstacles(arrays, x, y, ray_x, ray_y)]
+    if arrays.bounds is not None:
+        (low_x, low_y), (high_x, high_y) = arrays.bounds
+        leave = jnp.minimum(_through(low_x - x, high_x - x, ray_x)[1], _through(low_y - y, high_y - y, ray_y)[1])
+        found.append(jnp.maximum(leave, 0)[None])
+    return jnp.concatenate(found).min()
+
+
+def are_blocked(arrays: ProblemArrays, place: list[Array], gap: list[Array]) -> Array:
+    """``(K,)`` bool: an obstacle lies between positions and what is this vector away from them, columns ``(K,)``."""
+    distance = jnp.sqrt(gap[0] * gap[0] + gap[1] * gap[1])
+    length = jnp.where(distance > 0, distance, 1)
+
+    def to_obstacle(x: Array, y: Array, ray_x: Array, ray_y: Array) -> Array:
+        return jnp.concatenate([jnp.full(1, jnp.inf), *_to_obstacles(arrays, x, y, ray_x, ray_y)]).min()
+
+    blocked: Array = jax.vmap(to_obstacle)(place[0], place[1], gap[0] / length, gap[1] / length) < distance
+    return blocked
+
+
+def _to_obstacles(arrays: ProblemArrays, x: Array, y: Array, ray_x: Array, ray_y: Array) -> list[Array]:
+    """Distances from ``(x, y)`` along a ray to all obstacles."""
+    found = []
     if len(arrays.boxes):
         low_x, low_y, high_x, high_y, radius = arrays.boxes.T
         discs = _to_discs(low_x - x, low_y - y, radius, ray_x, ray_y)
@@ -54,11 +76,7 @@ def _nearest(
         found.append(jnp.where(radius > 0, discs, jnp.where(leave < enter, jnp.inf, enter)))
     if len(arrays.triangles):
         found.append(_to_triangles(arrays.triangles, x, y, ray_x, ray_y))
-    if arrays.bounds is not None:
-        (low_x, low_y), (high_x, high_y) = arrays.bounds
-        leave = jnp.minimum(_through(low_x - x, high_x - x, ray_x)[1], _through(low_y - y, high_y - y, ray_y)[1])
-        found.append(jnp.maximum(leave, 0)[None])
-    return jnp.concatenate(found).min()
+    return found
 
 
 def _to_discs(x: Array, y: Array, radius: Array | FloatArray, ray_x: Array, ray_y: Array) -> Array:
