@@ -155,7 +155,11 @@ def _make(kind: type[AnyDisturbance], values: Mapping[str, object], text: str) -
 
 def name_of(disturbance: AnyDisturbance) -> str:
     """Return the name of its kind here, or its import path."""
-    kind = type(disturbance)
+    return name_of_kind(type(disturbance))
+
+
+def name_of_kind(kind: type[AnyDisturbance]) -> str:
+    """Return the name of a kind here, or its import path."""
     for name in DISTURBANCES:
         if DISTURBANCES.origin(name) in (kind, f"{kind.__module__}:{kind.__qualname__}"):
             return name

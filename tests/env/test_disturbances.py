@@ -751,7 +751,7 @@ def test_pictures_show_where_it_was_disturbed(scenario: str, tmp_path: Any) -> N
     problem, trajectory, marks = episode.problem, episode.trajectory, episode.marks
     figure = plot_trajectory(problem, trajectory, marks=marks)
     told = {text.get_text() for text in figure.legends[0].get_texts()}
-    assert told >= {"push", "intruder"}
+    assert told >= {"push", "moving obstacle"}
     assert ("stalls" in told) == marks.stalled.any()
     assert not {text.get_text() for text in plot_trajectory(problem, trajectory).legends[0].get_texts()} & {"push"}
     save_animation(problem, trajectory, tmp_path / "plain.gif", max_frames=4)
