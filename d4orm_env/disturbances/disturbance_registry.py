@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from typing import NamedTuple
+
+import numpy as np
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
@@ -167,5 +170,11 @@ def name_of_kind(kind: type[AnyDisturbance]) -> str:
 
 
 def attributes_of(disturbance: AnyDisturbance) -> dict[str, object]:
-    """All attributes; what is infinite, which JSON does not have, as the text ``"inf"``."""
-    return {name: "inf" if value == math.inf else value for name, value in asdict(disturbance).items()}
+    """All attributes; what is infinite, which JSON does not have, as the text ``"inf"``, and arrays as digests."""
+    return {name: _attribute(value) for name, value in asdict(disturbance).items()}
+
+
+def _attribute(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return f"{value.shape} {hashlib.sha256(value.tobytes()).hexdigest()[:16]}"
+    return "inf" if value == math.inf else value

@@ -66,6 +66,17 @@ class MovingObstacle(Disturbance[BodiesNow]):
         for name, value in {"times": times, "positions": places, "radius": radius}.items():
             object.__setattr__(self, name, value)
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, MovingObstacle) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    @property
+    def _content(self) -> tuple[object, ...]:
+        times, places = self._track
+        return times.tobytes(), places.shape, places.tobytes(), self.radius
+
     @property
     def replayable(self) -> bool:
         return True  # it changes neither states nor controls

@@ -18,7 +18,8 @@ from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Intruder, MovingObstacle, load_pedestrians
 from d4orm_env.envs.joint_state import split_state
 from d4orm_env.render import plot_trajectory
-from d4orm_planners import run_episode
+from d4orm_planners import evaluate, run_episode
+from d4orm_planners.evaluation.store import TrialStore
 
 STILL = Problem(Team(("velocity2d",) * 2, radius=0.25), [[0, 0], [0, 5]], [[0, 3], [3, 5]], horizon=60)
 ACROSS = MovingObstacle([1, 3, 4], [[-2, 0], [2, 0], [2, 1]], radius=0.5)
@@ -138,6 +139,18 @@ def test_a_bad_file_is_an_error(tmp_path: Path, text: str, message: str) -> None
 def test_a_bad_trajectory_is_an_error(arguments: tuple[Any, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         MovingObstacle(*arguments)
+
+
+def test_they_are_equal_where_they_move_alike_and_a_study_tells_them_apart(tmp_path: Path) -> None:
+    later = MovingObstacle([2, 4, 5], ACROSS.positions, 0.5)
+    again = MovingObstacle([1, 3, 4], [[-2, 0], [2, 0], [2, 1]], 0.5)
+    assert (again == ACROSS, hash(again) == hash(ACROSS), later == ACROSS) == (True, True, False)
+    rates = evaluate(
+        "go-to-goal", STILL, out=tmp_path, seeds=[0], workers=1, disturbances={"people": [[], [ACROSS], [later]]}
+    )
+    assert [rate.undisturbed for rate in rates] == [True, False, False]
+    assert [rate.contacts for rate in rates] == [0, 0, 0]
+    assert len({trial.disturbances for trial in TrialStore.existing(tmp_path).trials()}) == 3
 
 
 def test_it_must_fit_the_robots_and_the_physics() -> None:
