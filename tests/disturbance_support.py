@@ -25,6 +25,7 @@ from d4orm_env.disturbances import (
     Occlusion,
     Push,
     Quantisation,
+    RayNoise,
     Scene,
     Stall,
     StateDelay,
@@ -77,6 +78,7 @@ CASES: dict[str, Disturbance[Any]] = {
     "drag": Drag(0.5),
     "limit_mismatch": LimitMismatch(0.7),
     "lag": Lag(0.2),
+    "ray_noise": RayNoise(0.2),
     "wind": Wind(),
 }
 """By name of the kind, and more behind a hyphen."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.geometry.world_index import WIDER, WorldIndex
 
@@ -26,6 +26,8 @@ class Sensed(NamedTuple):
         radius: ``(K + N,)``.
         heading: ``(K, 2)`` cosine and sine, zeros for models without a heading.
         arrived: ``(K,)`` 0 or 1.
+        hidden: ``(K + N,)`` bool, those that the robot in question does not observe.
+        ray: ``(5, 1)`` scratch for a line of sight.
         nearest_robots: ``(num_neighbors, 2)`` scratch: squared distance, robot.
         nearest_obstacles: ``(num_obstacles, 2)`` scratch: distance of the surface, obstacle.
     """
@@ -35,6 +37,8 @@ class Sensed(NamedTuple):
     radius: FloatArray
     heading: FloatArray
     arrived: FloatArray
+    hidden: BoolArray
+    ray: FloatArray
     nearest_robots: FloatArray
     nearest_obstacles: FloatArray
 
@@ -57,7 +61,7 @@ def observe_robot(
     obstacles = neighbors + (2 + 2 * d) * sensed.nearest_robots.shape[0]
     _see_itself(k, arrays, goal, sensed, out)
     out[2 * d + 3] = time_left
-    _find_nearest_robots(k, sensed.position, sensed.nearest_robots)
+    _find_nearest_robots(k, sensed.position, sensed.hidden, sensed.nearest_robots)
     _see_robots(k, sensed, neighbors, out)
     _find_nearest_obstacles(sensed.position[k], arrays, sensed.nearest_obstacles)
     _see_obstacles(sensed.position[k], arrays, arrays.radius[k], sensed.nearest_obstacles, obstacles, out)
@@ -125,10 +129,10 @@ def _comes_before(key: float, number: float, row: FloatArray) -> bool:
     return key < row[0] or (key == row[0] and number < row[1])
 
 
-def _find_nearest_robots(k: int, position: FloatArray, nearest: FloatArray) -> None:
+def _find_nearest_robots(k: int, position: FloatArray, hidden: BoolArray, nearest: FloatArray) -> None:
     nearest[:, 0] = np.inf
     for other in range(position.shape[0]):
-        if other != k:
+        if other != k and not hidden[other]:
             # Starting from the first axis and not from a literal keeps the sum in the caller's precision.
             gap = position[other, 0] - position[k, 0]
             gap2 = gap * gap

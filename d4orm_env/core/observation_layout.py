@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, whole_number
+from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
 from d4orm_env.core.problem import Problem
 
 __all__ = ["BoundsSlack", "ObservationLayout"]
@@ -90,23 +90,27 @@ Parts: TypeAlias = OwnParts | NeighborParts | ObstacleParts | PathParts
 
 @dataclass(frozen=True)
 class ObservationSlices:
-    """Slices of an observation: the robot's own part, each neighbour's, each obstacle's, and the shortest path's.
+    """Slices of an observation: the robot's own part, each neighbour's, each obstacle's, the rays, and the path.
 
     Attributes:
         dimension: ``d``.
         num_neighbors: Neighbours listed, nearest first.
         num_obstacles: Obstacles listed, nearest first; walls of the bounds are among them.
+        num_rays: Rays of its range sensor, counter-clockwise, the first along its heading, or along the x axis for a
+            model without one: how far each reaches [m].
         observed_path: Whether the path is there.
     """
 
     dimension: int
     num_neighbors: int
     num_obstacles: int
+    num_rays: int = field(default=0, kw_only=True)
     observed_path: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         whole_number(self.num_neighbors, "num_neighbors", 0)
         whole_number(self.num_obstacles, "num_obstacles", 0)
+        whole_number(self.num_rays, "num_rays", 0)
 
     @cached_property
     def own(self) -> OwnParts:
@@ -130,9 +134,22 @@ class ObservationSlices:
         return PathParts(*_slices(self.dimension, 1))
 
     @cached_property
+    def ray_directions(self) -> FloatArray:
+        """``(num_rays, 2)`` unit vectors of the rays in the robot's frame, read-only."""
+        angles = 2 * np.pi * np.arange(self.num_rays) / max(self.num_rays, 1)
+        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+        directions.setflags(write=False)
+        return directions
+
+    @cached_property
     def size(self) -> int:
         """Number of components ``D``."""
-        return self._obstacles_end + self.observed_path * self.path[-1].stop
+        return self.rays.stop + self.observed_path * self.path[-1].stop
+
+    @property
+    def rays(self) -> slice:
+        """Slice of the rays."""
+        return slice(self._obstacles_end, self._obstacles_end + self.num_rays)
 
     @property
     def _neighbors_end(self) -> int:
@@ -154,7 +171,7 @@ class ObservationSlices:
 
     def paths(self, observations: FloatArray) -> FloatArray:
         """``(..., .)`` what observations ``(..., D)`` say of the path; empty where they do not."""
-        return observations[..., self._obstacles_end :]
+        return observations[..., self.rays.stop :]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,8 +179,9 @@ class ObservationSlices:
         blocks: list[tuple[str, Parts]] = [("", self.own)]
         blocks += [(f"neighbor_{row}.", self.neighbor) for row in range(self.num_neighbors)]
         blocks += [(f"obstacle_{row}.", self.obstacle) for row in range(self.num_obstacles)]
-        blocks += [("path.", self.path)] * self.observed_path
-        return tuple(prefix + name for prefix, parts in blocks for name in _component_names(parts))
+        listed = [prefix + name for prefix, parts in blocks for name in _component_names(parts)]
+        listed += [f"ray_{ray}" for ray in range(self.num_rays)]
+        return (*listed, *(f"path.{name}" for name in _component_names(self.path) if self.observed_path))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +191,14 @@ class ObservationLayout(ObservationSlices):
     Attributes:
         low: ``(D,)`` float32 lower bounds.
         high: ``(D,)`` float32 upper bounds.
+        communication_range: Distance of centres beyond which neighbours are not observed [m].
+        line_of_sight: Whether neighbours behind obstacles are not observed either.
     """
 
     low: FloatArray
     high: FloatArray
+    communication_range: float = field(default=np.inf, kw_only=True)
+    line_of_sight: bool = field(default=False, kw_only=True)
 
     @classmethod
     def for_problem(
@@ -186,6 +208,10 @@ class ObservationLayout(ObservationSlices):
         num_obstacles: int = 4,
         observed_path: bool = False,
         slack: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
+        num_rays: int = 0,
+        ray_range: float = 5.0,
+        communication_range: float | None = None,
+        line_of_sight: bool = False,
     ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
 
@@ -195,11 +221,21 @@ class ObservationLayout(ObservationSlices):
             num_obstacles: Obstacles listed.
             observed_path: Whether the path is there.
             slack: Slack beyond that, for what disturbs the motion or what is seen of it.
+            num_rays: Rays of the range sensor.
+            ray_range: What a ray that meets nothing reads [m].
+            communication_range: Distance of centres beyond which neighbours are not observed [m]; ``None`` for none.
+            line_of_sight: Whether those behind obstacles are not observed either.
 
         Raises:
-            ValueError: If a number of neighbours or obstacles is negative or not whole.
+            ValueError: If a number is negative or not whole, a range is not positive, or the robots cannot have rays or
+                a line of sight.
         """
-        slices = ObservationSlices(problem.dimension, num_neighbors, num_obstacles, observed_path=observed_path)
+        sizes = problem.dimension, num_neighbors, num_obstacles
+        slices = ObservationSlices(*sizes, num_rays=num_rays, observed_path=observed_path)
+        if line_of_sight and problem.dimension != 2:
+            raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
+        if num_rays:
+            _check_rays(problem)
         team, reach = problem.team, _reach(problem, slack)
         radius, speed, acceleration = (
             float(values.max()) for values in (team.radius, team.max_speed, team.max_acceleration)
@@ -221,7 +257,9 @@ class ObservationLayout(ObservationSlices):
         _fill(slices.obstacles(high), slices.obstacle, {"present": 1, "position": reach, "gap": reach})
         if observed_path:
             _fill(slices.paths(high), slices.path, {"direction": 1, "length": WINDING * reach})
+        high[slices.rays] = positive_number(ray_range, "ray_range", most=LARGEST)
         low = -high
+        low[slices.rays] = 0
         _fill(low, slices.own, {"time_left": 0, "arrived": 0})
         _fill(slices.neighbors(low), slices.neighbor, {"present": 0})
         _fill(slices.obstacles(low), slices.obstacle, {"present": 0})
@@ -229,7 +267,20 @@ class ObservationLayout(ObservationSlices):
             _fill(slices.paths(low), slices.path, {"length": 0})
         for bound in (low, high):
             bound.setflags(write=False)
-        return cls(problem.dimension, num_neighbors, num_obstacles, low, high, observed_path=observed_path)
+        return cls(
+            *sizes,
+            low,
+            high,
+            num_rays=num_rays,
+            observed_path=observed_path,
+            communication_range=_checked_range(communication_range),
+            line_of_sight=line_of_sight,
+        )
+
+    @property
+    def ray_range(self) -> float:
+        """The range of the rays [m]; there must be some."""
+        return float(self.high[self.rays.start])
 
     @cached_property
     def bounds(self) -> FloatArray:
@@ -237,6 +288,20 @@ class ObservationLayout(ObservationSlices):
         bounds: FloatArray = np.stack([self.low, self.high])
         bounds.setflags(write=False)
         return bounds
+
+
+def _checked_range(given: float | None) -> float:
+    return np.inf if given is None else positive_number(given, "communication_range", most=LARGEST)
+
+
+def _check_rays(problem: Problem) -> None:
+    """Raise ``ValueError`` for a team that cannot have a range sensor."""
+    if problem.dimension != 2:
+        raise ValueError("rays lie in the plane, and this problem is in space; leave observed_rays out")
+    if problem.team.footprint_arrays is not None:
+        raise ValueError(
+            "rays meet robots that are discs, and this team has other footprints; leave footprint or observed_rays out"
+        )
 
 
 def _slices(*widths: int) -> Iterator[slice]:

@@ -10,7 +10,8 @@ from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise,
 from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.disturbances.intruder import Intruder
-from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
+from d4orm_env.disturbances.moving_obstacle import MovingObstacle, load_pedestrians
+from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, StateNoise
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
 __all__ = [
@@ -27,12 +28,15 @@ __all__ = [
     "Intruder",
     "Lag",
     "LimitMismatch",
+    "MovingObstacle",
     "Observed",
     "Occlusion",
     "Push",
     "Quantisation",
+    "RayNoise",
     "Scene",
     "Stall",
     "StateDelay",
     "StateNoise",
+    "load_pedestrians",
 ]

@@ -158,7 +158,7 @@ class Disturbance(Generic[M]):
         """Return the worlds as they are seen; called once at a reset and after every step."""
         return seen
 
-    def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
+    def observe(self, observations: FloatArray, layout: ObservationLayout, draws: Draws) -> FloatArray:
         """Return the robots' observations ``(B, K, D)`` of what is seen."""
         return observations
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from typing import NamedTuple
+
+import numpy as np
 
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
@@ -14,12 +17,12 @@ from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
 from d4orm_env.disturbances.intruder import Intruder
-from d4orm_env.disturbances.perception import Occlusion, StateDelay, StateNoise
+from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, StateNoise
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
 _BUILT_IN: tuple[type[AnyDisturbance], ...] = (
     ControlNoise, CorrelatedNoise, Bias, Delay, Dropout, Quantisation, Gain, StateNoise, StateDelay, Occlusion, Push,
-    Stall, Intruder, Drag, LimitMismatch, Lag,
+    Stall, Intruder, Drag, LimitMismatch, Lag, RayNoise,
 )  # fmt: skip
 
 
@@ -155,7 +158,11 @@ def _make(kind: type[AnyDisturbance], values: Mapping[str, object], text: str) -
 
 def name_of(disturbance: AnyDisturbance) -> str:
     """Return the name of its kind here, or its import path."""
-    kind = type(disturbance)
+    return name_of_kind(type(disturbance))
+
+
+def name_of_kind(kind: type[AnyDisturbance]) -> str:
+    """Return the name of a kind here, or its import path."""
     for name in DISTURBANCES:
         if DISTURBANCES.origin(name) in (kind, f"{kind.__module__}:{kind.__qualname__}"):
             return name
@@ -163,5 +170,11 @@ def name_of(disturbance: AnyDisturbance) -> str:
 
 
 def attributes_of(disturbance: AnyDisturbance) -> dict[str, object]:
-    """All attributes; what is infinite, which JSON does not have, as the text ``"inf"``."""
-    return {name: "inf" if value == math.inf else value for name, value in asdict(disturbance).items()}
+    """All attributes; what is infinite, which JSON does not have, as the text ``"inf"``, and arrays as digests."""
+    return {name: _attribute(value) for name, value in asdict(disturbance).items()}
+
+
+def _attribute(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return f"{value.shape} {hashlib.sha256(value.tobytes()).hexdigest()[:16]}"
+    return "inf" if value == math.inf else value

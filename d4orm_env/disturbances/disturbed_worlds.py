@@ -31,6 +31,7 @@ class _Purpose(IntEnum):
     COMMAND = 1
     MOVE = 2
     SEE = 3
+    OBSERVE = 4
 
 
 T = TypeVar("T")
@@ -216,10 +217,13 @@ class DisturbedWorlds:
                 one.remember(memory, worlds)
         return seen
 
-    def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
-        """``(B, K, D)`` observations of what is seen, as robots make them."""
+    def observe(
+        self, observations: FloatArray, layout: ObservationLayout, scene: Scene, worlds: Worlds | None = None
+    ) -> FloatArray:
+        """``(B, K, D)`` observations of what is seen in all worlds of a scene, or in some, as robots make them."""
         for one in self._observing:
-            made = one.disturbance.observe(observations, layout)
+            draws = self._draws(one, scene, _Purpose.OBSERVE)
+            made = one.disturbance.observe(observations, layout, draws if worlds is None else draws.of(worlds))
             observations = _checked(made, observations.shape, one, "observe")
         if self._observing:
             observations = np.clip(observations, layout.low, layout.high)

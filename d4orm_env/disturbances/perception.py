@@ -157,12 +157,41 @@ class Occlusion(Disturbance[Memory]):
         hidden = ((gaps * gaps).sum(axis=-1) > self.range**2).all(axis=-1)
         return seen._replace(bodies=np.where(hidden[..., None], np.float32(0), seen.bodies))
 
-    def observe(self, observations: FloatArray, layout: ObservationLayout) -> FloatArray:
+    def observe(self, observations: FloatArray, layout: ObservationLayout, draws: Draws) -> FloatArray:
         observations = observations.copy()
+        rays = observations[..., layout.rays]
+        np.copyto(rays, layout.high[layout.rays], where=rays > self.range)
         for rows, parts in (
             (layout.neighbors(observations), layout.neighbor),
             (layout.obstacles(observations), layout.obstacle),
         ):
             offsets = rows[..., parts.position]
             rows *= (offsets * offsets).sum(axis=-1, keepdims=True) <= self.range**2
+        return observations
+
+
+@dataclass(frozen=True)
+class RayNoise(Disturbance[Memory]):
+    """Gaussian noise on what range sensors measure, independent over steps, robots and rays.
+
+    A ray that meets nothing reads the range as it is.
+
+    Attributes:
+        std: Standard deviation [m].
+    """
+
+    std: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "std", standard_deviation(self.std, "RayNoise std"))
+
+    @property
+    def negligible(self) -> bool:
+        return self.std == 0
+
+    def observe(self, observations: FloatArray, layout: ObservationLayout, draws: Draws) -> FloatArray:
+        rays = observations[..., layout.rays]
+        noise = np.float32(self.std) * draws.normal(*rays.shape[1:])
+        observations = observations.copy()
+        observations[..., layout.rays] = np.where(rays < layout.high[layout.rays], rays + noise, rays)
         return observations

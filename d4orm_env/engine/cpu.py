@@ -11,6 +11,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.observing import ObservationSpec
+from d4orm_env.engine.ray_casting import Surroundings, cast_rays
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
@@ -40,6 +41,13 @@ class CpuEngine:
         arrays = typed(arrays)
         kernel, view = _kernels(arrays).observe_worlds, _view(layout)
         self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, sight, view, part, out))
+
+    def cast_rays(
+        self, arrays: ProblemArrays, layout: ObservationLayout, state: FloatArray, bodies: FloatArray, out: FloatArray
+    ) -> None:
+        """See :meth:`d4orm_env.engine.types.WorldEngine.cast_rays`."""
+        around, first = Surroundings.of(arrays, layout.ray_directions, layout.ray_range), layout.rays.start
+        self._threads.over(-(-len(out) // TILE), lambda part: cast_rays(around, state, bodies, first, part, out))
 
     def advance(
         self,
@@ -81,7 +89,10 @@ def _kernels(arrays: ProblemArrays) -> WorldKernels:
 
 
 def _view(layout: ObservationLayout) -> ObservationSpec:
-    return ObservationSpec(layout.bounds, layout.num_neighbors, layout.num_obstacles)
+    squared_range = np.float32(layout.communication_range**2)
+    return ObservationSpec(
+        layout.bounds, layout.num_neighbors, layout.num_obstacles, squared_range, layout.line_of_sight
+    )
 
 
 def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray) -> WorldArrays:

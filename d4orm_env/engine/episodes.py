@@ -137,7 +137,7 @@ def advance_worlds_kernel(
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
         near = np.empty((num_robots, 3), np.uint64)
-        sensed = allocate_sensed(num_robots, 0, dimension, view.num_neighbors, view.num_obstacles)
+        sensed = allocate_sensed(num_robots, 0, dimension, view)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             count = min(TILE, orders.shape[0] - first)
@@ -158,6 +158,6 @@ def advance_worlds_kernel(
                     batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + b - first])
                 if out.shape[0] > 0:
                     time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
-                    observe(read_motion, arrays, batch, b, time_left, w, view.bounds, sensed, out[b])
+                    observe(read_motion, arrays, batch, b, time_left, w, view, sensed, out[b])
 
     return advance_worlds

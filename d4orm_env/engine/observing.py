@@ -15,6 +15,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
+from d4orm_env.engine.ray_casting import is_blocked
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader
@@ -38,18 +39,6 @@ for _function in (
     register_jitable(**INLINED)(_function)
 
 
-@numba.njit(nogil=True, **OPTIONS)
-def allocate_sensed(
-    num_robots: int, num_bodies: int, dimension: int, num_neighbors: int, num_obstacles: int
-) -> observation.Sensed:
-    everybody = num_robots + num_bodies
-    return observation.Sensed(
-        np.empty((everybody, dimension), np.float32), np.empty((everybody, dimension), np.float32),
-        np.empty(everybody, np.float32), np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
-        np.empty((num_neighbors, 2), np.float32), np.empty((num_obstacles, 2), np.float32),
-    )  # fmt: skip
-
-
 class ObservationSpec(NamedTuple):
     """Contents of an observation, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`.
 
@@ -57,11 +46,40 @@ class ObservationSpec(NamedTuple):
         bounds: ``(2, D)`` lowest and highest observation.
         num_neighbors: Robots in it.
         num_obstacles: Obstacles in it.
+        squared_range: Square of the distance beyond which robots are not observed [m²].
+        line_of_sight: Whether those behind obstacles are not observed either.
     """
 
     bounds: FloatArray
     num_neighbors: int
     num_obstacles: int
+    squared_range: np.float32
+    line_of_sight: bool
+
+
+@numba.njit(nogil=True, **OPTIONS)
+def allocate_sensed(num_robots: int, num_bodies: int, dimension: int, view: ObservationSpec) -> observation.Sensed:
+    everybody = num_robots + num_bodies
+    return observation.Sensed(
+        np.empty((everybody, dimension), np.float32), np.empty((everybody, dimension), np.float32),
+        np.empty(everybody, np.float32), np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
+        np.zeros(everybody, np.bool_), np.empty((5, 1), np.float32),
+        np.empty((view.num_neighbors, 2), np.float32), np.empty((view.num_obstacles, 2), np.float32),
+    )  # fmt: skip
+
+
+@compiled
+def _hide(k: int, arrays: ProblemArrays, view: ObservationSpec, sensed: observation.Sensed) -> None:
+    """Mark whom robot ``k`` does not observe."""
+    place = sensed.position[k]
+    for other in range(sensed.hidden.shape[0]):
+        gap2 = ZERO
+        for axis in range(place.shape[0]):
+            gap = sensed.position[other, axis] - place[axis]
+            gap2 += gap * gap
+        sensed.hidden[other] = gap2 > view.squared_range
+        if view.line_of_sight and not sensed.hidden[other]:
+            sensed.hidden[other] = is_blocked(place, sensed.position[other], arrays.boxes, arrays.triangles, sensed.ray)
 
 
 @compiled
@@ -84,12 +102,12 @@ def observe(
     b: int,
     time_left: np.float32,
     w: FloatArray,
-    bounds: FloatArray,
+    view: ObservationSpec,
     sensed: observation.Sensed,
     out: FloatArray,
 ) -> None:
-    """Fill ``out`` ``(K, D)`` with what the robots of world ``b`` of a loaded tile see, inside ``bounds``."""
-    (num_robots, dimension), s = arrays.goal.shape, b % TILE
+    """Fill ``out`` ``(K, D)`` with what the robots of world ``b`` of a loaded tile see, inside the view's bounds."""
+    (num_robots, dimension), s, bounds = arrays.goal.shape, b % TILE, view.bounds
     for k in range(num_robots):
         for axis in range(dimension):
             sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
@@ -101,6 +119,8 @@ def observe(
         sensed.radius[k] = arrays.radius[k]
     for k in range(num_robots):
         row = out[k]
+        if view.line_of_sight or view.squared_range < np.inf:
+            _hide(k, arrays, view, sensed)
         observation.observe_robot(k, arrays, worlds.goal[b], sensed, time_left, row)
         for i in range(row.shape[0]):
             value = row[i]
@@ -129,12 +149,12 @@ def observe_worlds_kernel(
     ) -> None:
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE)
-        sensed = allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view.num_neighbors, view.num_obstacles)
+        sensed = allocate_sensed(num_robots, sight.bodies.shape[1], dimension, view)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
             load(sight, first, w)
             for b in range(first, min(first + TILE, sight.state.shape[0])):
                 _sense_bodies(sight.bodies[b], num_robots, sensed)
-                observe(read_motion, arrays, sight, b, sight.time_left[b], w, view.bounds, sensed, out[b])
+                observe(read_motion, arrays, sight, b, sight.time_left[b], w, view, sensed, out[b])
 
     return observe_worlds

@@ -169,6 +169,12 @@ class WorldEngine(Engine, Protocol):
         """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees, inside the layout's bounds."""
         ...
 
+    def cast_rays(
+        self, arrays: ProblemArrays, layout: ObservationLayout, state: FloatArray, bodies: FloatArray, out: FloatArray
+    ) -> None:
+        """Fill the rays of ``out`` ``(B, K, D)``, for states ``(B, K, n)`` among bodies ``(B, N, 2 d + 1)``."""
+        ...
+
     def advance(
         self,
         arrays: ProblemArrays,

@@ -119,6 +119,8 @@ def _mark_bodies(
     for s in range(min(TILE, bodies.shape[0] - first)):
         for k in range(num_robots):
             for i in range(bodies.shape[1]):
+                if bodies[first + s, i, 2 * dimension] <= ZERO:  # absent
+                    continue
                 gap2 = ZERO
                 for axis in range(dimension):
                     gap = bodies[first + s, i, axis] - w[k * STRIDE + (STATE + axis) * TILE + s]

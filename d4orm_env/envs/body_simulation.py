@@ -66,6 +66,9 @@ class SimulatedBodies(Protocol):
         """
 
 
+_OUT_OF_THE_WAY = np.float32(1e4)
+
+
 class BodySimulation(TeamSimulation):
     """A simulation whose bodies another physics moves.
 
@@ -97,6 +100,10 @@ class BodySimulation(TeamSimulation):
         """See :meth:`d4orm_env.envs.team_simulation.TeamSimulation.reset`."""
         step = super().reset(random)
         radius = self.worlds.bodies[0, :, -1]
+        if not radius.all():
+            raise ValueError(
+                "a moving obstacle is absent at first, and another physics has it all the time; begin at 0 s"
+            )
         if (
             self.bodies is None
             or self.bodies.problem is not self.problem
@@ -123,7 +130,8 @@ class BodySimulation(TeamSimulation):
         standing = np.asarray(stands(self.arrived, docks))
         limited = self._limited(controls[0], true.limits, standing)
         true = true._replace(goal=self.goals)
-        states, touched = self.bodies.advance(limited, true, worlds.bodies[0])
+        there = worlds.bodies[0, :, -1:] > 0
+        states, touched = self.bodies.advance(limited, true, np.where(there, worlds.bodies[0], _OUT_OF_THE_WAY))
         states = self._measured(states, standing)
         arrived = standing | reached_goals(team, true, states, limited)
         docking = np.flatnonzero(np.asarray(stands(arrived, docks)) & ~standing)

@@ -16,6 +16,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.chosen import Disturbances, at_work, checked_disturbances
 from d4orm_env.disturbances.controls import ControlNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.perception import RayNoise
 from d4orm_env.envs.inputs import noise_std
 from d4orm_env.envs.rewards import RewardFunction
 from d4orm_env.scenarios.problems import ScenarioLike, find_scenario, make_problem, unknown_argument
@@ -54,6 +55,10 @@ class EnvOptions:
             ``lifelong``.
         observed_robots: Nearest robots in an observation; missing ones are marked absent.
         observed_obstacles: Nearest obstacles in an observation; likewise.
+        observed_rays: Rays of each robot's range sensor (a planar lidar) in an observation; not in space.
+        ray_range: Range of that [m]; noise is :class:`~d4orm_env.disturbances.RayNoise`.
+        communication_range: Distance of centres beyond which no neighbour is observed [m]; ``None`` for no limit.
+        line_of_sight: Whether neighbours behind obstacles are not observed either; not in space.
         scenario_settings: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments.
     """
 
@@ -71,6 +76,10 @@ class EnvOptions:
     observed_path: bool = False
     observed_robots: int = 4
     observed_obstacles: int = 4
+    observed_rays: int = 0
+    ray_range: float = 5.0
+    communication_range: float | None = None
+    line_of_sight: bool = False
     scenario_settings: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -117,6 +126,10 @@ class EnvOptions:
             raise ValueError(f"progress is {shown(self.progress)}; it must be 'straight' or 'path'")
         if not isinstance(self.observed_path, bool):
             raise ValueError(f"observed_path is {shown(self.observed_path)}; it must be True or False")
+        if not self.observed_rays and any(isinstance(one, RayNoise) for one in self.disturbances):
+            raise ValueError("RayNoise is of range sensors, and these robots have none; give observed_rays")
+        if not isinstance(self.line_of_sight, bool):
+            raise ValueError(f"line_of_sight is {shown(self.line_of_sight)}; it must be True or False")
         if self.lifelong and (self.progress == "path" or self.observed_path):
             raise ValueError(
                 "progress='path' and observed_path need goals that stay; leave them out in lifelong mode, which draws "

@@ -73,6 +73,10 @@ class EnvSetup:
             num_obstacles=whole_number(options.observed_obstacles, "observed_obstacles", 0, _MAX_OBSERVED),
             observed_path=options.observed_path,
             slack=self.slack,
+            num_rays=whole_number(options.observed_rays, "observed_rays", 0, _MAX_OBSERVED),
+            ray_range=options.ray_range,
+            communication_range=options.communication_range,
+            line_of_sight=options.line_of_sight,
         )
         if self.along_paths:
             problem.check_reachable()

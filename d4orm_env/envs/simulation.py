@@ -19,6 +19,7 @@ from d4orm_env.engine.types import LOOK, RESET, SKIP, STEP, ObservationInputs, W
 from d4orm_env.envs.episode_metrics import EpisodeCounts, episode_metrics
 from d4orm_env.envs.inputs import checked_states
 from d4orm_env.envs.lifelong import assign_goals, reached_goals
+from d4orm_env.envs.range_sensors import sense_ranges
 from d4orm_env.envs.rewards import RewardInput, along_paths, compute_rewards, no_terms
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.world_paths import WorldPaths
@@ -227,6 +228,7 @@ class Simulation:
         """Complete the observations ``out`` ``(B, K, D)`` of the worlds that are not skipped."""
         layout = self.setup.layout
         if not self._observes_apart:
+            sense_ranges(self._engine, layout, self.problems, self.worlds, out)
             if layout.observed_path:
                 observe_paths(out, layout, self._paths.direction, self._paths.length)
             return
@@ -240,7 +242,8 @@ class Simulation:
             self._engine.observe_worlds(self.problems.seen[world], layout, inputs.select(one), seen[one])
         if layout.observed_path:
             observe_paths(seen, layout, *self._paths.look(worlds, inputs.state))
-        seen = self._disturbed.observe(seen, layout)
+        sense_ranges(self._engine, layout, self.problems, self.worlds, seen, None if every else worlds)
+        seen = self._disturbed.observe(seen, layout, self._scene, None if every else worlds)
         if seen is not out:
             out[worlds] = seen
 

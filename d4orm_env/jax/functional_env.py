@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.controls import ControlNoise
+from d4orm_env.disturbances.perception import RayNoise
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import find_reward
 from d4orm_env.envs.setup import EnvSetup
@@ -38,11 +40,13 @@ class EnvState(NamedTuple):
         team: State of the team.
         instance: ``()`` int32, which of the instances it runs.
         touched: ``(K,)`` bool: has been in contact.
+        ray_noise: ``(K, R)`` errors of what the range sensors measure now [m]; ``R`` is 0 without noise.
     """
 
     team: functional.State
     instance: jax.Array
     touched: jax.Array
+    ray_noise: jax.Array
 
 
 class Transition(NamedTuple):
@@ -80,7 +84,8 @@ class FunctionalEnv:
             draws others.
         **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario. Not
             ``render_mode``, ``lifelong``, ``progress="path"``, ``observed_path``, nor disturbances but
-            :class:`~d4orm_env.disturbances.ControlNoise`: they are not pure functions.
+            :class:`~d4orm_env.disturbances.ControlNoise` and :class:`~d4orm_env.disturbances.RayNoise`: they are not
+            pure functions.
 
     Attributes:
         problem: The first instance.
@@ -108,10 +113,13 @@ class FunctionalEnv:
         self.layout: ObservationLayout = setup.layout
         self.max_cycles: int = setup.max_cycles
         self._reward = find_reward(chosen.reward) or "paper"
-        noise = [one.std for one in setup.disturbances if isinstance(one, ControlNoise)]
-        if len(noise) < len(setup.disturbances):
-            raise ValueError("disturbances other than ControlNoise are no pure functions; use gymnasium.make_vec")
-        self._noise = np.sqrt(np.sum([np.square(std) for std in noise], axis=0)).astype(np.float32)
+        known = [one for one in setup.disturbances if isinstance(one, ControlNoise | RayNoise)]
+        if len(known) < len(setup.disturbances):
+            raise ValueError(
+                "disturbances other than ControlNoise and RayNoise are no pure functions; use gymnasium.make_vec"
+            )
+        self._noise = _joint_std([one.std for one in known if isinstance(one, ControlNoise)])
+        self._ray_noise = _joint_std([one.std for one in known if isinstance(one, RayNoise)])
         random = np.random.default_rng(chosen.scenario_settings.get("seed") or 0)
         drawn = [setup.draw(random) for _ in range(count)] if setup.redraws else [setup.problem]
         self._num_instances, self._varying, self._common, self._structure = len(drawn), *_stacked(drawn)
@@ -144,7 +152,12 @@ class FunctionalEnv:
 
     def observe(self, state: EnvState) -> jax.Array:
         """``(K, D)`` what every robot sees."""
-        return functional.observe(self.instance(state.instance), state.team, self.layout, self.max_cycles)
+        seen = functional.observe(self.instance(state.instance), state.team, self.layout, self.max_cycles)
+        if not self._ray_noise:
+            return seen
+        rays, reach = self.layout.rays, self.layout.ray_range
+        true = seen[:, rays]
+        return seen.at[:, rays].set(jnp.where(true < reach, jnp.clip(true + state.ray_noise, 0, reach), true))
 
     def advance(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         """One step, without reset at the end of an episode.
@@ -167,7 +180,12 @@ class FunctionalEnv:
     def _begin(self, key: jax.Array) -> EnvState:
         number = jax.random.randint(key, (), 0, self._num_instances, jnp.int32)
         problem = self.instance(number)
-        return EnvState(functional.reset(problem, key), number, jnp.zeros(problem.num_robots, bool))
+        nobody = jnp.zeros(problem.num_robots, bool)
+        return EnvState(functional.reset(problem, key), number, nobody, self._draw_ray_noise(key))
+
+    def _draw_ray_noise(self, key: jax.Array) -> jax.Array:
+        shape = self.problem.num_robots, self.layout.num_rays * bool(self._ray_noise)
+        return jax.random.normal(jax.random.fold_in(key, 1), shape, jnp.float32) * self._ray_noise
 
     def _move(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         problem, team = self.instance(state.instance), state.team
@@ -187,10 +205,15 @@ class FunctionalEnv:
             success=everyone & ~touched.any(),
             step=step._replace(truncated=(after.steps >= self.max_cycles) & ~finished.all()),
         )
-        return EnvState(after, state.instance, touched), transition
+        return EnvState(after, state.instance, touched, self._draw_ray_noise(key)), transition
 
     def _finished(self, arrived: jax.Array) -> jax.Array:
         return arrived if self.problem.docks else arrived & arrived.all()
+
+
+def _joint_std(stds: Sequence[ArrayLike]) -> np.ndarray:
+    """The standard deviation of the sum of independent noises."""
+    return np.sqrt(np.sum([np.square(std) for std in stds], axis=0)).astype(np.float32)
 
 
 def _refuse(options: EnvOptions) -> None:

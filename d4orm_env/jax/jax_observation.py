@@ -17,6 +17,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.jax.jax_motion import OPS, Worlds
+from d4orm_env.jax.jax_rays import are_blocked, cast_rays
 
 T = TypeVar("T")
 
@@ -50,8 +51,9 @@ def observe_team(
         arrays.radius,
         arrays.limits[:, 0],
         arrays.limits[:, 1],
-        *_neighbors(arrays, place, velocity, layout.num_neighbors),
+        *_neighbors(arrays, place, velocity, layout),
         *_obstacles(arrays, place, layout.num_obstacles),
+        *cast_rays(arrays, place, heading, layout),
     ]
     low, high = layout.low, layout.high
     return jnp.stack([jnp.clip(column, low[i], high[i]) for i, column in enumerate(columns)], axis=1)
@@ -115,17 +117,21 @@ class _Nearest(NamedTuple):
         return [column for there, row in zip(presence, self.rows) for column in (there, *row)]
 
 
-def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, count: int) -> Columns:
+def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, layout: ObservationLayout) -> Columns:
     """``2 d + 2`` for each."""
     robots = np.arange(len(arrays.radius), dtype=np.int32)
 
     def look(other: tuple[Ints, Columns, Array | FloatArray]) -> tuple[Array, Columns]:
         number, motion, radius = other
         relative = [theirs - own for theirs, own in zip(motion, (*place, *velocity))]
-        key = jnp.where(robots == number, jnp.inf, _square(relative[: len(place)]))
+        gap2 = _square(relative[: len(place)])
+        hidden = (robots == number) | (gap2 > np.float32(layout.communication_range**2))
+        if layout.line_of_sight:
+            hidden |= are_blocked(arrays, place, relative[:2])
+        key = jnp.where(hidden, jnp.inf, gap2)
         return key, [*relative, jnp.broadcast_to(radius, key.shape)]
 
-    nearest = _Nearest.nothing(len(robots), count, 2 * len(place) + 1)
+    nearest = _Nearest.nothing(len(robots), layout.num_neighbors, 2 * len(place) + 1)
     return nearest.with_all(look, (robots, [*place, *velocity], arrays.radius)).columns()
 
 

@@ -47,12 +47,19 @@ class MarkLayer:
 
     def _draw_bodies(self, marks: DisturbanceEvents) -> None:
         d, bodies = self.problem.dimension, np.asarray(marks.bodies, np.float64)
-        self.bodies.set_verts(self.panel.outlines(bodies[-1, :, :d], bodies[-1, :, -1]))
-        # A body that has left comes again somewhere else.
-        turns = (bodies[1:, :, d : 2 * d] != bodies[:-1, :, d : 2 * d]).any(axis=-1)
+        now = bodies[-1, bodies[-1, :, -1] > 0]
+        self.bodies.set_verts(self.panel.outlines(now[:, :d], now[:, -1]))
+        # A body that has left comes again somewhere else, or is absent.
+        moved, speed = (np.linalg.norm(part, axis=-1) for part in (np.diff(bodies[..., :d], axis=0), bodies[..., d:-1]))
+        jumps = (moved > 2 * self.problem.dt * np.maximum(speed[1:], speed[:-1])) | (
+            np.diff(bodies[..., -1], axis=0) != 0
+        )
         flat = self.panel.flatten(bodies[..., :d])
-        parts = [np.split(flat[:, i], np.flatnonzero(turns[:, i]) + 1) for i in range(bodies.shape[1])]
-        self.paths.set_segments([path for paths in parts for path in paths if len(path) > 1])
+        flat[bodies[..., -1] == 0] = np.nan
+        parts = [np.split(flat[:, i], np.flatnonzero(jumps[:, i]) + 1) for i in range(bodies.shape[1])]
+        self.paths.set_segments(
+            [path for paths in parts for path in paths if len(path) > 1 and np.isfinite(path).all()]
+        )
 
     def _draw_pushes(self, pushed: Array, positions: Array, begin: int) -> None:
         given = np.asarray(pushed[begin:], np.float64)
@@ -83,6 +90,6 @@ def mark_legend(marks: DisturbanceEvents) -> list[Line2D]:
         (marks.pushed.any(), Line2D([], [], color=PUSH, linewidth=1.8, label="push")),
         (marks.stalled.any(), Line2D([], [], linestyle="none", marker="x", color=INK, ms=8, mew=1.8, label="stalls")),
         (marks.bodies.shape[1] > 0, Line2D([], [], linestyle="none", marker="o", mfc=BODY, mec=INK, ms=8,
-                                           label="intruder")),
+                                           label="moving obstacle")),
     ]  # fmt: skip
     return [line for shown, line in entries if shown]

@@ -1,8 +1,9 @@
 """Drawing primitives: a panel in data coordinates, the world, and the team on it.
 
 Everything is drawn to scale, as polygons and line segments, so that one code draws the plane, a view of space, and
-space seen from above. Robots are told apart by the Okabe-Ito palette, which colour-blind readers can tell apart too,
-and larger teams by a perceptually uniform map. Only matplotlib figures are used, never pyplot's global state.
+space seen from above. Robots are told apart by a list of colours that begins with Okabe and Ito's, which colour-blind
+readers can tell apart too, and goes on with what differs most in OKLab from all before it, from white and from the red
+of contacts. Only matplotlib figures are used, never pyplot's global state.
 """
 
 from __future__ import annotations
@@ -11,18 +12,22 @@ from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_rgb
+from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.problem import Problem
 
-OKABE_ITO = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#000000", "#F0E442")
+ROBOTS = (
+    "#0072B2", "#D98E00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#000000", "#8F8A00",
+    "#9600FF", "#00C300", "#690000", "#FF00E1", "#004B00", "#2D78FF", "#784B00", "#2D0087",
+    "#FF6978", "#96B487", "#780078", "#F078FF", "#003C78", "#A5785A", "#0000FF", "#963C5A",
+    "#2D7800", "#9678F0", "#FF0F87", "#694B96", "#B4A5E1", "#B43CC3", "#5A3CD2", "#D200FF",
+)  # fmt: skip
 OBSTACLE, OBSTACLE_EDGE, BOUND, SHADOW, INK = "#C9CDD2", "#6B7280", "#374151", "#D9DCE1", "#1F2937"
 PUSH, BODY = "#7C3AED", "#4B5563"
 CONTACT, MARGIN, CLEAR = "#D0021B", "#F7B6BD", (1.0, 1.0, 1.0, 0.0)
@@ -39,10 +44,11 @@ Array = np.ndarray
 
 
 def robot_colors(num_robots: int) -> Array:
-    """``(K, 3)`` RGB colours: Okabe-Ito for up to eight robots, a perceptually uniform map for more."""
-    if num_robots <= len(OKABE_ITO):
-        return np.array([to_rgb(color) for color in OKABE_ITO[:num_robots]])
-    return np.asarray(mpl.colormaps["viridis"](np.linspace(0, 0.92, num_robots)))[:, :3]
+    """``(K, 3)`` RGB colours, all at least 2.2 : 1 in contrast with white up to 32 robots; turns of the hue beyond."""
+    further = np.arange(max(num_robots - len(ROBOTS), 0))
+    # The golden section of a turn, and three lightnesses: neighbours differ in both.
+    hues = np.stack([0.618034 * further % 1, np.ones(len(further)), 0.45 + 0.2 * (further % 3)], axis=1)
+    return np.concatenate([[to_rgb(color) for color in ROBOTS[:num_robots]], hsv_to_rgb(hues)])
 
 
 def picture_palette(num_robots: int, size: int) -> Array:
@@ -230,7 +236,7 @@ class TeamLayer:
         self.drives = [k for k, model in enumerate(problem.team.robot_models) if model.heading_index is not None]
         span = float(np.max(panel.limits[1] - panel.limits[0]))
         self.mark_size = float(np.clip(self.radius.mean(), 0.015 * span, 0.03 * span))
-        few = problem.num_robots <= 16
+        few = problem.num_robots <= 32
         lines, trail = (1.1 if few else 0.7), (1.6 if few else 0.8)
         self.dark = self.colors[self.drives] @ [0.299, 0.587, 0.114] < 0.6
         # One transparent face each: mplot3d sorts edge colours by depth together with the faces, or not at all.

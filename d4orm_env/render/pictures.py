@@ -189,11 +189,13 @@ def _plot_on(axes: Axes, problem: Problem, trajectory: Trajectory | None) -> Axe
 
 def _number_robots(layer: TeamLayer, trajectory: Trajectory, points_per_metre: float) -> None:
     """Write the robots' numbers into their discs where they fit; a heading line needs the room itself."""
-    style: dict[str, object] = {"color": INK, "ha": "center", "va": "center_baseline", "zorder": 6.5}
+    style: dict[str, object] = {"ha": "center", "va": "center_baseline", "zorder": 6.5}
+    # Discs of robots that have arrived are pale.
+    white = (layer.colors @ [0.299, 0.587, 0.114] < 0.55) & ~np.asarray(trajectory.arrived[-1])
     for robot, (x, y) in enumerate(layer.panel.flatten(trajectory.positions[-1])):
         fontsize = min(9.0, points_per_metre * layer.radius[robot])
         if robot not in layer.drives and fontsize >= 4.5:
-            layer.panel.axes.text(x, y, str(robot), fontsize=fontsize, **style)
+            layer.panel.axes.text(x, y, str(robot), fontsize=fontsize, color="white" if white[robot] else INK, **style)
 
 
 def _outcome(problem: Problem, trajectory: Trajectory) -> str:

@@ -35,12 +35,18 @@ RIGID = ("holonomic2d", "differential_drive")
 """Models that are stepped as rigid bodies, where MuJoCo is installed."""
 
 
+RAYS = 32
+"""Rays of the range sensors of environments that are stepped beside those without."""
+
+
 def measure_env(
-    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()
+    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = (), num_rays: int = 0
 ) -> Measurement:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
-    env = navigation_v0.parallel_env(problem=boxed_problem(num_boxes, "near"), disturbances=disturbances)
-    return _rate("parallel_env", 1, num_boxes, disturbances, _measure_steps(settings, env, settings.env_steps))
+    problem = boxed_problem(num_boxes, "near")
+    env = navigation_v0.parallel_env(problem=problem, disturbances=disturbances, observed_rays=num_rays)
+    seconds = _measure_steps(settings, env, settings.env_steps)
+    return _rate("parallel_env" + _with_rays(num_rays), 1, num_boxes, disturbances, seconds)
 
 
 def measure_rigid(settings: BenchmarkSettings, model: str) -> Measurement:
@@ -72,12 +78,12 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
 
 
 def measure_worlds(
-    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = ()
+    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = (), num_rays: int = 0
 ) -> Measurement:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
     size, problem = settings.num_worlds, boxed_problem(num_boxes, "near")
-    seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances)
-    return _rate("make_vec", size, num_boxes, disturbances, seconds)
+    seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances, observed_rays=num_rays)
+    return _rate("make_vec" + _with_rays(num_rays), size, num_boxes, disturbances, seconds)
 
 
 def measure_rooms(settings: BenchmarkSettings) -> Measurement:
@@ -133,6 +139,10 @@ def measure_functional(settings: BenchmarkSettings) -> Measurement:
         lambda: jax.block_until_ready(steps(state, jax.random.key(1))), settings.repetitions, settings.time_limit
     )
     return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
+
+
+def _with_rays(num_rays: int) -> str:
+    return f", {num_rays} rays" if num_rays else ""
 
 
 def _rate(

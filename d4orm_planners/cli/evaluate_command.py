@@ -23,8 +23,8 @@ from d4orm_planners.cli.arguments import (
 from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit
 from d4orm_planners.cli.dataclass_options import takes
 from d4orm_planners.cli.progress import resumable, tell_results
-from d4orm_planners.evaluation.evaluate import run_study
-from d4orm_planners.evaluation.robustness import write_disturbances
+from d4orm_planners.evaluation.evaluate import run_shard, run_study
+from d4orm_planners.evaluation.robustness import tolerance_tables, write_disturbances
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import success_rates
 from d4orm_planners.evaluation.tables import PARQUET_HINT, markdown, write_results
@@ -88,6 +88,14 @@ class StudyOptions:
     ray: Annotated[
         str | None, typer.Option("--ray", help="Address of a Ray cluster to run on, or auto; needs ray.")
     ] = None
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            "--shard",
+            help="Run only a part, as 3/20, the third of twenty, in a job array; afterwards the same command without "
+            "it puts all together.",
+        ),
+    ] = None
     out: Out = Path("evaluation")
     quiet: Quiet = False
 
@@ -97,7 +105,32 @@ class StudyOptions:
         Raises:
             ValueError: For an option that makes no sense. Nothing has run then.
         """
-        study = Study(
+        study, kept = self._study(), f"the finished trials are kept in {self.out}"
+        with output_folder(self.out), resumable(kept, enabled=not self.quiet) as progress:
+            return run_study(
+                study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, ray=self.ray, progress=progress
+            )
+
+    def run_shard(self, shard: str) -> Path:
+        """Run that part of the trials, ``"3/20"``, and give the file that they are in.
+
+        Raises:
+            ValueError: As :meth:`run`, or if it is no part.
+        """
+        index, slash, count = shard.partition("/")
+        if not (slash and index.isdecimal() and count.isdecimal()):
+            raise ValueError(f"--shard {shard!r} is no part; give its number and how many there are, as 3/20")
+        if self.ray is not None:
+            raise ValueError("--shard and --ray both spread trials over machines; give one of them")
+        study, kept = self._study(), f"the finished trials are kept in {self.out}"
+        with output_folder(self.out), resumable(kept, enabled=not self.quiet) as progress:
+            return run_shard(
+                study, self.out, (int(index), int(count)), trial_timeout=self.trial_timeout, workers=self.workers,
+                progress=progress,
+            )  # fmt: skip
+
+    def _study(self) -> Study:
+        return Study(
             policies=_with_settings(_policies(self.policies or ["d4orm,go-to-goal"]), parse_settings(self.settings)),
             scenarios=names(self.scenario) or (),
             seeds=seed_list(self.seeds),
@@ -111,11 +144,6 @@ class StudyOptions:
             time_limit=self.time_limit,
             physics=self.physics,
         )
-        kept = f"the finished trials are kept in {self.out}"
-        with output_folder(self.out), resumable(kept, enabled=not self.quiet) as progress:
-            return run_study(
-                study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, ray=self.ray, progress=progress
-            )
 
 
 @takes(StudyOptions)
@@ -130,14 +158,19 @@ def evaluate(options: StudyOptions) -> None:
 def report(
     options: StudyOptions, write: Callable[[Path, list[SuccessRate]], list[Path]]
 ) -> tuple[list[SuccessRate], list[Path]]:
-    """Run the trials and write what they came to; the success rates and what was written."""
+    """Run the trials and write what they came to; the success rates and what was written. A shard ends here."""
+    if options.shard is not None:
+        path = options.run_shard(options.shard)
+        if not options.quiet:
+            typer.echo(f"wrote {path}; once all shards have ended, the same command without --shard puts them together")
+        raise typer.Exit
     groups = options.run()
     rates = success_rates(groups)
     written = write(options.out, rates)
     if options.disturb is not None:
         written += write_disturbances(options.out, groups)
     if not options.quiet:
-        tell_results(markdown(rates), written)
+        tell_results(markdown(rates) if options.disturb is None else tolerance_tables(rates), written)
     return rates, written
 
 

@@ -190,7 +190,7 @@ def _evade() -> None:
 
 def _step_environments() -> None:
     disturbances = [Dropout(0.5), StateNoise(0.1), Intruder()]
-    for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances}):
+    for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances, "observed_rays": 4}):
         env = navigation_v0.parallel_env(problem=_smallest_problem(TEAMS[0]), **arguments)
         env.reset(seed=0)
         zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)

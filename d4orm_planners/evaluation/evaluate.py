@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -23,6 +23,8 @@ from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_r
 from d4orm_planners.evaluation.tables import PARQUET_HINT, write_results
 from d4orm_planners.evaluation.trials import Job
 
+SHARD_STORES = "trials-*.sqlite"
+"""Stores of shards in a folder."""
 Progress = Callable[[str, int, int], object]
 
 
@@ -122,6 +124,8 @@ def run_study(
 
     For the arguments and errors see :func:`evaluate`.
 
+    Trials that shards have stored in the folder, see :func:`run_shard`, are taken into the store first.
+
     Returns:
         Trials, one per seed, for every scenario, model, team size, policy and condition, in that order.
     """
@@ -132,7 +136,9 @@ def run_study(
     groups = study.groups()
     Path(out).mkdir(parents=True, exist_ok=True)
     store = TrialStore(Path(out) / STORE)
-    missing, done, total = _missing([job for group in groups for job in group], store)
+    for path in sorted(Path(out).glob(SHARD_STORES)):
+        store.add(*TrialStore(path, alone=True).trials())
+    missing, done, total = _missing([job for group in groups for job in group], store.finished())
     running = _run(missing, workers, ray, trial_timeout)
     _store(running, store, done, total, progress or (lambda what, done, total: None))
     stored = {trial.key: trial for trial in store.trials()}
@@ -145,9 +151,49 @@ def run_study(
     ]
 
 
-def _missing(jobs: Sequence[Job], store: TrialStore) -> tuple[list[Job], int, int]:
+def run_shard(
+    study: Study,
+    out: str | os.PathLike[str],
+    shard: tuple[int, int],
+    *,
+    trial_timeout: float | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Run one of several parts of a study, as a job of an array, and store its trials in a file of its own.
+
+    Shards share nothing, so that they run at the same time on any file system; once all have ended :func:`run_study`
+    of the same study and folder puts them together. A shard that was stopped goes on where it was.
+
+    Args:
+        study: The study.
+        out: Folder to write to; made if it does not exist.
+        shard: Number of the part, from 1 on, and how many there are.
+        trial_timeout: As for :func:`evaluate`, like all others.
+        workers: Processes.
+        progress: Called as the trials are done.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: If there is no such part, or as :func:`evaluate`.
+        OSError: If the folder or the file cannot be written to, or workers do not start.
+    """
+    count = whole_number(shard[1], "number of shards", 1)
+    index = whole_number(shard[0], "shard", 1, count)
+    jobs = [job for group in study.groups() for job in group][index - 1 :: count]
+    Path(out).mkdir(parents=True, exist_ok=True)
+    path = Path(out) / SHARD_STORES.replace("*", f"{index}-of-{count}")
+    store = TrialStore(path, alone=True)
+    missing, done, total = _missing(jobs, store.finished())
+    running = _run(missing, workers, None, trial_timeout)
+    _store(running, store, done, total, progress or (lambda what, done, total: None))
+    return path
+
+
+def _missing(jobs: Sequence[Job], finished: Set[TrialKey]) -> tuple[list[Job], int, int]:
     """Return the jobs that are left, the number of trials done, and the number in all."""
-    finished = store.finished()
     wanted: set[TrialKey] = set()
     missing = []
     for job in jobs:

@@ -202,20 +202,21 @@ class TrialStore:
     Args:
         path: The file.
         read_only: Leave it as it is, which must be there then; its folder need not be writable.
+        alone: Nobody else opens it, so that no locks are taken, which some network file systems do not have.
 
     Raises:
         ValueError: If the file is something else, or of another version.
         OSError: If it cannot be opened or written to.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False, alone: bool = False) -> None:
         self.path = Path(path)
-        self._read_only = read_only
+        self._read_only, self._alone = read_only, alone
         with self._connection() as connection:
             if not read_only:
                 self._make(connection)
             self._check(connection)
-            if not read_only:
+            if not (read_only or alone):
                 _use_wal(connection)
 
     @classmethod
@@ -298,6 +299,8 @@ class TrialStore:
         if self._read_only and not os.access(self.path.parent, os.W_OK) and not (log.exists() and log.stat().st_size):
             # SQLite cannot make the files that it keeps beside the store, and no writer has left anything in them.
             name += "?mode=ro&immutable=1"
+        elif self._alone:
+            name += "?nolock=1"
         return sqlite3.connect(name, uri=True, timeout=TIMEOUT, isolation_level=None)
 
     def _make(self, connection: sqlite3.Connection) -> None:

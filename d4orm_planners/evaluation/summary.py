@@ -15,7 +15,7 @@ from d4orm_planners.evaluation.store import Trial
 stats: Any = LazyModule("scipy.stats")
 
 THRESHOLD = 0.9
-"""Success rate below which a policy is said to tolerate a disturbance no longer."""
+"""Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
 
 
 class TrialGroup(NamedTuple):
@@ -48,6 +48,7 @@ class Compared:
         disturbance: Further disturbance, such as ``"push.speed"``; empty for nothing.
         level: Its level.
         physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
+        undisturbed: True if no disturbance changed anything, as at level zero.
         trials: Trials, those with an error included.
         successes: Those that succeeded.
         lower: Lower end of the 95% confidence interval of the success rate (Wilson).
@@ -65,6 +66,7 @@ class Compared:
     disturbance: str = ""
     level: float | None = None
     physics: str = "model"
+    undisturbed: bool = False
     trials: int
     successes: int
     lower: float
@@ -85,6 +87,7 @@ class Compared:
         return Compared(
             label=label,
             **{name: getattr(first, name) for name in same},
+            undisturbed=all(trial.disturbances == "[]" for trial in trials),
             trials=len(trials),
             successes=successes,
             lower=lower,
@@ -271,7 +274,7 @@ def success_by(trials: Iterable[Trial], deadline: float) -> SuccessWithin:
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """At which level of a disturbance the success of a policy falls below a threshold.
+    """At which level of a disturbance the success of a policy falls below a share of what it is undisturbed.
 
     Attributes:
         label: Name of the policy with its settings.
@@ -282,7 +285,8 @@ class Tolerance:
         disturbance: Disturbance, such as ``"push.speed"``.
         stands: The last level before that, in the order in which they were given; ``None`` if it fails at the first.
         fails: The first level with a success rate below the threshold; ``None`` if it tolerates all.
-        threshold: The threshold.
+        undisturbed: Success rate at the first level, which is the undisturbed one unless that is left out.
+        threshold: That share of it.
     """
 
     label: str
@@ -293,30 +297,36 @@ class Tolerance:
     disturbance: str
     stands: float | None
     fails: float | None
+    undisturbed: float
     threshold: float
 
     @property
     def text(self) -> str:
-        """Return the level as text: ``"4"``, or ``"over 4"`` where it tolerates the last level, 4."""
+        """Return the level as text: ``"4"``, ``"over 4"`` where it tolerates the last level, 4, or ``"-"`` if it never
+        succeeds.
+        """
+        if self.undisturbed == 0:
+            return "-"
         return f"{self.fails:g}" if self.fails is not None else f"over {self.stands:g}"
 
 
-def tolerances(rates: Iterable[SuccessRate], threshold: float = THRESHOLD) -> list[Tolerance]:
+def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
     """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
 
     Args:
         rates: Those of one policy and disturbance from harmless to bad; those without a disturbance are passed over.
-        threshold: Success rate that is asked for.
+        share: Share of the success rate at the first level that is asked for.
     """
     lines: dict[tuple[object, ...], list[SuccessRate]] = {}
     for rate in rates:
         if rate.disturbance:
             key = (rate.label, rate.scenario, rate.num_robots, rate.model, rate.control_noise_std, rate.disturbance)
             lines.setdefault(key, []).append(rate)
-    return [_tolerance(line, threshold) for line in lines.values()]
+    return [_tolerance(line, share) for line in lines.values()]
 
 
-def _tolerance(line: Sequence[SuccessRate], threshold: float) -> Tolerance:
+def _tolerance(line: Sequence[SuccessRate], share: float) -> Tolerance:
+    threshold = share * line[0].rate
     failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
     first = line[0]
     return Tolerance(
@@ -328,5 +338,6 @@ def _tolerance(line: Sequence[SuccessRate], threshold: float) -> Tolerance:
         disturbance=first.disturbance,
         stands=line[failing - 1].level if failing else None,
         fails=line[failing].level if failing < len(line) else None,
+        undisturbed=first.rate,
         threshold=threshold,
     )

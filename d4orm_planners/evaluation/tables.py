@@ -161,15 +161,19 @@ def rate_table(title: str, rates: Sequence[SuccessRate]) -> str:
     """A table of rates, with a column more where something but noise went wrong."""
     disturbed = any(rate.disturbance for rate in rates)
     header = (*HEADER[:2], "disturbance", *HEADER[2:]) if disturbed else HEADER
-    return table(title, header, [_cells(rate, disturbed) for rate in rates])
+    # The undisturbed trials are the same for all disturbances.
+    once = {(rate.label, rate.control_noise_std) if rate.undisturbed else number: rate
+            for number, rate in reversed(list(enumerate(rates)))}  # fmt: skip
+    return table(title, header, [_cells(rate, disturbed) for rate in reversed(once.values())])
 
 
 def _cells(rate: SuccessRate, disturbed: bool) -> tuple[str, ...]:
     level = "" if rate.level is None else f" {rate.level:g}"
+    what = "-" if rate.undisturbed else f"{rate.disturbance}{level}" or "-"
     return (
         rate.label,
         f"{rate.control_noise_std:g}",
-        *[f"{rate.disturbance}{level}" or "-"] * disturbed,
+        *[what] * disturbed,
         f"{rate.successes} of {rate.trials} ({rate.rate:.0%})",
         f"{rate.lower:.0%} to {rate.upper:.0%}",
         *(str(count) for count in (rate.verified, rate.contacts, rate.late, rate.errors)),

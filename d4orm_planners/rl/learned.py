@@ -107,6 +107,8 @@ class LearnedPolicy(Policy):
         if (path := self._file()) != self._actor.path:
             self._use(path)
         agent, self._env = env.possible_agents[0], env
+        if isinstance(self._actor, _NetworkActor) and env.unwrapped.options.observed_rays:
+            raise ValueError(f"the policy in {self._actor.path.name} reads no rays; leave observed_rays out")
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:

@@ -85,6 +85,8 @@ class RobotVecEnv(VecEnv):
                 "one model, so give model="
             )
         layout = self._env.layout
+        if layout.num_rays:
+            raise ValueError("networks of d4orm train read no rays; leave observed_rays out, or use another library's")
         slices = ObservationSlices(layout.dimension, layout.num_neighbors, layout.num_obstacles)
         self.features = Features.of(slices, problem.team.models[0])
         self.shortest_paths = shortest_paths

@@ -74,7 +74,7 @@ def test_every_kind_is_tested() -> None:
 
 @NAMES
 def test_pettingzoos_suite(name: str) -> None:
-    case = {"problem": EARLY, "disturbances": [CASES[name]]}
+    case = {"problem": EARLY, "observed_rays": 3, "disturbances": [CASES[name]]}
     parallel_api_test(navigation_v0.parallel_env(**case), num_cycles=60)
     parallel_seed_test(partial(navigation_v0.parallel_env, **case), num_cycles=30)
     api_test(navigation_v0.env(**case), num_cycles=40)
@@ -84,7 +84,8 @@ def test_pettingzoos_suite(name: str) -> None:
 
 @NAMES
 def test_gymnasiums_suite(name: str) -> None:
-    env = gymnasium.make("d4orm/Navigation-v0", problem=EARLY, disturbances=[CASES[name]]).unwrapped
+    case = {"problem": EARLY, "observed_rays": 3, "disturbances": [CASES[name]]}
+    env = gymnasium.make("d4orm/Navigation-v0", **case).unwrapped
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*Box action space|.*For Box")
         check_env(env, skip_render_check=True)
@@ -97,7 +98,7 @@ def joint_worlds(count: int, case: dict[str, Any]) -> list[JointNavigationEnv]:
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=lambda mode: mode.value)
 @pytest.mark.parametrize("disturbances", [*([case] for case in CASES.values()), TOGETHER], ids=[*CASES, "together"])
 def test_batched_worlds_are_the_joint_env_to_the_bit(disturbances: list[Any], mode: AutoresetMode) -> None:
-    case = {"scenario": "random", "num_robots": 4, "max_cycles": 14, "disturbances": disturbances}
+    case = {"scenario": "random", "num_robots": 4, "max_cycles": 14, "disturbances": disturbances, "observed_rays": 3}
     batch, singles, random = NavigationVectorEnv(3, autoreset_mode=mode, **case), joint_worlds(3, case), None
     random = np.random.default_rng(0)
     observations, infos = batch.reset(seed=5)
@@ -134,8 +135,8 @@ def test_batched_worlds_are_the_joint_env_to_the_bit(disturbances: list[Any], mo
 
 @NAMES
 def test_the_parallel_env_is_the_joint_env(name: str) -> None:
-    case = {"scenario": "circle", "num_robots": 3, "max_cycles": 12, "disturbances": [CASES[name]]}
-    parallel, joint = navigation_v0.parallel_env(**case), JointNavigationEnv(**case)
+    case = {"scenario": "circle", "max_cycles": 12, "observed_rays": 3, "disturbances": [CASES[name]]}
+    parallel, joint = navigation_v0.parallel_env(num_robots=3, **case), JointNavigationEnv(num_robots=3, **case)
     seen, _ = parallel.reset(seed=2)
     np.testing.assert_array_equal(np.concatenate(list(seen.values())), joint.reset(seed=2)[0])
     while len(parallel.agents) == 3:
@@ -153,7 +154,8 @@ def test_every_model_takes_them(model: str) -> None:
     for name, one in CASES.items():
         if (name == "drag" and not inert) or (name == "state_noise" and not inert):
             continue
-        env = navigation_v0.parallel_env("circle", 3, model=model, max_cycles=25, disturbances=[one])
+        case = {"model": model, "max_cycles": 25, "observed_rays": 3, "disturbances": [one]}
+        env = navigation_v0.parallel_env("circle", 3, **case)
         env.reset(seed=0)
         while env.agents:
             seen, *_ = env.step(sampled_actions(env))
@@ -749,7 +751,7 @@ def test_pictures_show_where_it_was_disturbed(scenario: str, tmp_path: Any) -> N
     problem, trajectory, marks = episode.problem, episode.trajectory, episode.marks
     figure = plot_trajectory(problem, trajectory, marks=marks)
     told = {text.get_text() for text in figure.legends[0].get_texts()}
-    assert told >= {"push", "intruder"}
+    assert told >= {"push", "moving obstacle"}
     assert ("stalls" in told) == marks.stalled.any()
     assert not {text.get_text() for text in plot_trajectory(problem, trajectory).legends[0].get_texts()} & {"push"}
     save_animation(problem, trajectory, tmp_path / "plain.gif", max_frames=4)

@@ -185,7 +185,7 @@ def test_noise_is_drawn_from_the_key() -> None:
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        ({"disturbances": [Delay(2)]}, "disturbances other than ControlNoise are no pure functions"),
+        ({"disturbances": [Delay(2)]}, "disturbances other than ControlNoise and RayNoise are no pure functions"),
         ({"lifelong": True}, "lifelong is not possible"),
         ({"render_mode": "human"}, "render_mode is not possible"),
         ({"observed_path": True}, "observed_path is not possible"),

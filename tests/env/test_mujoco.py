@@ -250,7 +250,9 @@ def test_intruders_push_whoever_is_in_their_way() -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_disturbance_works_there(name: str) -> None:
-    env = mujoco.parallel_env(problem=line_problem([2.0] * 2, "holonomic2d"), disturbances=[CASES[name]])
+    env = mujoco.parallel_env(
+        problem=line_problem([2.0] * 2, "holonomic2d"), observed_rays=3, disturbances=[CASES[name]]
+    )
     episode = run_episode(env, "go-to-goal", seed=0)
     assert np.isfinite(episode.trajectory.states).all()
 

@@ -295,7 +295,15 @@ def test_the_plain_function_and_the_compiled_one_agree() -> None:
     heading = np.array([[0, 0], [math.cos(0.5), math.sin(0.5)], [0, 0]], np.float32)
     plain = np.empty_like(compiled)
     sensed = Sensed(
-        position, velocity, np.asarray(problem.team.radius), heading, np.zeros(3), np.empty((3, 2)), np.empty((3, 2))
+        position,
+        velocity,
+        np.asarray(problem.team.radius),
+        heading,
+        np.zeros(3),
+        np.zeros(3, bool),
+        np.empty((5, 1)),
+        np.empty((3, 2)),
+        np.empty((3, 2)),
     )
     for k in range(3):
         observe_robot(k, problem.arrays, problem.goal, sensed, 0.5, plain[k])

@@ -156,6 +156,10 @@ def test_colours_are_distinct_for_every_team_size() -> None:
         colors = robot_colors(num_robots)
         assert colors.shape == (num_robots, 3)
         assert len({tuple(color) for color in colors}) == num_robots
+    lines = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)[:32]
+    assert (1.05 / (lines @ [0.2126, 0.7152, 0.0722] + 0.05) > 2.2).all(), "contrast with white"
+    apart = np.linalg.norm(colors[:16, None] - colors[:16], axis=-1) + np.eye(16)
+    assert apart.min() > 0.15
 
 
 def test_view_holds_every_robot_and_a_near_bound_but_not_a_far_one() -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,13 @@ from d4orm_env import mujoco, navigation_v0
 from d4orm_env.disturbances import Delay, Intruder, LimitMismatch, Push, Stall
 from d4orm_planners import evaluate, run_episode
 from d4orm_planners.evaluation.comparison import compare_pairs
-from d4orm_planners.evaluation.evaluate import run_study
+from d4orm_planners.evaluation.evaluate import run_shard, run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
 from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.evaluation.study import Study, conditions
 from d4orm_planners.evaluation.summary import TrialGroup, success_rates, tolerances
+from d4orm_planners.evaluation.tables import markdown
 from d4orm_planners.evaluation.trials import Condition
 
 TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
@@ -163,14 +165,15 @@ def group(label: str, level: float | None, wins: str, disturbance: str = "delay"
     return TrialGroup(label, rows, disturbance, level)
 
 
-def test_the_level_at_which_success_falls_below_90_percent() -> None:
-    good, bad = "+" * 9 + "-", "+" * 8 + "--"
+def test_the_level_at_which_success_falls_below_90_percent_of_the_undisturbed() -> None:
+    good, bad = "+" * 10, "+" * 8 + "--"
     rates = success_rates(
         [group("a", 0, good), group("a", 1, good), group("a", 2, bad), group("a", 4, good), group("b", 0, good),
-         group("b", 1, good), group("c", 0, bad), group("c", 1, bad), group("c", None, bad, "")]
+         group("b", 1, good), group("c", 0, bad), group("c", 1, bad), group("c", None, bad, ""),
+         group("d", 0, "-" * 10), group("d", 1, "-" * 10), group("e", 0, bad), group("e", 1, "+" * 7 + "-" * 3)]
     )  # fmt: skip
     assert [(one.label, one.stands, one.fails, one.text) for one in tolerances(rates)] == [
-        ("a", 1, 2, "2"), ("b", 1, None, "over 1"), ("c", None, 0, "0")
+        ("a", 1, 2, "2"), ("b", 1, None, "over 1"), ("c", 1, None, "over 1"), ("d", 1, None, "-"), ("e", 0, 1, "1")
     ]  # fmt: skip
 
 
@@ -190,23 +193,32 @@ def test_pairs_are_compared_by_seed() -> None:
 
 def test_the_files_of_a_study(tmp_path: Path) -> None:
     groups = [
-        group(label, level, wins, name)
+        group(label, level, wins, name, disturbances=kinds)
         for label in ("a", "b")
         for name in ("delay", "push.speed", "own thing")
-        for level, wins in ((0, "+++"), (1, "++-"))
+        for level, wins, kinds in ((0, "+++", "[]"), (1, "++-", f'[["{name}", {{}}]]'))
     ]
     written = write_disturbances(tmp_path, groups)
     assert [path.name for path in written] == [
-        "disturbances.md", "tolerance.csv", "tolerance.png", "pairs.csv", "disturbance-delay.png",
-        "disturbance-push.speed.png", "disturbance-own_thing.png",
+        "disturbances.md", "tolerance.csv", "pairs.csv", "disturbances.pdf", "disturbances.svg", "disturbances.png",
+        "disturbance_map.pdf", "disturbance_map.svg", "disturbance_map.png",
     ]  # fmt: skip
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written if path.suffix == ".png")
+    begins = {".png": b"\x89PNG", ".pdf": b"%PDF", ".svg": b"<?xml"}
+    assert all(path.read_bytes().startswith(begins.get(path.suffix, b"")) for path in written)
     with (tmp_path / "tolerance.csv").open(newline="") as file:
         assert [(row["label"], row["disturbance"], row["fails"]) for row in csv.DictReader(file)][:2] == [
             ("a", "delay", "1"), ("a", "push.speed", "1")
         ]  # fmt: skip
-    assert "| a | 1 | 1 | 1 |" in (tmp_path / "disturbances.md").read_text()
-    assert len(write_disturbances(tmp_path, [one for one in groups if one.label == "a"])) == 6
+    text = (tmp_path / "disturbances.md").read_text()
+    assert "| undisturbed success | 100% | 100% |" in text
+    assert "| speed of pushes \\[m/s\\] | 1 | 1 |" in text
+    assert "| own thing | 1 | 1 |" in text
+    # The undisturbed trials have one row for each policy.
+    assert markdown(success_rates(groups)).count("| - | 3 of 3 (100%)") == 2
+    assert len(write_disturbances(tmp_path, [one for one in groups if one.label == "a"])) == 8
+    again = [replace(trial, scenario="swap") for trial in groups[0].trials]
+    names = {path.name for path in write_disturbances(tmp_path, [*groups, groups[0]._replace(trials=again)])}
+    assert {"disturbances-1.pdf", "disturbances-2.pdf"} < names
 
 
 def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:
@@ -214,10 +226,11 @@ def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:
     status, _, error = d4orm("evaluate", *options, "--disturb", "delay=0,2", "--disturb", "push.speed=0.3")
     assert (status, error) == (0, "")
     assert len(TrialStore.existing(tmp_path / "evaluation").trials()) == 2 * 2 * 3
-    assert (tmp_path / "evaluation" / "disturbance-delay.png").exists()
+    assert (tmp_path / "evaluation" / "disturbances.pdf").exists()
     status, out, _ = d4orm("robustness", *options[:-1], "--out", "evaluation", "--disturb", "delay=0,2,[1, 3]")
     assert status == 0
-    assert "delay 2" in out
+    assert "control delay" in out
+    assert "delay 2" in (tmp_path / "evaluation" / "robustness.md").read_text()
     assert (tmp_path / "evaluation" / "robustness.csv").exists()
     assert len(TrialStore.existing(tmp_path / "evaluation").trials()) == 2 * 2 * 4
 
@@ -225,10 +238,11 @@ def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:
 def test_robustness_is_a_study_of_all(d4orm: Call, tmp_path: Path) -> None:
     status, out, _ = d4orm("robustness", "--policy", "go-to-goal", "-k", "2", "--seeds", "1", "--workers", "1")
     assert status == 0
-    assert "limit_mismatch 0.7" in out
+    assert "true over assumed limits" in out
+    assert len(out.splitlines()) < 40
     stored = TrialStore.existing(tmp_path / "robustness" / STORE).trials()
     assert len({row.disturbances for row in stored}) == len(stored) > 30
-    assert (tmp_path / "robustness" / "tolerance.png").exists()
+    assert (tmp_path / "robustness" / "disturbance_map.pdf").exists()
 
 
 def test_an_episode_with_disturbances(d4orm: Call) -> None:
@@ -263,3 +277,37 @@ def test_limits_fall_from_left_to_right() -> None:
     assert [one.level for one in found] == [1, 0.8]
     assert found[0].text == "[]"
     assert found[1].disturbances == (LimitMismatch(0.8),)
+
+
+def test_shards_of_a_job_array_come_to_the_same(tmp_path: Path) -> None:
+    study = Study(policies=["go-to-goal", "random"], num_robots=2, seeds=range(3), disturbances={"delay": [0, 1]})
+    for index in (1, 2):
+        path = run_shard(study, tmp_path / "parts", (index, 2), workers=1)
+        assert path.name == f"trials-{index}-of-2.sqlite"
+    assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == [
+        "trials-1-of-2.sqlite", "trials-2-of-2.sqlite"
+    ]  # fmt: skip
+    ran: list[int] = []
+    together = run_study(study, tmp_path / "parts", workers=1, progress=lambda what, done, total: ran.append(done))
+    assert ran == [12], "nothing was left to run"
+    alone = run_study(study, tmp_path / "alone", workers=1)
+    assert [[one.success for one in group.trials] for group in together] == [
+        [one.success for one in group.trials] for group in alone
+    ]
+    assert [[one.key for one in group.trials] for group in together] == [
+        [one.key for one in group.trials] for group in alone
+    ]
+
+
+def test_shards_on_the_command_line(d4orm: Call, tmp_path: Path) -> None:
+    options = ("evaluate", "--policy", "go-to-goal", "-k", "2", "--seeds", "3", "--workers", "1")
+    status, out, _ = d4orm(*options, "--shard", "2/2")
+    assert (status, "trials-2-of-2.sqlite" in out) == (0, True)
+    assert not (tmp_path / "evaluation" / STORE).exists()
+    assert d4orm(*options)[0] == 0
+    assert len(TrialStore.existing(tmp_path / "evaluation").trials()) == 3
+    for wrong, message in (("3", "is no part"), ("3/2", "shard is 3; it must be at most 2"), ("0/2", "shard is 0")):
+        status, _, error = d4orm(*options, "--shard", wrong)
+        assert status != 0
+        assert message in error
+    assert "give one of them" in d4orm(*options, "--shard", "1/2", "--ray", "auto")[2]

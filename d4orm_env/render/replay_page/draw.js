@@ -182,13 +182,42 @@ class Painter {
       if (part.radius) this.disc(part.centre, part.radius, theme.obstacle, theme.edge);
       else this.fill(part.corners, theme.obstacle, theme.edge);
     }
-    pen.globalAlpha = 0.25;
+    pen.globalAlpha = 0.4;
+    pen.lineWidth = scene.robots > 32 ? 1.2 : 2;
     for (let robot = 0; ways && robot < scene.robots; robot++) {
       pen.strokeStyle = this.colors[robot];
       this.trace(this.way(robot, 0, scene.moments - 1));
       pen.stroke();
     }
     pen.globalAlpha = 1;
+    this.paintScale();
+  }
+
+  /** A bar of a round number of metres, about a sixth as long as the canvas is wide. */
+  paintScale() {
+    const { pen, theme, view } = this, most = this.canvas.getBoundingClientRect().width / 6 / view.scale;
+    const unit = 10 ** Math.floor(Math.log10(most)), length = unit * [5, 2, 1].find((factor) => factor * unit <= most);
+    const [x, y] = [10, this.canvas.getBoundingClientRect().height - 10], end = x + length * view.scale;
+    pen.lineWidth = 1.5;
+    pen.strokeStyle = pen.fillStyle = theme.ink;
+    pen.beginPath();
+    pen.moveTo(x, y - 4); pen.lineTo(x, y); pen.lineTo(end, y); pen.lineTo(end, y - 4);
+    pen.stroke();
+    pen.font = "11px sans-serif";
+    pen.fillText(`${Number(length.toPrecision(1))} m`, x + 4, y - 4);
+  }
+
+  /** A robot's number in its body, where that is large enough. */
+  number(robot, place) {
+    const { pen, scene, view } = this, size = Math.min(0.95 * scene.radius[robot] * view.scale, 16);
+    if (size < 6) return;
+    pen.font = `${size}px sans-serif`;
+    pen.textAlign = "center";
+    pen.textBaseline = "middle";
+    pen.fillStyle = lightness(this.colors[robot]) > 0.6 ? "#1F2937" : "#FFFFFF";
+    pen.fillText(String(robot), view.x(place), view.y(place));
+    pen.textAlign = "start";
+    pen.textBaseline = "alphabetic";
   }
 
   way(robot, first, last) {
@@ -259,9 +288,11 @@ class Painter {
         const angle = scene.between(moment, robot, index, true), r = scene.radius[robot];
         pen.lineWidth = 2;
         pen.strokeStyle = theme.page;
-        this.trace([place, [place[0] + r * Math.cos(angle), place[1] + r * Math.sin(angle), place[2]]]);
+        const ahead = (share) => [place[0] + share * r * Math.cos(angle), place[1] + share * r * Math.sin(angle), place[2]];
+        this.trace([ahead(0.55), ahead(1)]);
         pen.stroke();
       }
+      this.number(robot, place);
     }
   }
 

@@ -71,3 +71,9 @@ function readable(color, dark) {
   const share = dark && light < 0.45 ? 0.6 - light : 0;
   return `rgb(${rgb.map((part) => Math.round(part + share * (255 - part))).join()})`;
 }
+
+/** How light a colour is, `rgb(r,g,b)`, from 0 to 1. */
+function lightness(color) {
+  const [r, g, b] = color.match(/\d+/g).map(Number);
+  return (0.299 * r + 0.587 * g + 0.114 * b) / 255;
+}

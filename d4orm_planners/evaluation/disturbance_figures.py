@@ -1,0 +1,183 @@
+"""Figures of success under disturbances that stand in a paper of two columns: small multiples, and a heat map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.lazy import LazyModule
+from d4orm_env.disturbances.disturbance_registry import find_level, name_of_kind
+from d4orm_env.render.style import own_style
+from d4orm_planners.evaluation.summary import SuccessRate
+from d4orm_planners.evaluation.tables import target
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+figures: Any = LazyModule("matplotlib.figure")
+
+KINDS = ("pdf", "svg", "png")
+"""Files of a figure."""
+COLUMN, PAGE = 3.5, 7.16
+"""Width of a column and of a page of two [inches]."""
+
+_STYLE = {
+    "text.parse_math": False,  # no name is a formula
+    "font.size": 7,
+    "axes.titlesize": 7,
+    "axes.linewidth": 0.6,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "d4orm",
+}
+_UNDATED = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+_MARKERS = "osD^v<>P"
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00", "#7C3AED")
+
+
+class Quantity(NamedTuple):
+    """What is varied of a disturbance, in plain words, and its unit."""
+
+    name: str
+    unit: str
+
+    @property
+    def text(self) -> str:
+        """Both on one line."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+_QUANTITIES = {
+    "control_noise.std": Quantity("control noise", "std, control units"),
+    "correlated_noise.std": Quantity("correlated control noise", "std, control units"),
+    "bias.std": Quantity("control bias", "std, control units"),
+    "delay.steps": Quantity("control delay", "time steps"),
+    "lag.time_constant": Quantity("actuator lag", "s"),
+    "dropout.probability": Quantity("lost commands", "probability"),
+    "quantisation.step": Quantity("control quantisation", "control units"),
+    "gain.std": Quantity("actuator gain error", "std"),
+    "state_noise.position_std": Quantity("position noise", "std, m"),
+    "state_noise.velocity_std": Quantity("velocity noise", "std, m/s"),
+    "state_noise.heading_std": Quantity("heading noise", "std, rad"),
+    "state_delay.steps": Quantity("state delay", "time steps"),
+    "occlusion.range": Quantity("sensing range", "m"),
+    "ray_noise.std": Quantity("range sensor noise", "std, m"),
+    "push.rate": Quantity("pushes", "per robot and s"),
+    "push.speed": Quantity("speed of pushes", "m/s"),
+    "stall.probability": Quantity("stalled robots", "probability"),
+    "stall.duration": Quantity("duration of stalls", "s"),
+    "intruder.count": Quantity("intruders", "number"),
+    "intruder.speed": Quantity("speed of intruders", "m/s"),
+    "intruder.radius": Quantity("radius of intruders", "m"),
+    "drag.coefficient": Quantity("drag", "1/s"),
+    "limit_mismatch.factor": Quantity("true over assumed limits", ""),
+}
+
+
+def quantity_of(disturbance: str) -> Quantity:
+    """The quantity that a name such as ``"push.speed"`` stands for; any other label itself."""
+    try:
+        level = find_level(disturbance)
+    except (ValueError, ImportError):
+        return Quantity(disturbance, "")
+    fixed = ", ".join(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
+                      for name, value in level.fixed.items())  # fmt: skip
+    kind = name_of_kind(level.kind)
+    known = _QUANTITIES.get(f"{kind}.{level.attribute}")
+    quantity = known or Quantity(f"{kind}: {level.attribute}".replace("_", " "), "")
+    return quantity._replace(name=f"{quantity.name} ({fixed})") if fixed else quantity
+
+
+def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
+    """Write a figure as PDF, SVG and PNG. The same figure gives the same bytes."""
+    paths = [folder / f"{name}.{kind}" for kind in KINDS]
+    for path, kind in zip(paths, KINDS):
+        with target(path) as temporary, own_style(_STYLE):
+            figure.savefig(temporary, format=kind, dpi=300, metadata=_UNDATED.get(kind))
+    return paths
+
+
+@own_style(_STYLE)
+def draw_lines(title: str, rates: Sequence[SuccessRate]) -> Figure:
+    """Success against the level of every disturbance: a panel each, a line with confidence intervals per policy."""
+    names, labels = (list(dict.fromkeys(all_of)) for all_of in zip(*((one.disturbance, one.label) for one in rates)))
+    across = min(4, len(names))
+    rows = -(-len(names) // across)
+    figure: Figure = figures.Figure(figsize=(PAGE * across / 4 if across > 1 else COLUMN, 0.45 + 1.45 * rows))
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots(rows, across, squeeze=False, sharey=True).ravel()
+    for number, (ax, name) in enumerate(zip(axes, names)):
+        _draw_panel(ax, name, labels, [rate for rate in rates if rate.disturbance == name])
+        ax.set_ylabel("success rate" if number % across == 0 else "")
+    for ax in axes[len(names) :]:
+        ax.set_visible(False)
+    figure.suptitle(title, fontsize=7)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(4, len(labels)), frameon=False
+    )
+    return figure
+
+
+def _draw_panel(ax: Axes, name: str, labels: Sequence[str], rates: Sequence[SuccessRate]) -> None:
+    levels = list(dict.fromkeys(rate.level for rate in rates))
+    for number, label in enumerate(labels):
+        line = [rate for rate in rates if rate.label == label]
+        # Beside each other, so that no interval hides another.
+        shift = 0.12 * (number - (len(labels) - 1) / 2)
+        x, y = [levels.index(rate.level) + shift for rate in line], np.array([rate.rate for rate in line])
+        ends = np.abs(np.array([(rate.lower, rate.upper) for rate in line]).T - y)
+        color, marker = _COLORS[number % len(_COLORS)], _MARKERS[number % len(_MARKERS)]
+        ax.errorbar(x, y, ends, color=color, marker=marker, markersize=3, linewidth=1, elinewidth=0.6, label=label)
+    quantity = quantity_of(name)
+    ax.set_xticks(range(len(levels)), [_shown(level) for level in levels])
+    ax.set(title=quantity.name, xlabel=quantity.unit, ylim=(-0.03, 1.03), xlim=(-0.5, len(levels) - 0.5))
+    ax.grid(axis="y", color="0.9", linewidth=0.5)
+    ax.tick_params(length=2, width=0.5)
+
+
+@own_style(_STYLE)
+def draw_map(title: str, rates: Sequence[SuccessRate]) -> Figure:
+    """Success in percent: a row per level of every disturbance, the undisturbed one first, a column per policy."""
+    labels = list(dict.fromkeys(rate.label for rate in rates))
+    rows = list(dict.fromkeys(map(_row, sorted(rates, key=lambda rate: not rate.undisturbed))))
+    shares = np.full((len(rows), len(labels)), np.nan)
+    for rate in rates:
+        shares[rows.index(_row(rate)), labels.index(rate.label)] = 100 * rate.rate
+    figure: Figure = figures.Figure(figsize=(COLUMN, 0.55 + 0.135 * len(rows)))
+    ax = figure.add_axes((0.5, 0.02, 0.48, 1 - 0.5 / figure.get_figheight()))
+    ax.imshow(shares, cmap="RdYlBu", vmin=0, vmax=100, aspect="auto")
+    for (row, column), share in np.ndenumerate(shares):
+        if np.isfinite(share):
+            ink = "black" if 15 < share < 85 else "white"
+            ax.text(column, row, f"{share:.0f}", ha="center", va="center", fontsize=6, color=ink)
+    ax.set_yticks(range(len(rows)), ["" if name == "" else _shown(level) for name, level in rows], fontsize=6)
+    ax.set_xticks(
+        range(len(labels)), labels, rotation=0 if len(labels) <= 3 else 30, ha="center" if len(labels) <= 3 else "left"
+    )
+    ax.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
+    for name, first, last in _stretches(name for name, _ in rows):
+        text = quantity_of(name).text.replace(" [", "\n[") if name else "undisturbed"
+        ax.annotate(text, (0, (first + last) / 2), (-26 if name else -4, 0), ("axes fraction", "data"), "offset points",
+                    ha="right", va="center", fontsize=6)  # fmt: skip
+        ax.axhline(first - 0.5, color="white", linewidth=1.5)
+    figure.text(0.5, 1 - 0.12 / figure.get_figheight(), f"success in %: {title}", ha="center", va="center")
+    return figure
+
+
+def _row(rate: SuccessRate) -> tuple[str, float | None]:
+    return ("", None) if rate.undisturbed else (rate.disturbance, rate.level)
+
+
+def _stretches(names: Iterable[str]) -> Iterator[tuple[str, int, int]]:
+    """Yield each name with its first and last row."""
+    for name, group in groupby(enumerate(names), key=lambda row: row[1]):
+        numbers = [number for number, _ in group]
+        yield name, numbers[0], numbers[-1]
+
+
+def _shown(level: float | None) -> str:
+    return "-" if level is None else f"{level:g}"
