@@ -13,6 +13,7 @@ from numba.np.unsafe import ndarray
 from d4orm_env.core import winding
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.dynamics import collision, reward, robot_model, transition
+from d4orm_env.engine.parts import PartCompiler
 
 ZERO = np.float32(0)
 ONE = np.float32(1)
@@ -30,7 +31,12 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same bits on every processor, however wide its
 registers. What it costs is measured in docs/performance.md."""
 
-UNCOUNTED = OPTIONS | {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+UNCOUNTED = OPTIONS | {
+    "_nrt": False,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+    "pipeline_class": PartCompiler,
+}
 """Options for everything that kernels call: without numba's reference counts, which would cost more than the sums they
 surround, and without what Python would call them by, which takes a fifth to a third of the time of compiling. Such
 functions cannot make arrays, and a call from Python ends the process: tests call them from compiled functions."""
