@@ -44,4 +44,4 @@ class PartCompiler(Compiler):
 
     def define_pipelines(self) -> Any:
         self.state.library = _Part(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-        return super().define_pipelines()
+        return Compiler.define_pipelines(self)
