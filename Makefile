@@ -16,7 +16,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all integrations portability wheel wheel-test lint docs bench results format clean
+.PHONY: help demo test test-all integrations portability wheel warm-wheel wheel-test lint docs bench results format clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -48,6 +48,10 @@ wheel: $(VENV)/.created ## Build source distribution and wheel into dist/
 	rm -rf dist
 	$(INSTALL) build
 	$(BIN)/python -m build --outdir dist .
+
+warm-wheel: wheel $(DEV_STAMP) ## Add compiled kernels to the wheel, for this Python, this system and every level of x86-64
+	$(INSTALL) wheel
+	$(BIN)/python tests/release/warm_wheel.py dist/*.whl
 
 wheel-test: wheel ## Install the wheel into a fresh environment of each of PYTHONS that is here, and try it
 	$(BIN)/python tests/release/fresh_environment.py dist/*.whl $(PYTHONS)

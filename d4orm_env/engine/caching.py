@@ -1,19 +1,26 @@
-"""Compiled kernels on disk, invalidated by any change of the sources they are made of."""
+"""Compiled kernels on disk, invalidated by any change of the sources they are made of.
+
+A wheel may bring kernels, compiled for the levels of x86-64 (``make warm-wheel``): they are looked for first. A plan
+has the same bits on every processor, so that a level is all that such a kernel has to know of one.
+"""
 
 from __future__ import annotations
 
+import base64
 import hashlib
+import importlib.metadata
 import os
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numba
+from llvmlite.binding import get_host_cpu_features
 from numba.core.caching import (
     CompileResultCacheImpl,
     FunctionCache,
@@ -90,6 +97,56 @@ class _Files(IndexDataCacheFile):
         return hashlib.sha256(repr((self._version, self._source_stamp)).encode() + content).digest()
 
 
+LEVELS = {
+    "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
+    "x86-64-v3": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
+    "x86-64-v2": ("sse4.2", "popcnt", "ssse3"),
+}
+"""Levels of x86-64, the newest first, and what a processor must have for each beyond the next."""
+SHIPPED = Path(__file__).parents[1] / "kernels"
+"""Where a wheel has a folder of kernels for each level; a checkout has none."""
+_SHIPPED_STAMP = "shipped"
+"""In place of the time of a source file, which is that of the installation."""
+
+
+def levels_here() -> tuple[str, ...]:
+    """The levels that this processor is of, the newest first."""
+    has, levels = get_host_cpu_features(), tuple(LEVELS)
+    missing = [level for level in levels if not all(has.get(feature) for feature in LEVELS[level])]
+    return levels[levels.index(missing[-1]) + 1 :] if missing else levels
+
+
+@cache
+def _shipped_folder() -> Path | None:
+    """The folder of this processor's kernels, if there is one and kernels are not to be compiled for another."""
+    if not SHIPPED.is_dir() or os.environ.get("NUMBA_CPU_NAME"):
+        return None
+    return next((SHIPPED / level for level in levels_here() if (SHIPPED / level).is_dir()), None)
+
+
+@cache
+def _record() -> Mapping[Path, str]:
+    """Digests of the kernels that the wheel's own record lists."""
+    files = importlib.metadata.files("d4orm-env") or []
+    return {
+        Path(str(file.locate())).resolve(): file.hash.value for file in files if file.hash and "kernels" in file.parts
+    }
+
+
+class _ShippedFiles(_Files):
+    """Index and data files of a level. What the wheel's record does not list, as it is, counts as missing."""
+
+    def __init__(self, folder: Path, filename_base: str) -> None:
+        super().__init__(str(folder), filename_base, _SHIPPED_STAMP)
+
+    def _if_whole(self, path: str, load: Callable[[], Any]) -> Any:
+        with suppress(OSError, ImportError, AttributeError):
+            digest = hashlib.sha256(Path(path).read_bytes()).digest()
+            if _record().get(Path(path).resolve()) == base64.urlsafe_b64encode(digest).decode().rstrip("="):
+                return load()
+        return None
+
+
 class _Place(CompileResultCacheImpl):
     """The folder that numba chooses, but none in a home folder that is not there or that others can write to."""
 
@@ -137,6 +194,23 @@ class _SourceKeyedCache(FunctionCache):
     def _index_key(self, sig: Signature, codegen: JITCPUCodegen) -> tuple[object, ...]:
         return sig, codegen.magic_tuple(), self._source_key
 
+    def _load_overload(self, sig: Signature, target_context: Any) -> Any:
+        shipped = self._shipped and self._shipped.load((sig, self._source_key))
+        return self._impl.rebuild(target_context, shipped) if shipped else super()._load_overload(sig, target_context)
+
+    @property
+    def _shipped(self) -> _ShippedFiles | None:
+        folder = _shipped_folder()
+        return None if folder is None else _ShippedFiles(folder, self._impl.filename_base)
+
+    def ship(self, folder: Path) -> None:
+        """Put what is kept into a folder that a wheel is to have, under keys without a processor."""
+        files = _Files(str(folder), self._impl.filename_base, _SHIPPED_STAMP)
+        kept = {key: self._cache_file.load(key) for key in self._cache_file._load_index()}
+        for (sig, _, source_key), data in kept.items():
+            if source_key == self._source_key and data is not None:
+                files.save((sig, source_key), data)
+
     def save_overload(self, sig: Signature, data: CompileResult) -> None:
         """Keep a kernel where there is room for it; elsewhere the next process compiles it anew."""
         with suppress(OSError):
@@ -145,8 +219,10 @@ class _SourceKeyedCache(FunctionCache):
     def is_kept(self) -> bool:
         """True if anything is kept, for the sources as they are now."""
         return any(
-            key[-1] == self._source_key and self._cache_file.load(key) is not None
-            for key in self._cache_file._load_index()
+            key[-1] == self._source_key and files.load(key) is not None
+            for files in (self._shipped, self._cache_file)
+            if files is not None
+            for key in files._load_index()
         )
 
 
@@ -199,3 +275,10 @@ def has_to_be_compiled(kernel: Kernel[..., object]) -> bool:
     """Check whether a kernel of :func:`cached_kernel` could be kept on disk and is not yet, for the present sources."""
     cache = getattr(kernel, "_cache", None)
     return isinstance(cache, _SourceKeyedCache) and not cache.is_kept()
+
+
+def ship(kernel: Kernel[..., object], folder: Path) -> None:
+    """Put what is kept of a kernel into a folder that a wheel is to have."""
+    kept = getattr(kernel, "_cache", None)
+    if isinstance(kept, _SourceKeyedCache):
+        kept.ship(folder)

@@ -20,7 +20,7 @@ from d4orm_planners.cli.warmup import compile_for_planning
 imported = time.perf_counter()
 problem = make_problem("circle", num_robots=int(sys.argv[1]))
 planner = make_planner(engine="cpu")
-compile_for_planning(problem.team.models, drives=planner.drives_straight)  # as the command line does
+compile_for_planning(problem.team.models, driver=planner.name)  # as the command line does
 plan = planner.solve(problem, seed=0)
 done = time.perf_counter()
 print(json.dumps({"import": imported - begin, "solve": done - imported, "planning": plan.wall_time,

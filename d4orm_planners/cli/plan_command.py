@@ -82,7 +82,8 @@ def solving(
         compile_for_planning(
             problem.team.models,
             lambda: typer.echo("compiling, once per installation ...", err=True),
-            drives=planner.drives_straight,
+            driver=planner.name if planner.drives_straight else "",
+            walls=len(problem.arrays.boxes) + len(problem.arrays.triangles) > 0,
         )
     limit = planner.config.max_iterations if max_iterations is None else max_iterations
     return solve_progress(planner.name, problem.num_robots, limit, enabled=not quiet)

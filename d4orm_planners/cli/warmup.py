@@ -1,7 +1,7 @@
 """Compile ahead whatever planning, rolling out and the environments need, into the cache on disk.
 
-The two kernels that a plan needs, that which samples and that which rolls out, take equally long. numba compiles one
-at a time in a process, so that two processes do it in half the time.
+What samples and rolls out takes as long as what searches for drives. numba compiles one kernel at a time in a process,
+so that two processes do it in half the time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 from d4orm_env.dynamics.models import COMMON
-from d4orm_env.engine.caching import Kernel, has_to_be_compiled
+from d4orm_env.engine.caching import Kernel, has_to_be_compiled, ship
 from d4orm_env.engine.threads import Threads
 from d4orm_env.engine.worlds import world_kernels
 from d4orm_env.envs.joint_state import JointState
@@ -72,46 +72,53 @@ _RULES = SamplingRules(weights=SoftmaxWeights(1.0))
 
 
 def compile_for_planning(
-    models: tuple[str, ...], announce: Callable[[], None] = lambda: None, *, drives: bool = False
+    models: tuple[str, ...], announce: Callable[[], None] = lambda: None, *, driver: str = "", walls: bool = False
 ) -> None:
     """Compile what planning on the CPU needs, in this process and another, unless it is on disk already.
 
     Args:
         models: The team's.
         announce: Called before it begins, if there is anything to do.
-        drives: Whether straight drives are needed too.
+        driver: The planner's name, if it looks for drives before it samples.
+        walls: Whether it then finds paths among obstacles too.
     """
-    if has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out):
-        announce()
-        # Should it fail, the kernel is compiled when it is needed, like any other.
-        other = _in_another_process(f"roll_out_once({models!r}, drives={drives})")
-        sample_once((models,))
-        other.wait()
+    if not (has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out)):
+        return
+    announce()
+    # Either takes about half of the time. Should the other fail, its kernels are compiled when they are needed.
+    drive, paths = f"drive_once({models!r}, {driver!r})", "; find_paths()" if walls else ""
+    other = _in_another_process(drive + paths if driver else f"roll_out_once({models!r})")
+    if driver and walls:
+        spread_waves()
+    sample_once((models,))
+    roll_out_once(models)
+    other.wait()
 
 
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     # What ends it, as Ctrl-C, ends this process too, which says so.
+    names = "drive_once, find_paths, roll_out_once, sample_once"
     return subprocess.Popen(
-        [sys.executable, "-c", f"from {__name__} import find_paths, roll_out_once, sample_once; {call}"],
-        stderr=subprocess.DEVNULL,
+        [sys.executable, "-c", f"from {__name__} import {names}; {call}"], stderr=subprocess.DEVNULL
     )
 
 
-def roll_out_once(models: tuple[str, ...], *, drives: bool = True) -> None:
-    """Roll out a plan of the smallest problem of a team of these models on the CPU, and drive straight.
+def roll_out_once(models: tuple[str, ...]) -> None:
+    """Roll out a plan of the smallest problem of a team of these models on the CPU.
 
-    Samples are weighed and averaged here too, and first: the process that scores them, which takes longer, needs that
-    last.
+    Samples are weighed and averaged here too, and first: a process that scores them needs that last.
     """
     problem = _smallest_problem(models)
     rewards = np.zeros((1, 2), np.float32)
     run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
     run.moments(_RULES.weights(rewards, np), with_second=False)
     get_sampling_engine("cpu").rollout(problem, _no_controls(problem))
-    if drives:
-        # What it drives by itself, and how it looks for paths around others.
-        planner = make_planner(engine="cpu")
-        planner.init(SolveRun(planner, problem, seed=0))
+
+
+def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
+    """Look for drives as a planner begins with, in the smallest problem of a team of these models."""
+    planner = make_planner(driver, engine="cpu")
+    planner.init(SolveRun(planner, _smallest_problem(models), seed=0))
 
 
 def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
@@ -122,11 +129,19 @@ def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
         get_sampling_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
 
 
-def find_paths() -> None:
-    """Find the shortest paths among walls, and guide a team along them."""
-    problem = make_problem("doorway", num_robots=4)
+def _doorway() -> Problem:
+    return make_problem("doorway", num_robots=4)
+
+
+def spread_waves() -> None:
+    """Find shortest paths among walls."""
+    problem = _doorway()
     problem.shortest_paths.distance(problem.goal)
-    make_planner("mapf", engine="cpu").solve(problem, seed=0)
+
+
+def find_paths() -> None:
+    """Find paths for a team among walls, and drive along them."""
+    make_planner("mapf", engine="cpu").solve(_doorway(), seed=0)
 
 
 def warm_up() -> WarmupReport:
@@ -138,14 +153,16 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"roll_out_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths()")
+    other = _in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths()")
     sample_once((TEAMS[0], TEAMS[-1]))
-    for models in TEAMS[1:]:
+    for models in TEAMS:
         roll_out_once(models)
+    for models in TEAMS[1:]:
+        drive_once(models)
     _step_environments()
     other.wait()
     sample_once(TEAMS)
-    roll_out_once(TEAMS[0])
+    drive_once(TEAMS[0])
     find_paths()
     _evade()
     _plan()
@@ -156,6 +173,16 @@ def warm_up() -> WarmupReport:
     lost = [kernel for kernel in compiled if has_to_be_compiled(kernel)]
     folders = tuple(sorted({Path(path) for kernel in kernels if (path := kernel.stats.cache_path)}))
     return WarmupReport(seconds, _names(compiled), _names(loaded), folders, _names(lost))
+
+
+def ship_kernels(folder: Path) -> None:
+    """Compile everything, and put it into a folder that a wheel is to have."""
+    report = warm_up()
+    if report.lost:
+        raise OSError(f"{', '.join(report.lost)} could not be kept; set NUMBA_CACHE_DIR to a folder with room")
+    folder.mkdir(parents=True, exist_ok=True)
+    for kernel in _kernels():
+        ship(kernel, folder)
 
 
 def _names(kernels: Iterable[Dispatcher[Callable[..., object]]]) -> tuple[str, ...]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import errno
+import hashlib
 import importlib.util
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,6 +16,7 @@ from typing import Any
 import pytest
 from numba.core import config
 
+from d4orm_env.engine import caching
 from d4orm_env.engine.caching import has_to_be_compiled
 
 KERNEL = """
@@ -75,6 +78,28 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 
 def flipped(content: bytes, place: int) -> bytes:
     return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+
+
+def record_digest(content: bytes) -> str:
+    return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).decode().rstrip("=")
+
+
+@pytest.mark.parametrize(
+    ("missing", "levels"),
+    [
+        ((), ("x86-64-v4", "x86-64-v3", "x86-64-v2")),
+        (("avx512cd",), ("x86-64-v3", "x86-64-v2")),
+        (("avx512cd", "fma"), ("x86-64-v2",)),
+        (("fma",), ("x86-64-v2",)),
+        (("popcnt",), ()),
+    ],
+)
+def test_levels_of_a_processor(
+    monkeypatch: pytest.MonkeyPatch, missing: tuple[str, ...], levels: tuple[str, ...]
+) -> None:
+    features = {feature: feature not in missing for level in caching.LEVELS.values() for feature in level}
+    monkeypatch.setattr(caching, "get_host_cpu_features", lambda: features)
+    assert caching.levels_here() == levels
 
 
 class TestKernelCache:
@@ -194,6 +219,48 @@ class TestKernelCache:
         assert self.hits(path) == 0
         assert self.hits(path) == kept
         assert not (path.parent / "~").exists()
+
+    @pytest.fixture
+    def shipped(self, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+        """The folder of a wheel that has the kernel, recorded as what it is, with nothing kept elsewhere."""
+        if not caching.levels_here():
+            pytest.skip("wheels have kernels for x86-64 only")
+        self.hits(path)
+        kernels = tmp_path / "kernels"
+        folder = kernels / caching.levels_here()[0]
+        folder.mkdir(parents=True)
+        caching.ship(self.module(path).twice, folder)
+        record = {file: record_digest(file.read_bytes()) for file in folder.iterdir()}
+        monkeypatch.setattr(caching, "SHIPPED", kernels)
+        monkeypatch.setattr(caching, "_record", lambda: record)
+        caching._shipped_folder.cache_clear()
+        for file in path.parent.glob("__pycache__/*"):
+            file.unlink()
+        yield folder
+        caching._shipped_folder.cache_clear()
+
+    def test_a_wheels_kernels_are_taken(self, path: Path, shipped: Path) -> None:
+        assert not has_to_be_compiled(self.module(path).twice)
+        assert self.hits(path) == 1
+        assert not [*path.parent.glob("__pycache__/*.nb*")]
+
+    def test_those_of_other_sources_are_not(self, path: Path, shipped: Path) -> None:
+        assert self.hits(path, "another version") == 0
+        assert self.hits(path, "another version") == 1
+
+    @pytest.mark.parametrize("kind", ["nbi", "nbc"])
+    def test_nor_are_those_that_the_wheels_record_does_not_list_as_they_are(
+        self, path: Path, shipped: Path, kind: str
+    ) -> None:
+        (file,) = shipped.glob(f"*.{kind}")
+        content = file.read_bytes()
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        assert self.hits(path) == 0
+
+    def test_nor_those_of_another_processor(self, path: Path, shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(caching, "get_host_cpu_features", dict)
+        caching._shipped_folder.cache_clear()
+        assert self.hits(path) == 0
 
     def test_without_compiling_nothing_works_and_it_is_said(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(config, "DISABLE_JIT", 1)

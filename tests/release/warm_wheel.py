@@ -1,0 +1,64 @@
+"""Add compiled kernels to a wheel, so that whoever installs it compiles nothing.
+
+    python tests/release/warm_wheel.py dist/d4orm_env-*.whl
+
+Makes a wheel of this Python and system beside the given one, with kernels for every level of x86-64 that this processor
+is of. It needs what the package needs, and `wheel`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from functools import partial
+from pathlib import Path
+
+from d4orm_env.engine.caching import SHIPPED, levels_here
+
+COMPILE = """
+import sys
+from pathlib import Path
+from d4orm_planners.cli.warmup import ship_kernels
+ship_kernels(Path(sys.argv[1]))
+"""
+
+
+def compile_kernels(package: Path, level: str) -> None:
+    """Compile the kernels of an unpacked wheel for a level, into it."""
+    with tempfile.TemporaryDirectory() as cache:
+        chosen = {
+            "NUMBA_CPU_NAME": level,
+            "NUMBA_CPU_FEATURES": "",
+            "NUMBA_CACHE_DIR": cache,
+            "PYTHONPATH": str(package),
+        }
+        folder = package / "d4orm_env" / SHIPPED.name / level
+        subprocess.run([sys.executable, "-c", COMPILE, folder], check=True, cwd=package, env=os.environ | chosen)
+    kept = list(folder.iterdir())
+    print(f"{level}: {len(kept)} files, {sum(path.stat().st_size for path in kept) / 1e6:.0f} MB", flush=True)
+
+
+def main() -> None:
+    wheel = Path(sys.argv[1]).resolve()
+    python = f"cp{sys.version_info.major}{sys.version_info.minor}"
+    system = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    tags = ["--python-tag", python, "--abi-tag", python, "--platform-tag", system]
+    with tempfile.TemporaryDirectory() as folder:
+        run = partial(subprocess.run, check=True, cwd=folder)
+        run([sys.executable, "-m", "wheel", "unpack", wheel])
+        (package,) = Path(folder).iterdir()
+        for level in levels_here():
+            compile_kernels(package, level)
+        run([sys.executable, "-m", "wheel", "pack", package])
+        run([sys.executable, "-m", "wheel", "tags", "--remove", *tags, wheel.name])
+        (warm,) = Path(folder).glob("*.whl")
+        shutil.move(warm, wheel.parent / warm.name)
+        print(f"wrote {wheel.parent / warm.name}")
+
+
+if __name__ == "__main__":
+    main()
