@@ -18,9 +18,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 
 if TYPE_CHECKING:
-    from d4orm_env.paths import wavefront
-    from d4orm_env.paths.wavefront import Fields, Front, Lattice, Space
+    from d4orm_env.paths import looking, spaces, wavefront
+    from d4orm_env.paths.looking import Fields
+    from d4orm_env.paths.spaces import Space
+    from d4orm_env.paths.wavefront import Front, Lattice
 else:
+    looking = LazyModule("d4orm_env.paths.looking")
+    spaces = LazyModule("d4orm_env.paths.spaces")
     wavefront = LazyModule("d4orm_env.paths.wavefront")
 
 
@@ -113,7 +117,7 @@ def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floa
     """Return next positions for robots from this number on at ``(R, Q, 3)``, the whole distances, and their anchors."""
     shape = places.shape[:2]
     target, length, anchor = np.empty(places.shape), np.empty(shape), np.empty(shape, np.int32)
-    wavefront.look(*world, robot, places, target, length, anchor)
+    looking.look(*world, robot, places, target, length, anchor)
     return target, length, anchor
 
 
@@ -129,7 +133,7 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
     start = problem.start[:, : problem.dimension].astype(np.float64)
     if not problem.world.num_obstacles:
         return ShortestPaths(problem, np.linalg.norm(problem.goal - start, axis=1), None)
-    space, starts = wavefront.make_space(problem), in_space(start)[:, None]
+    space, starts = spaces.make_space(problem), in_space(start)[:, None]
     reaches = np.asarray(problem.team.radius, np.float64) + problem.margin
     lattices: dict[tuple[float, int], Lattice] = {}
     chosen: list[tuple[float, int]] = []
@@ -142,13 +146,13 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
                 )
             lattice = lattices[reach, refinement]
             front = wavefront.spread(space, lattice, reach, goal)
-            own = wavefront.gather(np.array([reach]), [lattice], np.array([0]), [front])
+            own = looking.gather(np.array([reach]), [lattice], np.array([0]), [front])
             if np.isfinite(_find((space, own), 0, place[None])[1]).all():
                 break
         chosen.append((reach, refinement))
         fronts.append(front)
     number = {key: n for n, key in enumerate(lattices)}
-    world = space, wavefront.gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
+    world = space, looking.gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
     length = _find(world, 0, starts)[1][:, 0]
     length.setflags(write=False)
     return ShortestPaths(problem, length, world)
@@ -173,7 +177,7 @@ def ahead_in_each(paths: Sequence[ShortestPaths], places: FloatArray) -> tuple[F
         if own._world is None:
             target[world], length[world] = own._look(given[world])
         else:
-            wavefront.look(*own._world, 0, spatial[world], found[world], lengths[world], anchors[world])
+            looking.look(*own._world, 0, spatial[world], found[world], lengths[world], anchors[world])
             target[world] = found[world, :, 0, : given.shape[-1]]
     return _towards(given, target), length
 

@@ -11,7 +11,7 @@ from numba.extending import register_jitable
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_env.paths.wavefront import Space, is_free_line
+from d4orm_env.paths.spaces import Space, is_free_line
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import Cells
 from d4orm_planners.mapf.pibt import Footprints

@@ -11,7 +11,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths.shortest_paths import in_space, lay_lattice
-from d4orm_env.paths.wavefront import Space, free_lines, make_space
+from d4orm_env.paths.spaces import Space, free_lines, make_space
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells
 

@@ -13,7 +13,7 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.paths.wavefront import make_space
+from d4orm_env.paths.spaces import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.mapf.near_neighbours import sort_into_cells

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from d4orm_env import Problem, Team, World, make_problem
 from d4orm_env.paths import shortest_paths
-from d4orm_env.paths.wavefront import make_space
+from d4orm_env.paths.spaces import make_space
 from d4orm_env.scenarios.grid_map import GridMap
 from d4orm_planners import make_planner
 from d4orm_planners.mapf import roadmap as roadmaps

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
-from d4orm_env.paths.wavefront import Space
+from d4orm_env.paths.spaces import Space
 from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.guiding import Surroundings
 from d4orm_planners.baselines.mmd.path_frame import PathFrame

@@ -15,7 +15,7 @@ from numba.extending import register_jitable
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_env.paths.wavefront import Space, clearance_at
+from d4orm_env.paths.spaces import Space, clearance_at
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, locate, trace
 

@@ -17,7 +17,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-from d4orm_env.paths.wavefront import Space, clearance_at, make_space
+from d4orm_env.paths.spaces import Space, clearance_at, make_space
 
 POINTS = 64
 """Stretches of equal time that a motion is cut into, as in the publication."""
@@ -71,7 +71,7 @@ def sine_table() -> Floats:
 
 
 def world_space(problem: Problem) -> Space:
-    """The world as :func:`~d4orm_env.paths.wavefront.clearance_at` reads it, with obstacles or without."""
+    """The world as :func:`~d4orm_env.paths.spaces.clearance_at` reads it, with obstacles or without."""
     if problem.world.num_obstacles:
         return make_space(problem)
     bounds = np.tile([[-np.inf], [np.inf]], 3)

@@ -18,7 +18,7 @@ from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tile_layout import Row
-from d4orm_env.paths.wavefront import Space, clearance_at
+from d4orm_env.paths.spaces import Space, clearance_at
 from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, trace
 from d4orm_planners.tracking.tracker import tracker

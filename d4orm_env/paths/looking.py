@@ -1,0 +1,147 @@
+"""The wavefronts of a team in one struct, and a look at them: where to go from anywhere, and how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import Floats, IntArray, Ints
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.paths.spaces import Place, Space, clearance_at, distance, place_of, sees
+from d4orm_env.paths.wavefront import NOBODY, Front, Lattice, corner_below
+
+
+class Fields(NamedTuple):
+    """The wavefronts of a team, one behind the other, and the lattices that they are on.
+
+    Attributes:
+        reach: ``(K,)`` the distance that each robot keeps [m].
+        room: ``(K,)`` clearance at its goal [m].
+        lattice: ``(K,)`` int64 number of its lattice.
+        low: ``(L, 3)`` the first nodes of the lattices [m].
+        step: ``(L,)`` between neighbours along an axis [m].
+        size: ``(L, 3)`` int64 points along each axis.
+        first_node: ``(L + 1,)`` int64 where the part of ``nodes`` of each lattice begins, and the end.
+        nodes: int32 the node of each point; -1 where it is not free.
+        first_place: ``(L + 1,)`` int64 where the part of ``places`` of each lattice begins, and the end.
+        places: ``(., 3)`` where the nodes are [m].
+        first_anchor: ``(K + 1,)`` int64 where the part of ``anchor`` of each robot begins, and the end.
+        anchor: int32, see :class:`Front`.
+        first_point: ``(K + 1,)`` int64 where those of ``points``, ``values`` and ``parents`` begin, and the end.
+        points: ``(., 3)`` [m].
+        values: [m].
+        parents: int32, counted from the first one of the robot.
+    """
+
+    reach: Floats
+    room: Floats
+    lattice: IntArray
+    low: Floats
+    step: Floats
+    size: IntArray
+    first_node: IntArray
+    nodes: Ints
+    first_place: IntArray
+    places: Floats
+    first_anchor: IntArray
+    anchor: Ints
+    first_point: IntArray
+    points: Floats
+    values: Floats
+    parents: Ints
+
+
+def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts: Sequence[Front]) -> Fields:
+    """The wavefronts of robots that keep ``reach`` ``(K,)``, on the lattices of these numbers ``(K,)``."""
+    return Fields(
+        reach=reach,
+        room=np.array([front.room for front in fronts]),
+        lattice=number,
+        low=np.stack([lattice.low for lattice in lattices]),
+        step=np.array([lattice.step for lattice in lattices]),
+        size=np.stack([lattice.size for lattice in lattices]),
+        first_node=_beginnings([lattice.nodes for lattice in lattices]),
+        nodes=_joined([lattice.nodes for lattice in lattices]),
+        first_place=_beginnings([lattice.places for lattice in lattices]),
+        places=_joined([lattice.places for lattice in lattices]),
+        first_anchor=_beginnings([front.anchor for front in fronts]),
+        anchor=_joined([front.anchor for front in fronts]),
+        first_point=_beginnings([front.points for front in fronts]),
+        points=_joined([front.points for front in fronts]),
+        values=_joined([front.values for front in fronts]),
+        parents=_joined([front.parents for front in fronts]),
+    )
+
+
+def _beginnings(arrays: list[np.ndarray]) -> IntArray:
+    """Return the offset of each when they lie one behind the other, and the end of the last one."""
+    return np.cumsum([0, *map(len, arrays)])
+
+
+def _joined(arrays: list[np.ndarray]) -> Any:
+    """The arrays, one behind the other; a single one is not copied."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+@compiled
+def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Place, float, np.int32]:
+    """Return the next position for a robot at ``q``, the length of the whole path, and the anchor."""
+    reach, lattice, first = fields.reach[robot], fields.lattice[robot], fields.first_point[robot]
+    step, size, first_place = fields.step[lattice], fields.size[lattice], fields.first_place[lattice]
+    first_node, first_anchor = fields.first_node[lattice], fields.first_anchor[robot]
+    goal, own_goal, own = place_of(fields.points, first), fields.room[robot], clearance_at(space, q[0], q[1], q[2])
+    if sees(space, reach, goal, own_goal, q, own):
+        return goal, distance(goal, q), np.int32(0)
+    i, j, k = corner_below(fields.low[lattice], step, size, q)
+    # From deep inside an obstacle there may be none.
+    rings = 2 + np.int64(2 * min(max(0.0, reach - own), 2 * reach) / step)
+    ring, target, length, anchor = 0, q, np.inf, NOBODY
+    while ring < rings and anchor < 0:
+        last = NOBODY
+        for ni in range(max(0, i - ring), min(size[0], i + ring + 2)):
+            for nj in range(max(0, j - ring), min(size[1], j + ring + 2)):
+                for nk in range(max(0, k - ring), min(size[2], k + ring + 2)):
+                    n = np.int64(fields.nodes[first_node + (ni * size[1] + nj) * size[2] + nk])
+                    if n < 0:
+                        continue
+                    a = fields.anchor[first_anchor + n]
+                    if a < 0:
+                        continue
+                    at, value = place_of(fields.points, first + a), fields.values[first + a]
+                    straight = value + distance(at, q)
+                    if straight < length and a != last:
+                        last = a
+                        if sees(space, reach, at, own_goal if a == 0 else reach, q, own):
+                            target, length, anchor = at, straight, a
+                            continue
+                    place = place_of(fields.places, first_place + n)
+                    bent = value + distance(at, place) + distance(place, q)
+                    if bent < length and sees(space, reach, place, reach, q, own):
+                        target, length, anchor = place, bent, a
+        ring += 1
+    return target, length, anchor
+
+
+@cached_kernel(variant="look", **OPTIONS)
+def look(
+    space: Space, fields: Fields, first: int, places: Floats, target: Floats, length: Floats, anchor: Ints
+) -> None:
+    """The paths of some robots from places.
+
+    Args:
+        space: The world.
+        fields: The wavefronts of all robots.
+        first: Number of the first of these robots, which follow each other.
+        places: ``(R, Q, 3)``.
+        target: ``(R, Q, 3)`` where to go first, the place itself where there is no path; output.
+        length: ``(R, Q)`` of the whole path; infinite where there is none, output.
+        anchor: ``(R, Q)`` int32 the anchor that is the target or comes next, output; -1 where there is none.
+    """
+    for r in range(places.shape[0]):
+        for b in range(places.shape[1]):
+            q = (places[r, b, 0], places[r, b, 1], places[r, b, 2])
+            to, length[r, b], anchor[r, b] = _look_from(space, fields, first + r, q)
+            target[r, b, 0], target[r, b, 1], target[r, b, 2] = to
