@@ -160,7 +160,8 @@ def _roll_out_by_kernel(models: tuple[str, ...], arrays: ProblemArrays, begin: W
     if len(groups) == 1:
         return move(*groups[0], begin, controls)
     horizon, (num_robots, num_samples) = len(controls), begin.docked.shape
-    state, docked = jnp.zeros((horizon, *begin.state.shape)), jnp.zeros((horizon, num_robots, num_samples), bool)
+    state = jnp.zeros((horizon, *begin.state.shape), jnp.float32)
+    docked = jnp.zeros((horizon, num_robots, num_samples), bool)
     after = Worlds(state, docked, jnp.zeros_like(controls))
     for model, robots in groups:
         n, m = model.state_size, model.control_size

@@ -72,7 +72,7 @@ def test_commands_are_understood(page: str) -> None:
     known = LazyCommands()
     for line in commands(PAGES[page]):
         words = shlex.split(line, comments=True)
-        if words[0] == "d4orm" and not words[1].startswith("-"):
+        if words[:1] == ["d4orm"] and not words[1].startswith("-"):
             try:
                 known[words[1]].make_context(words[1], words[2:])
             except ImportError as error:
