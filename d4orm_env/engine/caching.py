@@ -10,6 +10,7 @@ import base64
 import hashlib
 import importlib.metadata
 import os
+import pickle
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -203,14 +204,6 @@ class _SourceKeyedCache(FunctionCache):
         folder = _shipped_folder()
         return None if folder is None else _ShippedFiles(folder, self._impl.filename_base)
 
-    def ship(self, folder: Path) -> None:
-        """Put what is kept into a folder that a wheel is to have, under keys without a processor."""
-        files = _Files(str(folder), self._impl.filename_base, _SHIPPED_STAMP)
-        kept = {key: self._cache_file.load(key) for key in self._cache_file._load_index()}
-        for (sig, _, source_key), data in kept.items():
-            if source_key == self._source_key and data is not None:
-                files.save((sig, source_key), data)
-
     def save_overload(self, sig: Signature, data: CompileResult) -> None:
         """Keep a kernel where there is room for it; elsewhere the next process compiles it anew."""
         with suppress(OSError):
@@ -277,8 +270,14 @@ def has_to_be_compiled(kernel: Kernel[..., object]) -> bool:
     return isinstance(cache, _SourceKeyedCache) and not cache.is_kept()
 
 
-def ship(kernel: Kernel[..., object], folder: Path) -> None:
-    """Put what is kept of a kernel into a folder that a wheel is to have."""
-    kept = getattr(kernel, "_cache", None)
-    if isinstance(kept, _SourceKeyedCache):
-        kept.ship(folder)
+def ship(cache: Path, folder: Path) -> None:
+    """Put all kernels that are kept below one folder into that of a wheel, under keys without the processor."""
+    for index in cache.rglob("*.nbi"):
+        with index.open("rb") as file:
+            _, (stamp, _) = pickle.load(file), pickle.load(file)
+        kept, shipped = (
+            _Files(str(place), index.stem, mark) for place, mark in ((index.parent, stamp), (folder, _SHIPPED_STAMP))
+        )
+        for key in kept._load_index():
+            sig, _, source_key = key
+            shipped.save((sig, source_key), kept.load(key))

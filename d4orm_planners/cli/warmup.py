@@ -25,7 +25,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 from d4orm_env.dynamics.models import COMMON
-from d4orm_env.engine.caching import Kernel, has_to_be_compiled, ship
+from d4orm_env.engine.caching import Kernel, has_to_be_compiled
 from d4orm_env.engine.threads import Threads
 from d4orm_env.engine.worlds import world_kernels
 from d4orm_env.envs.joint_state import JointState
@@ -173,16 +173,6 @@ def warm_up() -> WarmupReport:
     lost = [kernel for kernel in compiled if has_to_be_compiled(kernel)]
     folders = tuple(sorted({Path(path) for kernel in kernels if (path := kernel.stats.cache_path)}))
     return WarmupReport(seconds, _names(compiled), _names(loaded), folders, _names(lost))
-
-
-def ship_kernels(folder: Path) -> None:
-    """Compile everything, and put it into a folder that a wheel is to have."""
-    report = warm_up()
-    if report.lost:
-        raise OSError(f"{', '.join(report.lost)} could not be kept; set NUMBA_CACHE_DIR to a folder with room")
-    folder.mkdir(parents=True, exist_ok=True)
-    for kernel in _kernels():
-        ship(kernel, folder)
 
 
 def _names(kernels: Iterable[Dispatcher[Callable[..., object]]]) -> tuple[str, ...]:

@@ -17,18 +17,13 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-from d4orm_env.engine.caching import SHIPPED, levels_here
-
-COMPILE = """
-import sys
-from pathlib import Path
-from d4orm_planners.cli.warmup import ship_kernels
-ship_kernels(Path(sys.argv[1]))
-"""
+from d4orm_env.engine.caching import SHIPPED, levels_here, ship
 
 
 def compile_kernels(package: Path, level: str) -> None:
     """Compile the kernels of an unpacked wheel for a level, into it."""
+    folder = package / "d4orm_env" / SHIPPED.name / level
+    folder.mkdir(parents=True)
     with tempfile.TemporaryDirectory() as cache:
         chosen = {
             "NUMBA_CPU_NAME": level,
@@ -36,8 +31,9 @@ def compile_kernels(package: Path, level: str) -> None:
             "NUMBA_CACHE_DIR": cache,
             "PYTHONPATH": str(package),
         }
-        folder = package / "d4orm_env" / SHIPPED.name / level
-        subprocess.run([sys.executable, "-c", COMPILE, folder], check=True, cwd=package, env=os.environ | chosen)
+        command = [sys.executable, "-c", "from d4orm_planners.cli.warmup import warm_up; warm_up()"]
+        subprocess.run(command, check=True, cwd=package, env=os.environ | chosen)
+        ship(Path(cache), folder)
     kept = list(folder.iterdir())
     print(f"{level}: {len(kept)} files, {sum(path.stat().st_size for path in kept) / 1e6:.0f} MB", flush=True)
 
