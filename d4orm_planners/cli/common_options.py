@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from d4orm_env.render import save_animation, save_picture
+from d4orm_env import render
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import physics_module
@@ -104,6 +104,6 @@ class PictureOptions:
     def draw(self, problem: Problem, trajectory: Trajectory, marks: DisturbanceEvents | None = None) -> None:
         """Write the pictures that were asked for."""
         if self.picture is not None:
-            save_picture(problem, trajectory, self.picture, marks=marks)
+            render.save_picture(problem, trajectory, self.picture, marks=marks)
         if self.animation is not None:
-            save_animation(problem, trajectory, self.animation, marks=marks)
+            render.save_animation(problem, trajectory, self.animation, marks=marks)
