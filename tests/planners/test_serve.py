@@ -179,12 +179,12 @@ def test_emergency_stop_silence_and_restart(endpoint: str) -> None:
         assert time.monotonic() - told <= 2 * DT + 0.1  # and what a loaded machine takes
         time.sleep(3 * DT)
         assert (fleet.velocity == 0).all()
-        assert fleet.diagnosis[-1] == "stopped"
+        until(lambda: fleet.diagnosis[-1] == "stopped")
         fleet.e_stop(False)
         until(lambda: bool((fleet.velocity[:, 0] != 0).all()))
         fleet.on[1] = False
         until(lambda: bool((fleet.velocity == 0).all()))
-        assert fleet.diagnosis[-1] == "waiting"
+        until(lambda: fleet.diagnosis[-1] == "waiting")
         fleet.on[1] = True
         until(lambda: bool((fleet.velocity != 0).any()))
     until(lambda: bool((fleet.velocity == 0).all()))  # a server that ends leaves nobody moving
