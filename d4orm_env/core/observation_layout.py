@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
 from d4orm_env.core.problem import Problem
 
@@ -137,7 +138,8 @@ class ObservationSlices:
     def ray_directions(self) -> FloatArray:
         """``(num_rays, 2)`` unit vectors of the rays in the robot's frame, read-only."""
         angles = 2 * np.pi * np.arange(self.num_rays) / max(self.num_rays, 1)
-        directions = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+        sine, cosine = portable.sin_cos(angles)
+        directions = np.stack([cosine, sine], axis=1).astype(np.float32)
         directions.setflags(write=False)
         return directions
 

@@ -20,6 +20,7 @@ from d4orm_env.disturbances.intruder import MAX_INTRUDERS
 
 _COLUMNS = ("id", "time", "x", "y")
 _ROUNDING = 1e-6
+"""Rounding of the time after so many steps [s]."""
 
 
 class BodiesNow(NamedTuple):

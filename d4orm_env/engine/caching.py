@@ -105,7 +105,7 @@ LEVELS = {
 }
 """Levels of x86-64, the newest first, and what a processor must have for each beyond the next."""
 SHIPPED = Path(__file__).parents[1] / "kernels"
-"""Where a wheel has a folder of kernels for each level; a checkout has none."""
+"""Folder of a wheel with one of kernels for each level; a checkout has none."""
 _SHIPPED_STAMP = "shipped"
 """In place of the time of a source file, which is that of the installation."""
 

@@ -1,4 +1,4 @@
-"""How numba compiles a function that only kernels call: LLVM sees it once, in the kernels.
+"""Compilation of functions that only kernels call: LLVM optimises them once, in the kernels.
 
 By itself numba optimises every function by itself and makes machine code of it, then does all that again wherever it is
 called, at every level of calls.
@@ -29,7 +29,7 @@ class _Part(JITCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        """What the compiler asks to tell machine code its environment."""
+        """Return a stand-in: the compiler would tell machine code its environment."""
         return _NoMachineCode
 
 

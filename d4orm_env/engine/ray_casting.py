@@ -13,6 +13,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS, names_of_codes
+from d4orm_env.engine import elementary
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined
 from d4orm_env.engine.simd import TILE, use_wide_registers
@@ -89,7 +90,7 @@ def _meet_box(
 
 @inlined
 def _cut(enter: np.float32, leave: np.float32, inside: np.float32, growth: np.float32) -> tuple[np.float32, np.float32]:
-    """Where a ray is on the inner side of a line: ``inside`` at its beginning is positive there, and grows so fast."""
+    """Cut a ray to the inner side of a line: ``inside`` at its beginning is positive there, and grows so fast."""
     parallel = (growth < _PARALLEL) & (growth > -_PARALLEL)
     cut = -inside / (ONE if parallel else growth)
     later, sooner = (growth > ZERO) & (cut > enter) & ~parallel, (growth < ZERO) & (cut < leave) & ~parallel
@@ -141,7 +142,7 @@ def _invert(fan: FloatArray) -> None:
 @compiled
 def _aim(directions: FloatArray, heading: np.float32, fan: FloatArray) -> None:
     """Turn the rays by a heading, and take one over their components."""
-    cosine, sine = np.float32(np.cos(np.float64(heading))), np.float32(np.sin(np.float64(heading)))
+    cosine, sine = elementary.cosine(heading), elementary.sine(heading)
     for i in range(directions.shape[0]):
         fan[0, i] = cosine * directions[i, 0] - sine * directions[i, 1]
         fan[1, i] = sine * directions[i, 0] + cosine * directions[i, 1]

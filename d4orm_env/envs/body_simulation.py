@@ -67,6 +67,7 @@ class SimulatedBodies(Protocol):
 
 
 _OUT_OF_THE_WAY = np.float32(1e4)
+"""Coordinate of bodies that are absent, which a simulator cannot take out of its world."""
 
 
 class BodySimulation(TeamSimulation):

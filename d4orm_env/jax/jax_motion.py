@@ -1,7 +1,7 @@
 """Robots' motion in JAX: a step of all worlds, and rollouts, which are one kernel on a GPU.
 
 Nobody's motion depends on the others: a rollout needs no more than a robot's own numbers. A loop over time steps would
-start some twenty small kernels a step.
+start small kernels in every one.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Worlds(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """What a robot's motion depends on, each a number or an array that fits its state's components.
+    """Numbers that a robot's motion depends on, each a number or an array that fits its state's components.
 
     Attributes:
         time_step: Four, see :class:`~d4orm_env.dynamics.transition.TimeStep`.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from functools import partial
 from importlib.util import find_spec
 from typing import TypeAlias, get_args
@@ -71,32 +71,12 @@ def parts(settings: BenchmarkSettings) -> Iterator[Part]:
 
 def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
     fast = {"cpu", resolve_engine("auto")}  # JAX where it has an accelerator
-    for model in settings.models:
-        for num_robots in settings.num_robots:
-            for engine in settings.engines:
-                slow = engine not in fast and num_robots > settings.most_robots_slow
-                if slow or (engine == "plain" and model not in COMMON):
-                    continue
-                # The default planner's weights, by robot and with a cut-off, on the engine that it is meant for.
-                for preset in PRESETS if engine == "cpu" else ("paper",):
-                    label = f"{num_robots} {model} on {engine}"
-                    yield "denoising", label, partial(_measure_denoising, settings, engine, preset, num_robots, model)
+    yield from _denoising_parts(settings, fast)
     for num_robots in settings.thread_robots:
         for threads in thread_counts():
             work = partial(_measure_threads, settings, num_robots, threads)
             yield "threads", f"{num_robots} robots on {threads} threads", work
-    for num_boxes in (0, *settings.far_obstacles):
-        among = f" among {num_boxes} boxes" if num_boxes else ""
-        yield "environments", f"one environment{among}", partial(measure_env, settings, num_boxes)
-        yield "environments", f"{settings.num_worlds} worlds{among}", partial(measure_worlds, settings, num_boxes)
-    for what, measurement in (("one environment", measure_env), (f"{settings.num_worlds} worlds", measure_worlds)):
-        disturbed = partial(measurement, settings, 0, DISTURBANCES)
-        yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
-        yield "environments", f"{what} with {RAYS} rays", partial(measurement, settings, 0, num_rays=RAYS)
-    yield "environments", "rooms, along paths", partial(measure_rooms, settings)
-    yield "environments", f"{settings.num_worlds} worlds in JAX", partial(measure_functional, settings)
-    for model in RIGID if find_spec("mujoco") else ():
-        yield "environments", f"one environment of {model} in MuJoCo", partial(measure_rigid, settings, model)
+    yield from _environment_parts(settings)
     surroundings: dict[Where, tuple[int, ...]] = {"near": settings.obstacles, "far": settings.far_obstacles}
     for where, counts in surroundings.items():
         for count in counts:
@@ -115,6 +95,34 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
             for num_robots in settings.plan_robots:
                 work = partial(_measure_plans, settings, engine, preset, num_robots)
                 yield "plans", f"first plans of {num_robots} robots on {engine}", work
+
+
+def _denoising_parts(settings: BenchmarkSettings, fast: Set[str]) -> Iterator[Part]:
+    for model in settings.models:
+        for num_robots in settings.num_robots:
+            for engine in settings.engines:
+                slow = engine not in fast and num_robots > settings.most_robots_slow
+                if slow or (engine == "plain" and model not in COMMON):
+                    continue
+                # The default planner's weights, by robot and with a cut-off, on the engine that it is meant for.
+                for preset in PRESETS if engine == "cpu" else ("paper",):
+                    label = f"{num_robots} {model} on {engine}"
+                    yield "denoising", label, partial(_measure_denoising, settings, engine, preset, num_robots, model)
+
+
+def _environment_parts(settings: BenchmarkSettings) -> Iterator[Part]:
+    for num_boxes in (0, *settings.far_obstacles):
+        among = f" among {num_boxes} boxes" if num_boxes else ""
+        yield "environments", f"one environment{among}", partial(measure_env, settings, num_boxes)
+        yield "environments", f"{settings.num_worlds} worlds{among}", partial(measure_worlds, settings, num_boxes)
+    for what, measurement in (("one environment", measure_env), (f"{settings.num_worlds} worlds", measure_worlds)):
+        disturbed = partial(measurement, settings, 0, DISTURBANCES)
+        yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
+        yield "environments", f"{what} with {RAYS} rays", partial(measurement, settings, 0, num_rays=RAYS)
+    yield "environments", "rooms, along paths", partial(measure_rooms, settings)
+    yield "environments", f"{settings.num_worlds} worlds in JAX", partial(measure_functional, settings)
+    for model in RIGID if find_spec("mujoco") else ():
+        yield "environments", f"one environment of {model} in MuJoCo", partial(measure_rigid, settings, model)
 
 
 def run_parts(todo: Sequence[Part], progress: Callable[[str, int, int], object]) -> dict[str, list[Measurement]]:

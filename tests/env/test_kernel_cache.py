@@ -223,8 +223,8 @@ class TestKernelCache:
     @pytest.fixture
     def shipped(self, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         """The folder of a wheel that has the kernel, recorded as what it is, with nothing kept elsewhere."""
-        if not caching.levels_here():
-            pytest.skip("wheels have kernels for x86-64 only")
+        if not caching.levels_here() or "NUMBA_CPU_NAME" in os.environ:
+            pytest.skip("wheels have kernels for x86-64 only, and none where a processor is named")
         self.hits(path)
         kernels = tmp_path / "kernels"
         folder = kernels / caching.levels_here()[0]

@@ -19,7 +19,7 @@ from d4orm_planners.base.machine import commit, describe_machine
 from d4orm_planners.benchmark import bench_report, timing
 from d4orm_planners.benchmark.benchmark import parts, run_parts, thread_counts
 from d4orm_planners.benchmark.probes import measure_startup
-from d4orm_planners.benchmark.settings import MODELS, QUICK, BenchmarkSettings
+from d4orm_planners.benchmark.settings import MODELS, QUICK, SECTIONS, BenchmarkSettings
 from d4orm_planners.benchmark.timing import Spread, measure
 from d4orm_planners.cli import app as cli
 
@@ -276,3 +276,8 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     # Other tests have put theirs into the same cache.
     assert kernels(told)
     assert not kernels(told) - kernels(again)
+
+
+def test_every_section_has_a_table() -> None:
+    assert tuple(bench_report._SECTIONS) == SECTIONS
+    assert {part[0] for part in parts(BenchmarkSettings(**TINY))} <= set(SECTIONS)
