@@ -142,7 +142,7 @@ def test_a_rollout_is_its_steps(engine: str, name: str) -> None:
         states, arrived = result.states, result.arrived
         np.testing.assert_allclose(states, trajectory.states[t + 1], atol=1e-6)
         np.testing.assert_allclose(result.controls, trajectory.controls[t], atol=1e-6)
-        np.testing.assert_allclose(result.rewards, trajectory.rewards[t], atol=1e-6)
+        np.testing.assert_allclose(result.rewards, trajectory.rewards[t], rtol=1e-6, atol=1e-6)
         np.testing.assert_array_equal(arrived, trajectory.arrived[t + 1])
         np.testing.assert_array_equal(result.collided, trajectory.collided[t + 1])
         np.testing.assert_array_equal(result.margin_violated, trajectory.margin_violated[t + 1])
