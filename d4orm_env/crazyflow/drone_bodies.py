@@ -18,6 +18,8 @@ from d4orm_env.envs.body_simulation import Moved, Robots
 from d4orm_env.envs.lifelong import reached_goals
 
 MODEL = "holonomic3d"
+SENSED = 0.2
+"""Share of what a drone is off its setpoint beside what is known of that already, that is seen within a step."""
 HOVER, GUST = 3.0, 0.5
 """Time to hover at the start before a flight, and for which a gust blows in one direction [s]."""
 FLOOR, LOST = 0.05, 0.5
@@ -55,7 +57,8 @@ class DroneBodies:
     """The drones of a problem's team; see :class:`~d4orm_env.envs.body_simulation.SimulatedBodies`.
 
     Drones follow setpoints, which move as the team's model does under the controls and stay at the goal where that has
-    arrived. Drones that are held hover.
+    arrived. Drones that are held hover. What is seen of a drone is its setpoint, and how far it is off that on the
+    average of a second: who saw what its attitude has not yet done would ask for it again.
 
     Args:
         problem: The problem; see :func:`check_problem`.
@@ -63,6 +66,7 @@ class DroneBodies:
         physics: The drones.
 
     Attributes:
+        sensed: ``(K, 6)`` states as they are seen.
         record: Figures of the flight.
     """
 
@@ -83,6 +87,8 @@ class DroneBodies:
         still = np.zeros((round(HOVER * SETPOINT_RATE), *place.shape))
         self._flight.fly(place + still, still, still, still)
         self._position = self._flight.position
+        self._off, self._acceleration = self._position - place, np.zeros_like(place)
+        self._look()
         self.record = FlightRecord.empty(self.problem.num_robots)
 
     def put(self, robots: Robots, states: FloatArray) -> None:
@@ -90,6 +96,8 @@ class DroneBodies:
         self._flight.put(chosen, states[:, :3].astype(np.float64), states[:, 3:].astype(np.float64))
         self._setpoints[robots], self._parked[robots] = states[robots], False
         self._position = self._flight.position
+        self._off[robots] = 0
+        self._look()
 
     def hold(self, robots: Robots) -> None:
         self._setpoints[robots, 3:] = 0
@@ -102,15 +110,31 @@ class DroneBodies:
             self._setpoints[robot] = as_float32(
                 advance(model, tuple(before[robot]), control, tuple(arrays.limits[robot]), self._step, NUMPY_OPS)
             )
-        touched = self.follow(*between(before, self._setpoints, self.problem.dt, _periods(self.problem)), intruders)
+        touched = self.lead(before, self._setpoints, intruders)
         if self.problem.docks:
             self.hold(np.flatnonzero(reached_goals(self.problem.team, arrays, self._setpoints, controls)))
+        self._off += SENSED * (self._position - self._setpoints[:, :3] - self._off)
+        self._look()
         return Moved(self.states, touched)
+
+    def _look(self) -> None:
+        self.sensed = self._setpoints.copy()
+        self.sensed[:, :3] += as_float32(self._off)
 
     @property
     def states(self) -> FloatArray:
         """``(K, 6)`` positions and velocities."""
         return as_float32(np.concatenate([self._flight.position, self._flight.velocity], axis=1))
+
+    def lead(self, before: FloatArray, after: FloatArray, intruders: FloatArray | None = None) -> BoolArray:
+        """Fly from state to state ``(K, 6)`` within a time step; see :meth:`follow`.
+
+        Acceleration changes evenly: a jump by twice the limit ten times a second is more than attitude can follow.
+        """
+        position, velocity, acceleration = between(before, after, self.problem.dt, _periods(self.problem))
+        ramp = (np.arange(1, len(position) + 1) / len(position))[:, None, None]
+        former, self._acceleration = self._acceleration, acceleration[-1]
+        return self.follow(position, velocity, former + ramp * (acceleration - former), intruders)
 
     def follow(
         self, position: Floats, velocity: Floats, acceleration: Floats, intruders: FloatArray | None = None

@@ -47,6 +47,10 @@ class SimulatedBodies(Protocol):
     problem: Problem
     intruder_radius: FloatArray
 
+    @property
+    def sensed(self) -> FloatArray | None:
+        """``(K, n)`` states for who decides on controls, if they are not the true ones."""
+
     def begin(self, seed: int) -> None:
         """Put all robots at the start, and let go of those that were held; the seed is of what is random."""
 
@@ -93,6 +97,7 @@ class BodySimulation(TeamSimulation):
         make_bodies: Callable[[Problem, FloatArray], SimulatedBodies],
     ) -> None:
         self.bodies: SimulatedBodies | None = None
+        self._moving = False
         self._make_bodies = make_bodies
         super().__init__(EnvSetup(options, slack=_slack_of))
         check(self.problem)
@@ -112,11 +117,24 @@ class BodySimulation(TeamSimulation):
         ):
             self.bodies = self._make_bodies(self.problem, radius.copy())
         self.bodies.begin(self._seed)
+        self._moving = True
         return step
+
+    def _make_worlds(self, problem: Problem, num_worlds: int) -> None:
+        super()._make_worlds(problem, num_worlds)
+        self._observes_apart = True
+
+    @property
+    def _sensed(self) -> FloatArray:
+        true = self.worlds.state
+        if not self._moving or self.bodies is None or self.bodies.sensed is None:
+            return true
+        standing = np.asarray(stands(self.worlds.docked, self.problem.docks))
+        return np.where(standing[..., None], true, self.bodies.sensed)
 
     def _begin(self, seeds: Mapping[int, int]) -> None:
         super()._begin(seeds)
-        self._seed = seeds[0]
+        self._seed, self._moving = seeds[0], False
 
     def _put(self, states: FloatArray) -> None:
         assert self.bodies is not None

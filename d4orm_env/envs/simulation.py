@@ -189,8 +189,16 @@ class Simulation:
 
     @property
     def _scene(self) -> Scene:
+        return self._scene_of(self.worlds.state)
+
+    def _scene_of(self, states: FloatArray) -> Scene:
         now = self.worlds
-        return self._disturbed.scene(now.start, now.goal, now.state, now.control, now.docked, now.steps)
+        return self._disturbed.scene(now.start, now.goal, states, now.control, now.docked, now.steps)
+
+    @property
+    def _sensed(self) -> FloatArray:
+        """``(B, K, n)`` states as they are seen where no disturbance alters that."""
+        return self.worlds.state
 
     def _act(self, controls: FloatArray) -> FloatArray:
         """Disturb states and controls at the beginning of a step, and return the controls."""
@@ -251,9 +259,9 @@ class Simulation:
         """Return the inputs to the observations of these worlds now, true or believed."""
         batch, every = self.worlds, len(worlds) == len(self.worlds.steps)
         if every and not self.setup.disturbances:
-            seen = self.true
+            seen = self.true._replace(states=self._sensed)
         else:
-            seen = self._disturbed.see(self._scene, None if every else worlds)
+            seen = self._disturbed.see(self._scene_of(self._sensed), None if every else worlds)
         if every:
             self._seen = seen
         else:

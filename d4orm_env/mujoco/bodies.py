@@ -32,6 +32,8 @@ class TeamBodies:
         physics: Their material.
     """
 
+    sensed = None
+
     def __init__(self, problem: Problem, intruder_radius: FloatArray, physics: Physics) -> None:
         self.problem, self.intruder_radius = problem, intruder_radius
         self._substeps = math.ceil(problem.dt / physics.time_step - 1e-9)

@@ -24,6 +24,8 @@ Mode = Literal["nominal", "measured"]
 
 FEEDBACK = 0.25
 """Share of a distance from the reference that controls are to make up for within a step."""
+BEYOND = 4
+"""Multiple of the state space beyond it at which measured numbers end."""
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
 
@@ -69,11 +71,14 @@ class Controller:
         policy: Anything that :func:`~d4orm_planners.make_policy` takes.
         mode: ``"nominal"`` or ``"measured"``.
         reserve: Share of the robots' limits on speed, acceleration and turn rate that the reference leaves to the
-            feedback in mode ``"nominal"``.
+            feedback, in mode ``"nominal"`` or with a tracker.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
             meanwhile, and its answer, which would be too late, is not used. ``None`` waits.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
+        tracker: True if robots follow positions and velocities by a controller of their own, as drones do. In mode
+            ``"measured"`` the reference then goes towards what was measured by ``dt / (dt + 2 lag)`` of the way a step:
+            all at once would ask again for what the robots are about to do, and leave their own controller nothing.
         **settings: Of the policy.
 
     Raises:
@@ -88,6 +93,7 @@ class Controller:
         reserve: float = 0.2,
         timeout: float | None = None,
         lag: ArrayLike = 0.0,
+        tracker: bool = False,
         **settings: Any,
     ) -> None:
         if mode not in get_args(Mode):
@@ -96,7 +102,8 @@ class Controller:
         self.reserve = positive_number(reserve, "reserve", zero_allowed=True, most=0.9)
         self.timeout = None if timeout is None else positive_number(timeout, "timeout")
         self.policy: Policy = make_policy(policy, **settings)
-        self._lag = lag
+        self.tracker = tracker
+        self._lag, self._leads = lag, mode == "nominal" or tracker
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="controller")
         self._late: Future[Actions] | None = None
         self._env: Any = None
@@ -128,8 +135,8 @@ class Controller:
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
-        start, _ = self._plausible(states)
-        left = 1 - (self.reserve if self.mode == "nominal" else 0.0)
+        start = self._possible(self._completed(states)[0])
+        left = 1 - (self.reserve if self._leads else 0.0)
         team = problem.team
         limits = {name: left * getattr(team, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
         self._open(problem.with_state(start, problem.goal, team=team.replace(**limits)), seed)
@@ -155,7 +162,7 @@ class Controller:
         passed = (time - self._time) / self.problem.dt
         if not passed > -SAME_PERIOD:
             raise ValueError(f"time is {time!r} s, before the last step; give times of one clock, in seconds")
-        measured, known = self._plausible(states)
+        measured, known = self._completed(states)
         if passed >= SAME_PERIOD:
             self._time = time
             self._setpoint = self._advance(measured, known)
@@ -180,20 +187,22 @@ class Controller:
         self._env = navigation_v0.parallel_env(problem=problem)
         self._observations, _ = self._env.reset(seed=seed)
 
-    def _plausible(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """``(K, n)`` states that the reference can be in, measured ones where they are known, and ``(K,)`` where."""
+    def _completed(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
+        """``(K, n)`` measured states where they are known, the reference's elsewhere, and ``(K,)`` where."""
         joint = self._joint
         reference, measured = joint.states, as_float32(states)
         if measured.shape != reference.shape:
             raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
         known: BoolArray = np.all(np.isfinite(measured), axis=1)
-        return self._possible(np.where(known[:, None], measured, reference)), known
+        low, high = self._bounds
+        sane = np.clip(measured, low - BEYOND * (high - low), high + BEYOND * (high - low))
+        return np.where(known[:, None], sane, reference), known
 
     def _possible(self, states: FloatArray) -> FloatArray:
         """``(K, n)`` states within the robots' limits and the state space."""
         plausible = np.clip(states, *self._bounds)
         for model, robots in by_model(self._robots):
-            x, limits = (tuple(rows[robots].T) for rows in (plausible, self._robots.team.limits))
+            x, limits = (tuple(rows[robots].T) for rows in (plausible, self.problem.team.limits))
             limited = model.functions.limit_state(x[: model.state_size], limits, NUMPY_OPS)
             plausible[robots, : model.state_size] = np.stack(np.broadcast_arrays(*limited), axis=1)
         return plausible
@@ -202,20 +211,32 @@ class Controller:
         parked = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
         self._observer.observe(measured, known)
         if self.mode == "measured":
-            measured = self._possible(self._observer.undelayed(measured))
+            seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
             if not self.over:
-                self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, measured))
+                possible = self._possible(seen)
+                self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, possible))
+            measured = measured if self.tracker else seen
         before, actions = self._joint, self._actions()
+        moving = before.states if self._leads else measured
         brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
         controls, held = brakes, not self.over and actions is None
         if not self.over:
             if actions is None:
                 actions = dict(zip(self._env.possible_agents, brakes))
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
-            controls = self._joint.controls
-        follows = known & parked if self.mode == "measured" else known
+            controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
+        follows = known if self._leads else known & parked
         controls = self._observer.compensated(self._with_feedback(measured, follows, controls), self.arrived)
         return self._described(before, controls, held)
+
+    def _blended(self, measured: FloatArray) -> FloatArray:
+        """``(K, n)`` the reference, moved towards what was measured by a share that the lag allows."""
+        off = measured - self._joint.states
+        for model, robots in by_model(self.problem):
+            if model.heading_index is not None:
+                turn = off[robots, model.heading_index]
+                off[robots, model.heading_index] = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
+        return self._joint.states + (self._observer.trust * off).astype(np.float32)
 
     def _actions(self) -> Actions | None:
         """Return the policy's actions; ``None`` if they do not come in time, or no longer."""

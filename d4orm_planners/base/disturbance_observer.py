@@ -26,6 +26,7 @@ class DisturbanceObserver:
         lag: Time constant of the actuators [s], one or ``K``.
 
     Attributes:
+        trust: ``(K, 1)`` share of a robot's way off a reference that is not what its lag has yet to do.
         bias: ``(K, d)`` the estimate, in units of the controls; zero for other models.
 
     Raises:
@@ -52,6 +53,7 @@ class DisturbanceObserver:
         self._remains = np.where(constants > 0, np.exp(-problem.dt / np.maximum(constants, 1e-12)), 0.0)[:, None]
         # Mean over a step of exp(-t / lag).
         self._share = (constants / problem.dt)[:, None] * (1 - self._remains)
+        self.trust = problem.dt / (problem.dt + 2 * constants[:, None])
         self.bias, self._applied = np.zeros((count, d)), np.zeros((count, d))
         self._explained: Floats | None = None
         self._before: Floats | None = None
@@ -82,6 +84,21 @@ class DisturbanceObserver:
         if self._second_order.any():
             ahead[:, d : 2 * d] += np.where(self._second_order, rate, 0.0).astype(np.float32)
         return ahead
+
+    def executed(self, before: FloatArray, after: FloatArray, controls: FloatArray) -> FloatArray:
+        """``(K, m)`` controls that take double integrators from one velocity to the other; of other models unchanged.
+
+        A model that is at its speed limit does not obey a control that speeds it up; a robot does.
+
+        Args:
+            before: ``(K, n)`` states of the robots now, at whatever speed.
+            after: ``(K, n)`` states of the models after the step.
+            controls: ``(K, m)`` of the models.
+        """
+        d, executed = self.problem.dimension, controls.copy()
+        change = (after[:, d : 2 * d] - before[:, d : 2 * d]) / self.problem.dt if after.shape[1] >= 2 * d else 0.0
+        executed[:, :d] = np.where(self._second_order, change, controls[:, :d])
+        return executed
 
     def compensated(self, controls: FloatArray, resting: BoolArray) -> FloatArray:
         """``(K, m)`` controls that come to what these would without the disturbance; unchanged for robots at rest."""

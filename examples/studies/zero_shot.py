@@ -5,8 +5,9 @@
 Teams of `robot="crazyflie"`, with its radius, limits and margin: a swap of ten among obstacles, a circle of eight in a
 slab of 0.5 m, and ten that rise from a grid to a figure of eight, in an order drawn anew. Plans of `hybrid` are sampled
 at 100 Hz and flown as they are, in calm air, and with gusts of 0.02 N and 5% more mass than the drones' controller
-reckons with. With those, D4orm-C2F flies the teams in a `Controller`: in mode "nominal" drones get position, velocity
-and acceleration of the reference, in mode "measured" the acceleration alone. It needs crazyflow, `--trials` does not.
+reckons with. With those, D4orm-C2F flies the teams in a `Controller`, whose reference the drones follow: in mode
+"nominal" without looking at them, in mode "measured" the reference goes towards them. It needs crazyflow, `--trials`
+does not.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ def problem_of(scenario: str, seed: int) -> Problem:
 SCENARIOS = ("swap of ten", "circle of eight", "figure of ten")
 
 
-def setpoints_of_a_plan(problem: Problem, seed: int) -> Iterator[tuple[np.ndarray, ...]]:
-    """The setpoints of each step of a plan; none where it is not solved."""
+def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
+    """Who has touched something in each step of a plan; nothing where it is not solved."""
     plan = make_planner().solve(problem, seed=seed, time_limit=60)
     if not plan.solved:
         return
@@ -69,33 +70,20 @@ def setpoints_of_a_plan(problem: Problem, seed: int) -> Iterator[tuple[np.ndarra
              (sampled.position, sampled.velocity, sampled.acceleration)]  # fmt: skip
     each = round(problem.dt * RATE)
     for first in range(0, len(parts[0]), each):
-        yield tuple(part[first : first + each] for part in parts)
+        yield bodies.follow(*(part[first : first + each] for part in parts))
 
 
-def setpoints_of_a_controller(problem: Problem, seed: int, mode: Any, bodies: Any) -> Iterator[tuple[np.ndarray, ...]]:
-    """The setpoints of each step of D4orm-C2F, which sees where the drones are."""
-    from d4orm_env.crazyflow.drone_bodies import between
-
-    count, dt = round(problem.dt * RATE), problem.dt
-    trim = problem.start[:, :3] - bodies.states[:, :3]  # what drones that hover are off
-    with Controller("d4orm-c2f", mode=mode, reserve=RESERVE, lag=find_robot(ROBOT).lag, refine="sync") as controller:
-        last, former = bodies.states, np.zeros_like(trim)
+def fly_controller(problem: Problem, seed: int, bodies: Any, mode: Any) -> Iterator[np.ndarray]:
+    """Who has touched something in each step of D4orm-C2F."""
+    settings = {"reserve": RESERVE, "lag": find_robot(ROBOT).lag, "tracker": True, "refine": "sync"}
+    with Controller("d4orm-c2f", mode=mode, **settings) as controller:
+        last, step, calm = bodies.states, 0, 0
         controller.begin(problem, last, seed=seed)
-        step = calm = 0
         while calm < CALM:
-            setpoint = controller.step(bodies.states, step * dt)
+            setpoint = controller.step(bodies.states, step * problem.dt)
             after = np.concatenate([setpoint.position, setpoint.velocity], axis=1).astype(np.float32)
-            if mode == "measured":
-                last = bodies.states
-                velocity = last[:, 3:] + dt * setpoint.control
-                position = last[:, :3] + trim + dt / 2 * (last[:, 3:] + velocity)
-                last[:, :3] += trim
-                after = np.concatenate([position, velocity], axis=1)
-            position, velocity, acceleration = between(last, after, dt, count)
-            # Acceleration that jumps by twice the limit ten times a second is more than the attitude can follow.
-            ramp = (np.arange(1, count + 1) / count)[:, None, None]
-            yield position, velocity, former + ramp * (acceleration - former)
-            last, former, step, calm = after, acceleration[-1], step + 1, calm + controller.over
+            yield bodies.lead(last, after)
+            last, step, calm = after, step + 1, calm + controller.over
 
 
 def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
@@ -105,14 +93,10 @@ def fly(scenario: str, condition: str, seed: int) -> dict[str, Any]:
     problem, mode = problem_of(scenario, seed), condition.partition(",")[0]
     bodies = DroneBodies(problem, np.zeros(0, np.float32), DronePhysics(**CONDITIONS[condition]))
     bodies.begin(seed)
-    steps = (
-        setpoints_of_a_plan(problem, seed)
-        if mode == "open loop"
-        else setpoints_of_a_controller(problem, seed, mode, bodies)
-    )
+    steps = fly_plan(problem, seed, bodies) if mode == "open loop" else fly_controller(problem, seed, bodies, mode)
     touched, arrived = np.zeros((2, problem.num_robots), np.bool_)
-    for setpoints in steps:
-        touched |= bodies.follow(*setpoints)
+    for touching in steps:
+        touched |= touching
         position, velocity = bodies.states[:, :3], bodies.states[:, 3:]
         near = np.linalg.norm(position - problem.goal, axis=1) <= problem.goal_radius
         arrived |= near & (np.linalg.norm(velocity, axis=1) <= problem.goal_speed)
@@ -140,14 +124,14 @@ def measure(seeds: int) -> list[dict[str, Any]]:
 def row_of(scenario: str, condition: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The table's row of some flights."""
     flown = [row for row in rows if row["flown"]]
-    drones, tracked = sum(row["robots"] for row in flown), not condition.startswith("measured")
+    drones = sum(row["robots"] for row in flown)
     rms = np.sqrt(np.mean([row["mean_squared_error"] for row in flown]))
     return {
         "scenario": scenario, "flown": condition, "teams": f"{len(flown)} of {len(rows)}",
         "arrived": f"{sum(row['arrived'] for row in flown)} of {drones}",
         "in contact": sum(row["contacts"] for row in flown), "fallen": sum(row["fallen"] for row in flown),
-        "error RMS [m]": f"{rms:.3f}" if tracked else "-",
-        "most [m]": f"{max(row['error'] for row in flown):.3f}" if tracked else "-",
+        "error RMS [m]": f"{rms:.3f}",
+        "most [m]": f"{max(row['error'] for row in flown):.3f}",
         "least distance of centres [m]": f"{min(row['gap'] + 2 * row['radius'] for row in flown):.3f}",
         "least gap to obstacles [m]": f"{min(row['clearance'] for row in flown):.3f}",
     }  # fmt: skip

@@ -67,6 +67,18 @@ def test_a_plan_is_flown_and_gusts_are_felt() -> None:
 
 
 @needs_crazyflow
+@pytest.mark.slow
+def test_a_policy_that_sees_the_drones_brings_them_to_their_goals() -> None:
+    problem = swap(horizon=80, start=[[0, 0.5, 1, 0, 0, 0], [2, 0, 1, 0, 0, 0]], goal=[[2, 0.5, 1], [0, 0, 1]])
+    env = crazyflow.parallel_env(problem=problem, physics=crazyflow.DronePhysics(gust=0.02, mass_factor=1.05))
+    episode = run_episode(env, "d4orm-c2f", seed=0)
+    assert episode.metrics["success"] == 1
+    assert not env.flight.fallen.any()
+    seen, true = env.state(), env.unwrapped.true_state()
+    assert 0 < np.abs(seen - true).max() < 0.5
+
+
+@needs_crazyflow
 def test_contacts_between_steps_and_falls_count() -> None:
     problem = swap(world=World(3, spheres=[[0.4, 0.5, 1, 0.1]]))
     env = crazyflow.parallel_env(problem=problem)

@@ -50,9 +50,13 @@ def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> 
     episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy(policy, **same), seed=0)
     assert plant.metrics()["success"] == episode.metrics["success"] == 1
     places = np.stack([s.position for s in said])
-    states = episode.trajectory.positions[1 : len(places) + 1]
-    # What float32 leaves of a measured velocity is a push, but a small one.
-    np.testing.assert_allclose(places, states, atol=2e-5 if mode == "nominal" else 0.02)
+    states = episode.trajectory.positions[1:]
+    steps = min(len(places), len(states))
+    assert abs(len(places) - len(states)) <= (mode == "measured")
+    # What float32 leaves of a measured velocity is a push, but a small one. At the speed limit a model gains half of
+    # dt^2 times the control a step, which the controller does not ask of a robot.
+    gained = 0.2 if model.startswith("holonomic") else 0.02
+    np.testing.assert_allclose(places[:steps], states[:steps], atol=2e-5 if mode == "nominal" else gained)
     np.testing.assert_array_equal(said[-1].arrived, True)
     assert not any(s.held for s in said)
     speeds = np.linalg.norm([s.velocity for s in said], axis=2)
@@ -96,6 +100,40 @@ def test_a_known_lag_is_no_weakness() -> None:
         for lag in (0.0, 0.25)
     ]
     assert arrived[1] == 4 > arrived[0]
+
+
+def test_robots_without_a_speed_limit_of_their_own_keep_it() -> None:
+    problem = team("holonomic2d", 3)
+    states, fastest = problem.start.copy(), 0.0
+    with Controller("go-to-goal", mode="measured") as controller:
+        controller.begin(problem, states)
+        for step in range(80):
+            control = controller.step(states, step * problem.dt).control
+            states[:, :2] += problem.dt * (states[:, 2:] + problem.dt / 2 * control)
+            states[:, 2:] += problem.dt * control
+            fastest = max(fastest, float(np.linalg.norm(states[:, 2:], axis=1).max()))
+    assert controller.arrived.all()
+    assert 0.9 < fastest < 1.001
+
+
+def test_robots_with_trackers_lead_and_are_led() -> None:
+    problem = team("holonomic2d", 4, horizon=150)
+    states, wind, nearest = problem.start.copy(), np.float32([0.3, -0.2]), np.inf
+    with Controller("d4orm-c2f", mode="measured", tracker=True, lag=0.2, reserve=0.5, refine="sync") as controller:
+        controller.begin(problem, states, seed=2)
+        for step in range(problem.horizon):
+            s = controller.step(states, step * problem.dt)
+            for part in np.arange(1, 11) / 10:  # as a drone: feed-forward, and a feedback that a wind deflects
+                place = s.position + (part - 1) * problem.dt * s.velocity
+                push = s.acceleration + 8 * (place - states[:, :2]) + 5 * (s.velocity - states[:, 2:]) + wind
+                states[:, 2:] += problem.dt / 10 * push
+                states[:, :2] += problem.dt / 10 * states[:, 2:]
+            gaps = np.linalg.norm(states[:, None, :2] - states[:, :2], axis=2)[np.triu_indices(4, 1)]
+            nearest = min(nearest, float(gaps.min()))
+    assert controller.arrived.all()
+    assert nearest > 2 * problem.team.radius.max()
+    deflected = np.linalg.norm(wind) / 8
+    assert (np.linalg.norm(states[:, :2] - problem.goal, axis=1) < problem.goal_radius + 1.1 * deflected).all()
 
 
 @pytest.mark.parametrize("model", ["holonomic2d", "velocity2d"])
