@@ -15,7 +15,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, pos
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.base.disturbance_observer import DisturbanceObserver
+from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Actions, Policy
 from d4orm_planners.tracking.steering import by_model, present_velocities, track_velocities
@@ -76,9 +76,10 @@ class Controller:
             meanwhile, and its answer, which would be too late, is not used. ``None`` waits.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
-        tracker: True if robots follow positions and velocities by a controller of their own, as drones do. In mode
-            ``"measured"`` the reference then goes towards what was measured by ``dt / (dt + 2 lag)`` of the way a step:
-            all at once would ask again for what the robots are about to do, and leave their own controller nothing.
+        tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
+            are shifted by what keeps the robots beside the reference, as a thrust that is too weak does, up to the
+            margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
+            way a step: all at once would ask again for what the robots are about to do.
         **settings: Of the policy.
 
     Raises:
@@ -141,7 +142,7 @@ class Controller:
         limits = {name: left * getattr(team, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
         self._open(problem.with_state(start, problem.goal, team=team.replace(**limits)), seed)
         self.policy.reset(self._env, seed=seed)
-        self._time = float(time) - problem.dt
+        self._time, self._lead = float(time) - problem.dt, np.zeros_like(problem.goal, np.float64)
         self._setpoint = self._described(self._joint, self._joint.controls, held=False)
 
     def step(self, states: ArrayLike, time: float) -> ControlSetpoint:
@@ -210,6 +211,8 @@ class Controller:
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
         parked = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
         self._observer.observe(measured, known)
+        if self.tracker:
+            self._shift(measured, known)
         if self.mode == "measured":
             seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
             if not self.over:
@@ -228,6 +231,12 @@ class Controller:
         follows = known if self._leads else known & parked
         controls = self._observer.compensated(self._with_feedback(measured, follows, controls), self.arrived)
         return self._described(before, controls, held)
+
+    def _shift(self, measured: FloatArray, known: BoolArray) -> None:
+        """Shift setpoints against what keeps robots beside the reference, by as much as the margin."""
+        d, margin = self.problem.dimension, self.problem.margin
+        beside = np.where(known[:, None], self._joint.states[:, :d] - measured[:, :d], 0.0)
+        self._lead = np.clip(self._lead + GAIN * beside, -margin, margin)
 
     def _blended(self, measured: FloatArray) -> FloatArray:
         """``(K, n)`` the reference, moved towards what was measured by a share that the lag allows."""
@@ -281,5 +290,5 @@ class Controller:
                 heading[robots] = joint.states[robots, model.heading_index]
         velocity = self._velocities(joint)
         acceleration = (velocity - self._velocities(before)) / self.problem.dt
-        position = joint.states[:, : self.problem.dimension].astype(np.float64)
+        position = joint.states[:, : self.problem.dimension] + self._lead
         return ControlSetpoint(position, velocity, acceleration, heading, controls.copy(), joint.arrived.copy(), held)
