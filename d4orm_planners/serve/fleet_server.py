@@ -13,7 +13,16 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller, ControlSetpoint
-from d4orm_planners.serve.team_messages import diagnostics, full_state, heading_of, state_from, twist
+from d4orm_planners.serve.team_messages import (
+    diagnostics,
+    full_state,
+    heading_of,
+    place_of,
+    state_from,
+    time_of,
+    turned,
+    twist,
+)
 from d4orm_planners.serve.wire import RosSession, messages
 
 NODE = "d4orm"
@@ -21,6 +30,8 @@ DRIVING, PLANNING, WAITING, STOPPED = "driving", "planning", "waiting", "stopped
 """States of the server. It drives; stands and plans; stands as robots are silent; stands after an emergency stop."""
 LEVELS = {DRIVING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
 """Levels of diagnostics: well, warning, error."""
+BASE = 0.5
+"""Share of a period over which velocities are taken from poses."""
 TELL = 1.0
 """Time between two diagnostics of the same state [s]."""
 
@@ -35,21 +46,35 @@ class Robot:
         state: ``(n,)`` as last heard; not a number before.
         heading: As last heard [rad].
         stand: ``(d,)`` where it is to stand, while all do [m].
+        velocity: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s].
+        posed: Time by the robot's clock [s] and ``(3,)`` position of the later one [m].
     """
 
     name: str
     state: FloatArray
     heard: float = -np.inf
     heading: float = 0.0
-    stand: Floats | None = field(default=None)
+    stand: Floats | None = None
+    velocity: Floats = field(default_factory=lambda: np.zeros(3))
+    posed: tuple[float, Floats] | None = None
+
+    def take_pose(self, stamped: Any, base: float) -> None:
+        """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by ``base`` seconds at least."""
+        now, place = time_of(stamped.header), place_of(stamped.pose.position)
+        passed = np.inf if self.posed is None else now - self.posed[0]
+        if passed < base and passed >= 0:
+            return
+        self.velocity = (place - self.posed[1]) / passed if self.posed and 0 < passed < np.inf else np.zeros(3)
+        self.posed = now, place
 
 
 class FleetServer:
     """A controller as a ROS 2 node.
 
-    In: ``/NAME/odom`` (``nav_msgs/Odometry``), ``/NAME/goal`` (``geometry_msgs/PoseStamped``) and ``/e_stop``
-    (``std_msgs/Bool``). Out, once a period: ``/NAME/cmd_vel`` (``geometry_msgs/Twist``) and ``/NAME/setpoint``
-    (``trajectory_msgs/MultiDOFJointTrajectory`` of one point); and ``/diagnostics``.
+    In: ``/NAME/odom`` (``nav_msgs/Odometry``) or ``/NAME/pose`` (``geometry_msgs/PoseStamped``), ``/NAME/goal``
+    (``geometry_msgs/PoseStamped``) and ``/e_stop`` (``std_msgs/Bool``). Out, once a period: ``/NAME/cmd_vel``
+    (``geometry_msgs/Twist``) and ``/NAME/setpoint`` (``trajectory_msgs/MultiDOFJointTrajectory`` of one point); and
+    ``/diagnostics``.
 
     Nobody moves before all have been heard, nor while one has been silent for longer than the deadline, nor after an
     emergency stop until that is taken back. When that is over the controller begins anew from where robots are, and so
@@ -86,8 +111,10 @@ class FleetServer:
         self._robots = [Robot(name, unknown) for name in names]
         self._by_name = {name: robot for robot, name in enumerate(names)}
         self._odometry = session.subscriber("*/odom", messages.Odometry)
+        self._poses = session.subscriber("*/pose", messages.PoseStamped)
         self._goal = session.subscriber("*/goal", messages.PoseStamped)
         self._e_stop = session.subscriber("e_stop", messages.Bool)
+        self._inputs = self._odometry, self._poses, self._goal, self._e_stop
         self._commands = [session.publisher(f"{name}/cmd_vel", messages.Twist) for name in names]
         self._setpoints = [session.publisher(f"{name}/setpoint", messages.MultiDOFJointTrajectory) for name in names]
         self._diagnostics = session.publisher("diagnostics", messages.DiagnosticArray)
@@ -145,18 +172,28 @@ class FleetServer:
 
     def _read(self, now: float) -> None:
         for topic, message in self._odometry.take():
+            self._hear(topic, message.pose.pose, place_of(message.twist.twist.linear), now)
+        for topic, message in self._poses.take():
             number = self._by_name.get(topic.partition("/")[0])
-            if number is not None:
-                state, robot = state_from(self._problem, number, message), self._robots[number]
-                if np.isfinite(state).all():
-                    robot.state, robot.heading = state, heading_of(message.pose.pose.orientation)
-                    robot.heard = now
+            if number is not None and np.isfinite(place_of(message.pose.position)).all():
+                robot = self._robots[number]
+                robot.take_pose(message, BASE * self._problem.dt)
+                own = turned(robot.velocity, -heading_of(message.pose.orientation))
+                self._hear(topic, message.pose, own, now)
         for topic, message in self._goal.take():
             number = self._by_name.get(topic.partition("/")[0])
             if number is not None:
                 self._take_goal(number, message.pose.position)
         for _, message in self._e_stop.take():
             self._emergency = bool(message.data)
+
+    def _hear(self, topic: str, pose: Any, velocity: Floats, now: float) -> None:
+        number = self._by_name.get(topic.partition("/")[0])
+        if number is None:
+            return
+        state, robot = state_from(self._problem, number, pose, velocity), self._robots[number]
+        if np.isfinite(state).all():
+            robot.state, robot.heading, robot.heard = state, heading_of(pose.orientation), now
 
     def _take_goal(self, number: int, place: Any) -> None:
         goals = self._problem.goal.copy()
@@ -193,7 +230,7 @@ class FleetServer:
                 setpoint.publish(full_state(robot.name, robot.stand, still, still, robot.heading))
 
     def _diagnosis(self, now: float) -> Any:
-        silent, refused = self._silent(now), self._odometry.refused + self._goal.refused + self._e_stop.refused
+        silent, refused = self._silent(now), sum(topic.refused for topic in self._inputs)
         values = {
             "silent": ", ".join(silent),
             "arrived": str(int(self._controller.arrived.sum())) if self.state == DRIVING else "",

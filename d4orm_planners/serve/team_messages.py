@@ -23,19 +23,28 @@ def heading_of(orientation: Any) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def state_from(problem: Problem, robot: int, odometry: Any) -> FloatArray:
-    """``(n,)`` the state of a robot, from ``nav_msgs/Odometry``: its velocity is in the robot's own frame."""
-    model, d = problem.team.robot_models[robot], problem.dimension
-    pose, linear = odometry.pose.pose, odometry.twist.twist.linear
-    heading, forward = heading_of(pose.orientation), np.array([linear.x, linear.y, linear.z])
+def state_from(problem: Problem, robot: int, pose: Any, velocity: Floats) -> FloatArray:
+    """``(n,)`` the state of a robot, from its ``geometry_msgs/Pose`` and its velocity ``(3,)`` in its own frame."""
+    model, d, heading = problem.team.robot_models[robot], problem.dimension, heading_of(pose.orientation)
     state: FloatArray = np.zeros(problem.state_size, np.float32)
-    state[:d] = [pose.position.x, pose.position.y, pose.position.z][:d]
+    state[:d] = place_of(pose.position)[:d]
     if model.heading_index is not None:
         state[model.heading_index] = heading
-        state[list(model.speed_indices)] = forward[0]
+        state[list(model.speed_indices)] = velocity[0]
     elif model.speed_indices:
-        state[list(model.speed_indices)] = turned(forward, heading)[:d]
+        state[list(model.speed_indices)] = turned(velocity, heading)[:d]
     return state
+
+
+def place_of(point: Any) -> Floats:
+    """``(3,)`` of a ``geometry_msgs/Point`` or ``Vector3``."""
+    return np.array([point.x, point.y, point.z])
+
+
+def time_of(header: Any) -> float:
+    """Time of a ``std_msgs/Header`` [s]."""
+    seconds: float = header.stamp.sec + 1e-9 * header.stamp.nanosec
+    return seconds
 
 
 def turned(vector: Floats, angle: float) -> Floats:

@@ -25,7 +25,7 @@ zenoh = pytest.importorskip("zenoh")
 typesys = pytest.importorskip("rosbags.typesys")
 
 from d4orm_planners.serve import messages  # noqa: E402
-from d4orm_planners.serve.fleet_server import FleetServer  # noqa: E402
+from d4orm_planners.serve.fleet_server import FleetServer, Robot  # noqa: E402
 from d4orm_planners.serve.team_messages import state_from, twist  # noqa: E402
 from d4orm_planners.serve.wire import RosSession  # noqa: E402
 
@@ -46,14 +46,14 @@ def key(topic: str, ros_type: str) -> str:
 class Fleet:
     """Robots that do as ``cmd_vel`` says, and tell where they are; each may be off, and messages may be lost."""
 
-    def __init__(self, endpoint: str, start: np.ndarray, loss: float = 0.0) -> None:
+    def __init__(self, endpoint: str, start: np.ndarray, loss: float = 0.0, poses: bool = False) -> None:
         config = zenoh.Config()
         config.insert_json5("connect/endpoints", f'["{endpoint}"]')
         config.insert_json5("scouting/multicast/enabled", "false")
         self.session, self.position, self.heading = zenoh.open(config), start.copy(), np.array([0.0, 0.7])
         self.velocity, self.on = np.zeros_like(start), [True] * len(start)
         self.heard, self.diagnosis, self.setpoints = [0.0] * len(start), [""], [None] * len(start)
-        self.loss, self.random, self.moved_at = loss, np.random.default_rng(0), 0.0
+        self.poses, self.loss, self.random, self.moved_at = poses, loss, np.random.default_rng(0), 0.0
         self._over, self._subscribers = threading.Event(), [
             self.session.declare_subscriber(key("*/cmd_vel", "geometry_msgs/msg/Twist"), self._command),
             self.session.declare_subscriber(
@@ -100,6 +100,7 @@ class Fleet:
 
     def _live(self) -> None:
         odometry = STORE.deserialize_cdr(messages.Odometry().serialize(), "nav_msgs/msg/Odometry")
+        stamped = STORE.deserialize_cdr(messages.PoseStamped().serialize(), "geometry_msgs/msg/PoseStamped")
         while not self._over.wait(DT / 5):
             self.position += DT / 5 * self.velocity
             if (np.abs(self.velocity) > 1e-6).any():
@@ -114,7 +115,12 @@ class Fleet:
                 vx, vy = self.velocity[robot].tolist()
                 speed.x = math.cos(heading) * vx - math.sin(heading) * vy
                 speed.y = math.sin(heading) * vx + math.cos(heading) * vy
-                self.say(f"robot_{robot}/odom", "nav_msgs/msg/Odometry", odometry)
+                if self.poses:
+                    stamped.header.stamp.sec, stamped.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
+                    stamped.pose.position, stamped.pose.orientation = pose.position, pose.orientation
+                    self.say(f"robot_{robot}/pose", "geometry_msgs/msg/PoseStamped", stamped)
+                else:
+                    self.say(f"robot_{robot}/odom", "nav_msgs/msg/Odometry", odometry)
 
 
 def problem() -> Problem:
@@ -146,16 +152,17 @@ def endpoint() -> str:
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def until(condition: Callable[[], bool], seconds: float = 40.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.005)
 
 
-def test_robots_arrive_though_messages_are_lost_and_get_new_goals(endpoint: str) -> None:
+@pytest.mark.parametrize("poses", [False, True])
+def test_robots_arrive_though_messages_are_lost_and_get_new_goals(endpoint: str, poses: bool) -> None:
     with served(endpoint) as server:
-        fleet = Fleet(endpoint, problem().start[:, :2].astype(float), loss=0.2)
+        fleet = Fleet(endpoint, problem().start[:, :2].astype(float), loss=0.2, poses=poses)
         try:
             until(lambda: bool((np.linalg.norm(fleet.position - problem().goal, axis=1) < 0.1).all()))
             fleet.goal(0, [0.3, 0.2])
@@ -195,6 +202,14 @@ def test_emergency_stop_silence_and_restart(endpoint: str) -> None:
             fleet.close()
 
 
+def test_velocities_are_taken_from_poses() -> None:
+    robot, stamped = Robot("a", np.zeros(4, np.float32)), messages.PoseStamped()
+    for now, x, velocity in ((0.0, 1.0, 0.0), (0.01, 9.0, 0.0), (0.05, 1.1, 2.0), (0.06, 1.1, 2.0), (0.01, 3.0, 0.0)):
+        stamped.header.stamp.nanosec, stamped.pose.position.x = round(1e9 * now), x
+        robot.take_pose(stamped, 0.04)
+        assert robot.velocity == pytest.approx([velocity, 0, 0])
+
+
 def test_types_are_those_of_ros() -> None:
     for kind, expected in messages.HASHES.items():
         assert f"RIHS01_{expected}" == STORE.hash_rihs01(ros_name(kind))
@@ -211,8 +226,7 @@ def test_states_and_velocities_are_in_the_robots_own_frame(model: str) -> None:
     odometry = messages.Odometry()
     odometry.pose.pose.position = messages.Point(1.0, 2.0, 3.0)
     odometry.pose.pose.orientation.z = odometry.pose.pose.orientation.w = math.sqrt(0.5)
-    odometry.twist.twist.linear.x = 0.4
-    state = state_from(alone, 0, odometry)
+    state = state_from(alone, 0, odometry.pose.pose, np.array([0.4, 0, 0]))
     expected = {
         "holonomic2d": [1, 2, 0, 0.4], "velocity2d": [1, 2], "differential_drive": [1, 2, math.pi / 2, 0.4],
         "unicycle": [1, 2, math.pi / 2], "holonomic3d": [1, 2, 3, 0, 0.4, 0],
