@@ -16,10 +16,10 @@ export PIP_DISABLE_PIP_VERSION_CHECK ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all integrations portability wheel warm-wheel wheel-test lint docs bench results format clean
+.PHONY: help demo test test-all integrations portability wheel warm-wheel wheel-test lint docs bench bench-compare results format clean
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 demo: $(CORE_STAMP) ## Plan 16 robots across a warehouse, execute the plan, write pictures to demo/
 	$(BIN)/d4orm demo --out demo
@@ -67,6 +67,9 @@ docs: $(DEV_STAMP) ## Build the documentation into docs/_build/html
 
 bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 	$(BIN)/d4orm bench --out bench
+
+bench-compare: $(CORE_STAMP) ## Print what got slower since a commit: make bench-compare BASE=main BENCH_ARGS='--quick'
+	$(BIN)/python tests/release/bench_compare.py $(BASE) $(BENCH_ARGS)
 
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in examples/studies/data/
 	$(BIN)/python -m examples.studies --out docs/tables

@@ -23,6 +23,9 @@ from d4orm_planners.benchmark.settings import MODELS, QUICK, SECTIONS, Benchmark
 from d4orm_planners.benchmark.timing import Spread, measure
 from d4orm_planners.cli import app as cli
 
+sys.path.append(str(Path(__file__).parents[1] / "release"))
+from bench_compare import slower
+
 TINY: dict[str, Any] = {
     "num_robots": (2, 3),
     "models": ("holonomic2d",),
@@ -281,3 +284,16 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
 def test_every_section_has_a_table() -> None:
     assert tuple(bench_report._SECTIONS) == SECTIONS
     assert {part[0] for part in parts(BenchmarkSettings(**TINY))} <= set(SECTIONS)
+
+
+def test_rows_that_got_slower_are_told() -> None:
+    def report(step: float, iterations: float = 1.0) -> dict[str, Any]:
+        row = {"engine": "cpu", "num_robots": 8, "step": {"median": step}, "iterations": {"median": iterations}}
+        return {"date": "today", "denoising": [row]}
+
+    base = [report(0.010), report(0.030), report(0.011)]
+    assert slower(base, [report(0.0121), report(0.0119), report(0.0120, 9.0)]) == []
+    assert slower(base, [report(0.0132), report(0.0001), report(0.0140)]) == [
+        " 1.20 times  denoising: cpu 8, step: 0.011 -> 0.0132 s"
+    ]
+    assert slower(base, [{"denoising": [{"engine": "jax", "step": {"median": 9.0}}]}]) == []
