@@ -1,6 +1,8 @@
 """The JAX engine's sampling: a whole denoising run is one compiled loop.
 
-Nothing returns to the host before it ends, or before the next look at whether it is to be stopped.
+Nothing returns to the host before it ends, or before the next look at whether it is to be stopped. Where there are
+several devices each rolls out its share of the samples, and all make the mean of all samples: plans are those of one
+device, but for what compilers round differently.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.sharding import AxisType, NamedSharding
+from jax.sharding import PartitionSpec as P
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -49,6 +53,7 @@ class _Static(NamedTuple):
     collisions: bool
     per_pair: bool
     credit: str
+    devices: int
 
 
 class _Inputs(NamedTuple):
@@ -63,10 +68,16 @@ class _Inputs(NamedTuple):
     seed: tuple[Array, Array]
 
 
-def _deformations(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> Array:
-    """``(H, K, m, M)`` samples of the deformation."""
+def _replicated(devices: int) -> NamedSharding:
+    """The same array on each of the devices."""
+    mesh = jax.make_mesh((devices,), ("samples",), (AxisType.Auto,), devices=jax.local_devices()[:devices])
+    return NamedSharding(mesh, P())
+
+
+def _deformations(samples: Array, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> Array:
+    """``(H, K, m, M)`` of the deformation's samples of those numbers ``(M,)``."""
     horizon, num_robots, size = mean.shape
-    counters, cosine, sine = noise.turned(jnp.arange(static.num_samples, dtype=jnp.uint32)[None, None], BIT_OPS)
+    counters, cosine, sine = noise.turned(samples[None, None], BIT_OPS)
     times = jnp.arange(horizon, dtype=jnp.uint32)[:, None, None]
     robots = jnp.arange(num_robots, dtype=jnp.uint32)[None, :, None]
     low, high = inputs.seed
@@ -80,18 +91,48 @@ def _deformations(static: _Static, inputs: _Inputs, step: Array, mean: Array, sc
 
 def _score(static: _Static, inputs: _Inputs, step: Array, mean: Array, scale: Array) -> tuple[Array, Array]:
     """Roll all samples out; returns rewards ``(K, M)``, means over time, and the deformations ``(H, K, m, M)``."""
+    samples = jnp.arange(static.num_samples, dtype=jnp.uint32)
+    if static.devices == 1:
+        deformations = _deformations(samples, inputs, step, mean, scale)
+        return _rewards(static, inputs, deformations), deformations
+    all_of_it = _replicated(static.devices)
+
+    def share(samples: Array, inputs: _Inputs, *rest: Array) -> Array:
+        return _rewards(static, inputs, _deformations(samples, inputs, *rest))
+
+    by_device = jax.shard_map(
+        share,
+        mesh=all_of_it.mesh,
+        in_specs=(P("samples"), P(), P(), P(), P()),
+        out_specs=P(None, "samples"),
+        check_vma=False,  # Pallas does not say what varies
+    )
+    scored = by_device(samples, inputs, step, mean, scale), _deformations(samples, inputs, step, mean, scale)
+    rewards, deformations = (jax.lax.with_sharding_constraint(part, all_of_it) for part in scored)
+    return rewards, deformations
+
+
+def _rewards(static: _Static, inputs: _Inputs, deformations: Array) -> Array:
+    """``(K, M)`` means over time of deformations ``(H, K, m, M)``."""
     arrays = inputs.arrays
-    num_robots, num_samples = len(arrays.goal), static.num_samples
+    num_robots, size, num_samples = deformations.shape[1:]
     begin = Worlds(
         jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, num_samples)),
         jnp.broadcast_to(inputs.docked[:, None], (num_robots, num_samples)),
-        jnp.zeros((num_robots, mean.shape[2], num_samples), jnp.float32),
+        jnp.zeros((num_robots, size, num_samples), jnp.float32),
     )
-    deformations = _deformations(static, inputs, step, mean, scale)
     after = roll_out(static.models, arrays, begin, inputs.base[..., None] + deformations)
     obstacles = None if inputs.moving is None else (inputs.moving.positions, inputs.moving.headings)
-    rewards = jax.vmap(partial(_step_rewards, static, inputs))(after.state, obstacles)
-    return rewards.mean(axis=0), deformations
+    rewards: Array = jax.vmap(partial(_step_rewards, static, inputs))(after.state, obstacles)
+    return _sum(rewards) / jnp.float32(len(rewards))
+
+
+def _sum(rows: Array) -> Array:
+    """Sum over the first axis, pair by pair: a compiler's own order changes with the number of samples."""
+    while len(rows) > 1:
+        half = len(rows) // 2
+        rows = jnp.concatenate([rows[:half] + rows[half : 2 * half], rows[2 * half :]])
+    return rows[0]
 
 
 def _step_rewards(
@@ -99,7 +140,7 @@ def _step_rewards(
 ) -> Array:
     """``(K, M)`` rewards of one step, which led to ``state`` ``(K, n, M)``."""
     arrays = inputs.arrays
-    near_robot = jnp.zeros((len(state), static.num_samples), int)
+    near_robot = jnp.zeros((len(state), state.shape[-1]), int)
     if static.collisions:
         near_robot = robot_contacts(arrays, state, arrays.margin)
         if inputs.moving is not None and obstacle is not None:
@@ -135,15 +176,15 @@ def _denoise(
         mean, factor, scale = run.mean, run.factor, run.factor * noise_scale[step] * inputs.units[None]
         rewards, deformations = _score(static, inputs, step.astype(jnp.uint32), mean, scale)
         if static.credit == "team":
-            rewards = rewards.mean(axis=0, keepdims=True)
+            rewards = _sum(rewards)[None] / jnp.float32(len(rewards))
         finite = jnp.isfinite(rewards)
         # A sample that blew up has weight zero, and zero times infinity must not reach the mean.
         usable = jnp.where(jnp.isfinite(deformations), deformations, 0)
         extra: tuple[Array, ...] = ()
         if static.rules.importance:
             slope = (inputs.base + mean) / scale**2
-            ratio = -((usable - mean[..., None]) * slope[..., None]).sum(axis=(0, 2))
-            ratio = ratio.sum(axis=0, keepdims=True) if static.credit == "team" else ratio
+            ratio = -_sum(((usable - mean[..., None]) * slope[..., None]).sum(axis=2))
+            ratio = _sum(ratio)[None] if static.credit == "team" else ratio
             extra = (static.rules.importance * ratio,)
         weights = static.rules.weights(jnp.where(finite, rewards, -jnp.inf), jnp, *extra)
         weights = jnp.broadcast_to(jnp.asarray(weights, jnp.float32), (mean.shape[1], static.num_samples))
@@ -161,12 +202,20 @@ def _denoise(
     return jax.lax.fori_loop(begin, end, update, run)
 
 
+def _devices(num_samples: int) -> int:
+    """Devices among which so many samples are shared: all, or one where that does not come out even."""
+    devices = jax.local_device_count()
+    return devices if num_samples % devices == 0 else 1
+
+
 @lru_cache(maxsize=256)
 def _compiled_denoise(
     static: _Static, treedef: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], np.dtype[np.generic]], ...]
 ) -> jax.stages.Compiled:
     """The denoising run compiled for arguments of these shapes, ahead of the call."""
-    arguments = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
+    sharding = None if static.devices == 1 else _replicated(static.devices)
+    leaves = [jax.ShapeDtypeStruct(shape, dtype, sharding=sharding) for shape, dtype in shapes]
+    arguments = jax.tree.unflatten(treedef, leaves)
     return jax.jit(partial(_denoise, static)).lower(*arguments).compile()
 
 
@@ -188,7 +237,8 @@ class JaxSamplingEngine(JaxEngine):
             task.arrays, task.penalties, problem.team.control_units, task.base, docked, task.moving,
             noise.seed_words(seed),
         )  # fmt: skip
-        static = _Static(problem.team.models, rules, num_samples, task.collisions, task.penalty_per_pair, task.credit)
+        counted = task.collisions, task.penalty_per_pair, task.credit
+        static = _Static(problem.team.models, rules, num_samples, *counted, _devices(num_samples))
         scale = np.asarray(noise_scale, np.float32)
         begun: tuple[Any, ...] = mean, task.first_factor, np.zeros_like(scale), np.int32(0)
         arguments = _Inputs(*scored), scale, _DenoisingState(*begun), np.int32(0), np.int32(len(scale))
@@ -218,7 +268,8 @@ class JaxSamplingEngine(JaxEngine):
         if watcher is not None:
             raise ValueError("engine 'jax' runs all denoising steps as one program; to watch them, use engine='cpu'")
         compiled, arguments = self._lower(task, rules, mean, noise_scale, num_samples, seed)
-        inputs, scale, run, *_ = jax.device_put(arguments)
+        devices = _devices(num_samples)
+        inputs, scale, run, *_ = jax.device_put(arguments, None if devices == 1 else _replicated(devices))
         done, total = 0, len(noise_scale)
         part = total if should_stop is None else 1
         while done < total and not (should_stop is not None and should_stop()):

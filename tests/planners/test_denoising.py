@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -110,3 +113,28 @@ def test_the_denoising_is_drawn_and_replayed(scenario: str, tmp_path: Path) -> N
     scene = plan.motion(denoising=seen).content
     assert scene["denoising"]["labels"] == list(seen.labels)
     assert scene["denoising"]["points"] == seen.paths.shape[1]
+
+
+SHARED = """
+import sys
+import jax, numpy as np
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+problem = make_problem("circle", num_robots=3, goal_speed=np.inf)
+for name, preset in (("d4orm", None), ("d4orm", "paper"), ("cem", None)):
+    planner = make_planner(name, preset=preset, engine="jax", num_samples=128, num_steps=6)
+    sys.stdout.buffer.write(planner.solve(problem, seed=1, max_iterations=1).controls.tobytes())
+sys.stderr.write(str(jax.local_device_count()))
+"""
+
+
+@pytest.mark.slow
+def test_several_devices_share_the_samples_of_one_plan() -> None:
+    plans = []
+    for devices in (1, 4):
+        flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "JAX_PLATFORMS": "cpu"}
+        ran = subprocess.run([sys.executable, "-c", SHARED], env=os.environ | flags, capture_output=True, check=True)
+        assert ran.stderr.decode().endswith(str(devices))
+        plans.append(np.frombuffer(ran.stdout, np.float32))
+    np.testing.assert_allclose(*plans, atol=1e-3)
+    assert np.abs(plans[0]).max() > 0.5
