@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import BoolArray
 from d4orm_env.core.lazy import LazyModule
-from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode
+from d4orm_planners.rl.dataset.demonstrations import RecordedEpisode
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
