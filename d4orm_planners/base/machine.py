@@ -52,7 +52,7 @@ def commit() -> str:
 
     Empty for a package that is installed elsewhere, and without git.
     """
-    package = Path(__file__).parent
+    package = Path(__file__).parents[1]
     if not (package.parent / ".git").exists():
         return ""
     try:

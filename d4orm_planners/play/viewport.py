@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,21 +34,12 @@ HORIZON = "predict_horizon"
 """Setting of policies that look ahead."""
 
 
-class _Snapshot(NamedTuple):
-    states: FloatArray
-    goals: FloatArray
-    arrived: BoolArray
-    collided: BoolArray
-    violated: BoolArray
-    bodies: FloatArray
-
-
 class EpisodeBuffer:
     """Steps since team, world or policies last changed; one thread may add while others make replays."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._snapshots: deque[_Snapshot] = deque(maxlen=MOST_STEPS)
+        self._snapshots: deque[tuple[np.ndarray, ...]] = deque(maxlen=MOST_STEPS)
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -63,29 +53,27 @@ class EpisodeBuffer:
                 too close, and ``(N, 2 d + 1)`` what moves about and is no robot.
         """
         with self._lock:
-            self._snapshots.append(_Snapshot(*snapshot))
+            self._snapshots.append(snapshot)
 
     def motion(self, policy: str) -> ReplayMotion:
         """Return the motion for a replay."""
         with self._lock:
             problem, snapshots = self._problem, list(self._snapshots)
-        states = np.stack([snapshot.states for snapshot in snapshots])
+        *stacked, around = zip(*snapshots, strict=True)
+        states, goals, arrived, collided, violated = map(np.stack, stacked)
         steps = len(snapshots) - 1
         trajectory = Trajectory(
             states=states,
             positions=states[..., : problem.dimension],
             controls=np.zeros((steps, problem.num_robots, problem.control_size), np.float32),
             rewards=np.zeros((steps, problem.num_robots), np.float32),
-            arrived=np.stack([snapshot.arrived for snapshot in snapshots]),
-            collided=np.stack([snapshot.collided for snapshot in snapshots]),
-            margin_violated=np.stack([snapshot.violated for snapshot in snapshots]),
+            arrived=arrived,
+            collided=collided,
+            margin_violated=violated,
         )
-        goals = np.stack([snapshot.goals for snapshot in snapshots])
-        bodies = np.zeros(
-            (len(snapshots), max(len(snapshot.bodies) for snapshot in snapshots), 2 * problem.dimension + 1), np.float32
-        )
-        for row, snapshot in zip(bodies, snapshots):
-            row[: len(snapshot.bodies)] = snapshot.bodies
+        bodies = np.zeros((len(snapshots), max(map(len, around)), 2 * problem.dimension + 1), np.float32)
+        for row, present in zip(bodies, around):
+            row[: len(present)] = present
         return motion(problem, trajectory, f"{policy}, {steps * problem.dt:.1f} s", goals=goals, bodies=bodies)
 
 

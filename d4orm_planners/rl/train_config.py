@@ -151,10 +151,6 @@ def make_stages(num_robots: int, scenario: str, steps: int, unit: int, count: in
     return tuple(stages)
 
 
-def _as_tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrainingSettings(TrainConfig):
     """Settings of a training.
@@ -194,7 +190,9 @@ class TrainingSettings(TrainConfig):
     learning_rate: Annotated[Positive, Field(le=1)] | None = None
     learner_settings: Mapping[str, Number] = field(default_factory=dict)
     reward_settings: Mapping[str, Number] = field(default_factory=dict)
-    mixture: Annotated[tuple[str, ...], BeforeValidator(_as_tuple)] = ()
+    mixture: Annotated[
+        tuple[str, ...], BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+    ] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
