@@ -83,7 +83,7 @@ def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
 
 
 def step_faults(problem: Problem, trajectory: Trajectory, unreachable: Set[int]) -> dict[int, list[str]]:
-    """What each robot that fails does wrong at the steps, in words; those without a path to their goals are given."""
+    """Say what each failing robot does wrong at the steps; those without a path to their goals are given."""
     near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
     rounding = ["comes so near to the margin of something that rounding decides"]
     faults = {}

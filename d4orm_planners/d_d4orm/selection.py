@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from d4orm_planners.d_d4orm.messages import Message
 
 Item: TypeAlias = "Report | Message"
-"""What a node sent, with its number; evaluated or not."""
+"""Candidate of a node, evaluated or as it was sent."""
 
 SELECTIONS = ("top-k", "max", "k-means")
 

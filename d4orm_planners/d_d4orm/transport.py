@@ -47,7 +47,7 @@ class Mailbox:
             self._changed.notify_all()
 
     def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """What has arrived, see :meth:`Transport.collect`."""
+        """Return what has arrived, see :meth:`Transport.collect`."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._arrived, timeout)
             messages = [] if self.closed else list(self._arrived)

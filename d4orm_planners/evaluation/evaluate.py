@@ -192,17 +192,14 @@ def _missing(jobs: Sequence[Job], finished: Set[TrialKey]) -> tuple[list[Job], i
     wanted: set[TrialKey] = set()
     missing = []
     for job in jobs:
-        keys = {condition: job.key(condition) for condition in job.conditions}
-        # The same problem may be asked for under two names, and all disturbances at level zero are one condition.
-        first = {key: condition for condition, key in reversed(keys.items())}
-        left = tuple(
-            condition
-            for condition, key in keys.items()
-            if key not in finished and key not in wanted and first[key] is condition
-        )
-        wanted.update(keys.values())
+        left = []
+        for condition in job.conditions:
+            # The same problem may be asked for under two names, and all disturbances at level zero are one condition.
+            if (key := job.key(condition)) not in wanted:
+                wanted.add(key)
+                left += [condition] if key not in finished else []
         if left:
-            missing.append(replace(job, conditions=left))
+            missing.append(replace(job, conditions=tuple(left)))
     return missing, len(wanted) - sum(len(job.conditions) for job in missing), len(wanted)
 
 

@@ -71,7 +71,7 @@ class Method(NamedTuple):
     """Weights and limits of the alternation, with its basis.
 
     Attributes:
-        place: ``(T, n+1)`` see :class:`~d4orm_planners.baselines.amswarm.swarm.Basis`.
+        place: ``(T, n+1)`` see :class:`Basis`.
         velocity: ``(T, n+1)``.
         acceleration: ``(T, n+1)``.
         squares: ``(4, n+1, n+1)`` of the constraints on places, velocities and accelerations the sums of squares over
