@@ -20,7 +20,7 @@ from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm import ray_planner
-from d4orm_planners.d_d4orm.ray_connection import RayConnection
+from d4orm_planners.d_d4orm.ray_planner import RayConnection
 
 SETTINGS: dict[str, Any] = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "improve": True, "k": 2}
 

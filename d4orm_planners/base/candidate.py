@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.types import Engine
 from d4orm_env.verify import VerificationReport, verify
-from d4orm_planners.base.plan import failed_robots
+from d4orm_planners.base.conflict_groups import Graph, conflicts
 
 PLAN_REACH = LARGEST_NUMBER / LARGEST
 """Times its limit that a planned control may be, so that no square of it overflows: some methods scale theirs up."""
@@ -69,3 +70,47 @@ def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, ch
     failed = failed_robots(trajectory, check_interval)
     report = None if failed_robots(trajectory).any() else verify(problem, trajectory.controls)
     return Candidate(planned, trajectory.controls, trajectory, failed, report)
+
+
+def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
+    """``(K,)`` robots that do not arrive, or violate the margin at some ``check_interval``-th step.
+
+    The start itself cannot be planned away, so it does not count.
+    """
+    violated = trajectory.margin_violated[check_interval::check_interval]
+    failed: BoolArray = ~trajectory.arrived[-1] | violated.any(axis=0)
+    return failed
+
+
+def step_faults(problem: Problem, trajectory: Trajectory, unreachable: Set[int]) -> dict[int, list[str]]:
+    """Say what each failing robot does wrong at the steps; those without a path to their goals are given."""
+    near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
+    rounding = ["comes so near to the margin of something that rounding decides"]
+    faults = {}
+    for robot in np.flatnonzero(failed_robots(trajectory)).tolist():
+        missed = _not_there(problem, trajectory, robot, robot in unreachable)
+        faults[robot] = [*missed, *_too_near(problem, trajectory, robot, near)] or rounding
+    return faults
+
+
+def _not_there(problem: Problem, trajectory: Trajectory, robot: int, unreachable: bool) -> Iterator[str]:
+    if not trajectory.arrived[-1, robot]:
+        gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
+        turns = (problem.team.headings(trajectory.states[-1]) - problem.goal_heading)[robot] / (2 * np.pi)
+        missed = 2 * np.pi * abs(turns - np.round(turns))
+        yield f"ends {gap:.2g} m from its goal" + (f", {missed:.2g} rad off" if missed > 0 else "")
+    if unreachable:
+        reach = problem.team.radius[robot] + problem.margin
+        yield f"has no path from start to goal that is {reach:.4g} m clear of obstacles"
+
+
+def _too_near(problem: Problem, trajectory: Trajectory, robot: int, near: Graph) -> Iterator[str]:
+    if problem.team.shapes:  # the discs round them do not tell what touches what
+        if trajectory.margin_violated[1:, robot].any():
+            yield "comes within the margin of something"
+        return
+    if near[robot]:
+        yield f"comes within the margin of {', '.join(f'robot_{other}' for other in sorted(near[robot]))}"
+    reach = problem.team.radius[robot] + problem.margin
+    if problem.world.clearance(trajectory.positions[1:, robot]).min() <= reach:
+        yield "comes within the margin of an obstacle or the bounds"

@@ -63,10 +63,6 @@ def reconnected(graph: Graph, previous: Grouping | None) -> Graph:
 
     A robot of a previous group that now conflicts with a robot outside that group is joined again to those of its
     previous direct neighbours that are free of conflicts now.
-
-    Args:
-        graph: Conflicts now.
-        previous: Groups of the previous iteration, or ``None``.
     """
     if previous is None:
         return graph
@@ -111,12 +107,7 @@ def failure_groups(failed: BoolArray, groups: Groups) -> Groups:
 
 
 def independent_robots(candidates: Iterable[int], graph: Graph) -> tuple[int, ...]:
-    """Return those candidates, taken in order, that conflict with none taken before; sorted.
-
-    Args:
-        candidates: Robots, the most wanted first.
-        graph: Conflicts.
-    """
+    """Return those candidates, taken in order, that conflict with none taken before; sorted."""
     taken: set[int] = set()
     for robot in candidates:
         if taken.isdisjoint(graph[robot]):

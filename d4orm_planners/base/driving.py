@@ -29,32 +29,27 @@ class Driving:
         return Driving, ()
 
     @contextmanager
-    def _alone(self) -> Iterator[None]:
+    def turn(self, env: Any = None) -> Iterator[None]:
+        """While a thread resets the policy for an environment or, without one, asks it for controls.
+
+        Raises:
+            RuntimeError: If another thread does so at this moment, or has reset the policy for its own environment.
+        """
         if not self._lock.acquire(blocking=False):
             raise RuntimeError(f"another thread is using this policy at this moment; {_REMEDY}")
+        thread = threading.get_ident()
         try:
+            if env is not None:
+                episode = thread, id(getattr(env, "unwrapped", env))
+                if self._episode is not None and self._episode[1] != episode[1]:
+                    self._replaced.add(self._episode[0])
+                self._replaced.discard(thread)
+                self._episode = episode
+            elif thread in self._replaced:
+                raise RuntimeError(f"another thread has reset this policy for an environment of its own; {_REMEDY}")
             yield
         finally:
             self._lock.release()
-
-    @contextmanager
-    def beginning(self, env: Any) -> Iterator[None]:
-        """While a thread resets the policy for an environment."""
-        with self._alone():
-            episode = threading.get_ident(), id(getattr(env, "unwrapped", env))
-            if self._episode is not None and self._episode[1] != episode[1]:
-                self._replaced.add(self._episode[0])
-            self._replaced.discard(episode[0])
-            self._episode = episode
-            yield
-
-    @contextmanager
-    def acting(self) -> Iterator[None]:
-        """While a thread asks the policy for controls."""
-        with self._alone():
-            if threading.get_ident() in self._replaced:
-                raise RuntimeError(f"another thread has reset this policy for an environment of its own; {_REMEDY}")
-            yield
 
 
 def driven_alone(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -62,18 +57,10 @@ def driven_alone(method: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(method)
     def guarded(policy: Any, *arguments: Any, **keywords: Any) -> Any:
-        with _of(policy).acting():
+        # One step, so that two threads do not make two; a subclass need not call a constructor for it.
+        driving: Driving = vars(policy).setdefault(ATTRIBUTE, Driving())
+        env = keywords.get("env", *arguments[:1]) if method.__name__ == "reset" else None
+        with driving.turn(env):
             return method(policy, *arguments, **keywords)
 
-    @wraps(method)
-    def guarded_reset(policy: Any, env: Any, *arguments: Any, **keywords: Any) -> Any:
-        with _of(policy).beginning(env):
-            return method(policy, env, *arguments, **keywords)
-
-    return guarded_reset if method.__name__ == "reset" else guarded
-
-
-def _of(policy: Any) -> Driving:
-    # One step, so that two threads do not make two; a subclass need not call a constructor for it.
-    driving: Driving = vars(policy).setdefault(ATTRIBUTE, Driving())
-    return driving
+    return guarded

@@ -60,13 +60,7 @@ def approach_goals(
 
 
 def drive_further_in(search: SolveRun, candidate: Candidate, evaluate: Callable[[FloatArray], Candidate]) -> Candidate:
-    """The candidate, or if rounding alone decides who has arrived in it, one whose robots drive further in.
-
-    Args:
-        search: The search.
-        candidate: Result of an iteration.
-        evaluate: Function that makes a candidate of controls ``(H, K, m)``.
-    """
+    """The candidate, or if rounding alone decides who has arrived in it, one whose robots drive further in."""
     report = candidate.report
     if report is None or report.ok or any(violation.kind != "not arrived" for violation in report.violations):
         return candidate

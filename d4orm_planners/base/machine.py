@@ -1,15 +1,19 @@
-"""The machine and the versions of libraries, for the record of what was measured."""
+"""The machine and the versions of libraries, for the record of what was measured, and the provenance of plans."""
 
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from d4orm_env import __version__
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.engine.threads import available_cores
 
@@ -48,7 +52,7 @@ def commit() -> str:
 
     Empty for a package that is installed elsewhere, and without git.
     """
-    package = Path(__file__).parent
+    package = Path(__file__).parents[1]
     if not (package.parent / ".git").exists():
         return ""
     try:
@@ -71,3 +75,37 @@ def _processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Origin of a plan, beside its planner's name and the seed.
+
+    Attributes:
+        preset: Of :func:`~d4orm_planners.make_planner`; ``None`` for the defaults.
+        settings: All settings of the planner, by name; what JSON has no word for as text.
+        version: Of this package.
+        machine: Processor, cores and system, as the benchmark describes them.
+    """
+
+    preset: str | None
+    settings: Mapping[str, object]
+    version: str
+    machine: Mapping[str, object]
+
+    def __post_init__(self) -> None:
+        kinds = {"preset": (str, type(None)), "settings": Mapping, "version": str, "machine": Mapping}
+        for name, kind in kinds.items():
+            if not isinstance(getattr(self, name), kind):  # type: ignore[arg-type]
+                raise ValueError(f"{name} of the provenance is {getattr(self, name)!r}")
+
+    @classmethod
+    def here(cls, preset: str | None, settings: Mapping[str, object]) -> Provenance:
+        """Return that of a plan made by a planner with this preset and these settings here and now."""
+        plain = json.loads(json.dumps(settings, default=str))
+        return cls(preset=preset, settings=plain, version=__version__, machine=_machine())
+
+
+@cache
+def _machine() -> dict[str, object]:
+    return describe_machine()

@@ -85,7 +85,7 @@ for _name, _path in {
 
 for _name, _path in {
     "d4orm-c2f": "d4orm_c2f.receding_horizon:D4ormC2F",
-    "go-to-goal": "baselines.go_to_goal:GoToGoal",
+    "go-to-goal": "base.policy:GoToGoal",
     "random": "base.policy:RandomControls",
     "orca": "baselines.orca:Orca",
     "ppo": "rl.learned:PPO",

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.lazy import LazyModule
@@ -21,9 +19,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport, verify
-from d4orm_planners.base.conflict_groups import Graph, conflicts
+from d4orm_planners.base.candidate import step_faults
 from d4orm_planners.base.display import DisplayMixin
-from d4orm_planners.base.provenance import Provenance
+from d4orm_planners.base.machine import Provenance
 
 if TYPE_CHECKING:
     from d4orm_env.scenarios import dynobench
@@ -163,42 +161,13 @@ class Plan(DisplayMixin):
         if self.status == "infeasible":
             reasons = {robot: [proof] for robot, proof in prove_infeasible(self.problem).items()}
         else:
-            reasons = self._faults()
+            unreachable = {robot for record in self.history for robot in record.unreachable}
+            reasons = step_faults(self.problem, self.trajectory, unreachable)
         if not reasons:
             for violation in self._report.violations:
                 for robot in violation.robots:
                     reasons.setdefault(robot, []).append(str(violation))
         return {f"robot_{robot}": "; ".join(reasons[robot]) for robot in sorted(reasons)}
-
-    def _faults(self) -> dict[int, list[str]]:
-        """Return the faults of robots at the steps."""
-        near = conflicts(self.trajectory.positions, self.problem.team.radius, self.problem.margin)
-        rounding = ["comes so near to the margin of something that rounding decides"]
-        failed = np.flatnonzero(failed_robots(self.trajectory)).tolist()
-        return {robot: [*self._not_there(robot), *self._too_near(robot, near)] or rounding for robot in failed}
-
-    def _not_there(self, robot: int) -> Iterator[str]:
-        problem, trajectory = self.problem, self.trajectory
-        if not trajectory.arrived[-1, robot]:
-            gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
-            turns = (problem.team.headings(trajectory.states[-1]) - problem.goal_heading)[robot] / (2 * np.pi)
-            missed = 2 * np.pi * abs(turns - np.round(turns))
-            yield f"ends {gap:.2g} m from its goal" + (f", {missed:.2g} rad off" if missed > 0 else "")
-        if any(robot in record.unreachable for record in self.history):
-            reach = problem.team.radius[robot] + problem.margin
-            yield f"has no path from start to goal that is {reach:.4g} m clear of obstacles"
-
-    def _too_near(self, robot: int, near: Graph) -> Iterator[str]:
-        problem, trajectory = self.problem, self.trajectory
-        if problem.team.shapes:  # the discs round them do not tell what touches what
-            if trajectory.margin_violated[1:, robot].any():
-                yield "comes within the margin of something"
-            return
-        if near[robot]:
-            yield f"comes within the margin of {', '.join(f'robot_{other}' for other in sorted(near[robot]))}"
-        reach = problem.team.radius[robot] + problem.margin
-        if problem.world.clearance(trajectory.positions[1:, robot]).min() <= reach:
-            yield "comes within the margin of an obstacle or the bounds"
 
     def sample(
         self, rate: float = 100.0, *, max_acceleration: ArrayLike | None = None, max_jerk: ArrayLike | None = None
@@ -303,13 +272,3 @@ class Plan(DisplayMixin):
 def load_plan(path: str | os.PathLike[str]) -> Plan:
     """:meth:`Plan.load`, beside :func:`d4orm_env.load_problem`."""
     return Plan.load(path)
-
-
-def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
-    """``(K,)`` robots that do not arrive, or violate the margin at some ``check_interval``-th step.
-
-    The start itself cannot be planned away, so it does not count.
-    """
-    violated = trajectory.margin_violated[check_interval::check_interval]
-    failed: BoolArray = ~trajectory.arrived[-1] | violated.any(axis=0)
-    return failed

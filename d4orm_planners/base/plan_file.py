@@ -22,8 +22,9 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
 from d4orm_env.scenarios.schema import describe, parse
 from d4orm_env.verify import verify
-from d4orm_planners.base.plan import IterationRecord, Plan, failed_robots
-from d4orm_planners.base.provenance import Provenance
+from d4orm_planners.base.candidate import failed_robots
+from d4orm_planners.base.machine import Provenance
+from d4orm_planners.base.plan import IterationRecord, Plan
 
 FORMAT = "d4orm-plan-1"
 
@@ -41,7 +42,6 @@ _SCALARS = ("planner", "seed", "solved", "status", "iterations", "denoising_step
 
 
 def save_plan(plan: Plan, path: str | os.PathLike[str]) -> None:
-    """See :meth:`Plan.save`."""
     target = _npz_path(path)
     header = {
         "format": FORMAT,
@@ -56,7 +56,6 @@ def save_plan(plan: Plan, path: str | os.PathLike[str]) -> None:
 
 
 def read_plan(path: str | os.PathLike[str]) -> Plan:
-    """See :meth:`Plan.load`."""
     source = _npz_path(path)
     try:
         require_file(source, "a plan")

@@ -20,7 +20,7 @@ from d4orm_planners.base.driving import ATTRIBUTE, driven_alone
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.settings import CheckedSettings
-from d4orm_planners.tracking.steering import limit_controls
+from d4orm_planners.tracking.steering import drive_to_goal, limit_controls
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -228,6 +228,15 @@ class OpenLoop(StatePolicy):
         if joint.steps >= len(self.plan.controls):
             return np.zeros_like(self.plan.controls[0])
         return self.plan.controls[joint.steps]
+
+
+class GoToGoal(StatePolicy):
+    """Drives straight to the goal and brakes for it, as if it were alone."""
+
+    name = "go-to-goal"
+
+    def _controls(self, joint: JointState) -> FloatArray:
+        return drive_to_goal(self.problem, joint.states, joint.goals)
 
 
 class RandomControls(StatePolicy):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -18,9 +20,8 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import checked_controls
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.final_approach import drive_further_in
+from d4orm_planners.base.machine import Provenance
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
-from d4orm_planners.base.provenance import Provenance
-from d4orm_planners.base.stopwatch import Stopwatch
 from d4orm_planners.engine.sampling_types import (
     DenoisingStep,
     SamplingEngine,
@@ -33,6 +34,40 @@ from d4orm_planners.engine.select import get_sampling_engine
 
 if TYPE_CHECKING:
     from d4orm_planners.base.planner import Planner, State
+
+
+class Stopwatch:
+    """Wall time since it was made, what was left out not counted."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._paused = 0.0
+        self._paused_since: float | None = None
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds so far."""
+        return time.perf_counter() - self._start - self._paused
+
+    @property
+    def paused_seconds(self) -> float:
+        """Seconds left out so far, those of a pause that lasts included; other threads may look."""
+        since = self._paused_since
+        return self._paused if since is None else self._paused + time.perf_counter() - since
+
+    def leave_out(self, seconds: float) -> None:
+        """Leave out some seconds of the time so far."""
+        self._paused += seconds
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leave the time of the block out."""
+        begin = self._paused_since = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._paused_since = None
+            self._paused += time.perf_counter() - begin
 
 
 class SolveRun:

@@ -1,53 +1,36 @@
 """The motion of a whole team as one nonlinear program, written for CasADi (paper, Eq. 1 and section IV-B).
 
-M. Kelly, "An Introduction to Trajectory Optimization", SIAM Review, 2017; A. Waechter and L. T. Biegler, "On the
-Implementation of an Interior-Point Filter Line-Search Algorithm for Large-Scale Nonlinear Programming", Mathematical
-Programming, 2006.
+M. Kelly, "An Introduction to Trajectory Optimization", SIAM Review, 2017.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import chain
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import Floats, IntArray
-from d4orm_env.core.lazy import LazyModule, load
+from d4orm_env.core.lazy import load
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.dynamics.collision import axis_gap
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, Ops
 from d4orm_env.dynamics.transition import TimeStep
-from d4orm_planners.baselines.abandoning import run_or_abandon
-
-casadi: Any = LazyModule("casadi", "planner 'ipopt'", "ipopt")
+from d4orm_planners.baselines.ipopt_run import Expression, NonlinearProgram, Options, casadi, run_ipopt
 
 OBJECTIVE_SCALE = 10.0
 """Scale of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
 
-FEASIBILITY = 1e-5
-"""Largest violation of a constraint that IPOPT may leave, in the program's units; the clearance makes up for it."""
-
-ABANDONED = "Abandoned_At_Time_Limit"
-"""Status of a run that was left before IPOPT could end it."""
-
 TINY = 1e-9
 """Added to squared distances, since the square root has no derivative at zero, in the program's units."""
 
-IPOPT = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY}
-CASADI = {"print_time": False, "show_eval_warnings": False}
-"""Options of every solve."""
-
-Options = Mapping[str, object]
 Contacts = dict[tuple[int, int], NDArray[np.int64]]
 """Steps at which robot ``k`` is kept clear of body ``b``: robot ``b``, or from ``K`` on obstacle ``b - K``."""
-
-Expression: TypeAlias = Any
-"""CasADi's matrices, symbolic or of numbers; the library carries no types."""
 
 Rows = tuple[Expression, float, float]
 """A matrix of expressions with their lower and their upper bound."""
@@ -71,14 +54,8 @@ class TeamProgram:
     A control is held over its step, and the defect of a step is that of the environment's own RK4, so that a solution
     is what the engines roll out. Limits hold as they do there: on a norm, or on single components.
 
-    IPOPT's tolerances are absolute, so that it is given lengths in a unit in which robots have the default size.
-
-    Args:
-        problem: The problem.
-        clearance: Added to every distance to keep [m].
-
-    Raises:
-        ImportError: If CasADi is not installed.
+    IPOPT's tolerances are absolute, so that it is given lengths in a unit in which robots have the default size. Every
+    distance to keep is larger by ``clearance`` [m].
     """
 
     def __init__(self, problem: Problem, clearance: float) -> None:
@@ -113,57 +90,32 @@ class TeamProgram:
         options: Options,
         should_stop: Callable[[], bool],
     ) -> tuple[CollocatedMotion, str]:
-        """Solve from a guess.
+        """Solve from a guess, with robots at their goals by steps ``docks`` ``(K,)``, from which on they stay there.
 
-        Args:
-            guess: Start of IPOPT.
-            contacts: Pairs that are kept clear of each other, and when.
-            docks: ``(K,)`` steps by which the robots are at their goals, and from which on they stay there.
-            options: IPOPT's.
-            should_stop: Asked every hundredth of a second whether to end; it ends within a tenth, even where writing
-                the program or one of IPOPT's iterations takes longer.
+        ``should_stop`` is asked every hundredth of a second; it ends within a tenth, even where writing the program or
+        one of IPOPT's iterations takes longer.
 
         Returns:
             The motion that IPOPT came to, feasible or not, and its word for how it ended.
         """
-        reached = self._packed(guess)
-
-        def keep(values: Expression) -> None:
-            nonlocal reached
-            reached = values
-
-        ended = run_or_abandon(lambda ends: self._run_ipopt(guess, contacts, docks, options, keep, ends), should_stop)
+        write = partial(self._program, contacts, docks)
+        values, ended = run_ipopt(write, self._packed(guess), options, should_stop)
         # IPOPT gives up where a function has no value; the guess is then the best there is.
-        values = np.asarray(reached).ravel()
-        motion = self._unpacked(values) if np.isfinite(values).all() else guess
-        return motion, ABANDONED if ended is None else ended
+        return self._unpacked(values) if np.isfinite(values).all() else guess, ended
 
-    def _run_ipopt(
-        self,
-        guess: CollocatedMotion,
-        contacts: Contacts,
-        docks: IntArray,
-        options: Options,
-        keep: Callable[[Expression], None],
-        ends: Callable[[], bool],
-    ) -> str:
-        """Hand IPOPT's variables to ``keep`` after every iteration and at the end; return how it ended."""
+    def _program(self, contacts: Contacts, docks: IntArray) -> NonlinearProgram:
+        """The program as CasADi takes it."""
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(docks), *self._contact_rows(contacts, docks)]
-        program = {
+        sizes = [row.numel() for row, _, _ in rows]
+        lower, upper = (np.repeat([row[bound] for row in rows], sizes) for bound in (1, 2))
+        lowest, highest = self._variable_bounds()
+        functions = {
             "x": ca.vertcat(*map(ca.vec, chain(*self.variables))),
             "f": self._cost(),
             "g": ca.vertcat(*(ca.vec(row) for row, _, _ in rows)),
         }
-        sizes = [row.numel() for row, _, _ in rows]
-        lower, upper = (np.repeat([row[bound] for row in rows], sizes) for bound in (1, 2))
-        lowest, highest = self._variable_bounds()
-        stopper = _stopper(ca, {name: part.numel() for name, part in program.items()}, keep, ends)
-        settings = {"ipopt": {**IPOPT, **options}, **CASADI, "iteration_callback": stopper}
-        solver = ca.nlpsol("team", "ipopt", program, settings)
-        solution = solver(x0=self._packed(guess), lbx=lowest, ubx=highest, lbg=lower, ubg=upper)
-        keep(solution["x"])
-        return str(solver.stats()["return_status"])
+        return NonlinearProgram(functions, {"lbx": lowest, "ubx": highest, "lbg": lower, "ubg": upper})
 
     def contacts(self, motion: CollocatedMotion, lookout: float | None) -> Contacts:
         """Find what comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""
@@ -248,10 +200,7 @@ class TeamProgram:
         return self._norm(ca.vertcat(*outside)) + ca.fmin(depth, 0.0)
 
     def _cost(self) -> Expression:
-        """The mean of distance over initial distance, one minus the reward of a motion without violations.
-
-        Distances are smoothed within the goal radius, where a robot has docked anyway.
-        """
+        """The mean of distance over initial distance, smoothed within the goal radius, where a robot has docked."""
         problem, ca = self.problem, self.casadi
         weight = inverse_initial_distance(problem.start[:, : problem.dimension], problem.goal, problem.goal_radius)
         distances = (
@@ -343,33 +292,7 @@ class TeamProgram:
         controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size))
         sizes = [variable.numel() for variable in chain(*self.variables)]
         parts = np.split(values, np.cumsum(sizes)[:-1])
-        for robot, model in enumerate(self.models):
-            own = parts[robot].reshape(problem.horizon, -1)
-            states[1:, robot, : model.state_size] = self.units[0][robot] * own
-            own = parts[problem.num_robots + robot].reshape(problem.horizon, -1)
-            controls[:, robot, : model.control_size] = self.units[1][robot] * own
+        for values_of, units, first in zip((states[1:], controls), self.units, (0, problem.num_robots)):
+            for robot, unit in enumerate(units):
+                values_of[:, robot, : unit.size] = unit * parts[first + robot].reshape(problem.horizon, -1)
         return CollocatedMotion(states, controls)
-
-
-def _stopper(
-    casadi: Any, sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]
-) -> Expression:
-    """Return a callback for IPOPT, after every iteration of a program of these sizes, to end it at ``ends()``."""
-
-    class Stopper(casadi.Callback):
-        def __init__(self) -> None:
-            casadi.Callback.__init__(self)
-            self.construct("stopper", {})
-
-        def get_n_in(self) -> int:
-            return casadi.nlpsol_n_out()
-
-        def get_sparsity_in(self, index: int) -> Expression:
-            size = sizes.get(casadi.nlpsol_out(index).removeprefix("lam_"), 0)
-            return casadi.Sparsity.dense(size, min(size, 1))
-
-        def eval(self, arguments: Expression) -> list[int]:
-            keep(arguments[0])
-            return [int(ends())]
-
-    return Stopper()

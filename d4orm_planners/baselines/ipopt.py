@@ -14,7 +14,8 @@ from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Positive
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, TeamProgram, casadi
+from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, TeamProgram
+from d4orm_planners.baselines.ipopt_run import casadi
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -47,9 +48,6 @@ class IpoptConfig(PlannerConfig):
         tolerance: IPOPT's, on the scaled optimality error.
         barrier: IPOPT's first barrier parameter.
         solver_iterations: IPOPT's own iterations in each solve.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
     """
 
     max_iterations: Count = 20
@@ -64,12 +62,7 @@ class IpoptConfig(PlannerConfig):
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """The state of a solve, which stays as it is.
-
-    Attributes:
-        program: The problem as IPOPT is given it.
-        motion: Motion that every iteration perturbs.
-    """
+    """The state of a solve, which stays as it is."""
 
     program: TeamProgram
     motion: CollocatedMotion
@@ -96,7 +89,6 @@ class Ipopt(Planner):
         load(casadi)
 
     def init(self, search: SolveRun) -> WarmStart:
-        """See :meth:`Planner.init`."""
         program = TeamProgram(search.problem, self.config.clearance * search.problem.stride)
         return WarmStart(program, self._warm_start(search, program))
 

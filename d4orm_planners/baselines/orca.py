@@ -53,9 +53,6 @@ class OrcaConfig(CheckedSettings):
         shortest_paths: Whether robots prefer to follow their shortest paths among obstacles, or else the straight line.
         deviation: Standard deviation of the angle by which each robot's preferred velocity is turned, drawn once per
             episode [rad]. Without it robots in a symmetric formation block each other, as the authors note.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
     """
 
     time_horizon: Positive = 1.0

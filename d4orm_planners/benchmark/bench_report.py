@@ -39,12 +39,6 @@ def write_report(
 ) -> tuple[Path, Path]:
     """Write ``bench.json`` and ``bench.md``.
 
-    Args:
-        folder: Output folder.
-        settings: Of the benchmark.
-        begun: Result of :func:`circumstances` at its beginning.
-        results: By section, see :func:`~d4orm_planners.benchmark.benchmark.run_parts`.
-
     Returns:
         The two paths.
 
@@ -91,26 +85,10 @@ def seconds(spread: Spread) -> str:
     return f"{spread.median:.2f} ({spread.lower_quartile:.2f}-{spread.upper_quartile:.2f})"
 
 
-def _denoising(rows: list[Measurement]) -> str:
+def _with_reference(rows: list[Measurement]) -> list[Measurement]:
+    """Measurements of denoising beside those of plain JAX in the same problem."""
     plain = {(row["model"], row["num_robots"]): row["step"].median for row in rows if row["engine"] == "plain"}
-    lines = []
-    for row in rows:
-        reference = plain.get((row["model"], row["num_robots"]))
-        pair = row["ns_per_pair"]
-        lines.append((
-            row["model"],
-            str(row["num_robots"]),
-            row["engine"],
-            row["rules"],
-            milliseconds(row["step"]),
-            milliseconds(row["iteration"]),
-            f"{row['ns_per_robot_step']:.2f}",
-            "-" if pair is None else f"{pair:.2f}",
-            "-" if reference is None else f"{reference / row['step'].median:.1f}",
-        ))  # fmt: skip
-    header = ("model", "robots", "engine", "rules", "first step, ms", "iteration, ms", "ns per robot-step",
-              "ns added per pair check", "times plain JAX")  # fmt: skip
-    return table("Denoising", header, lines)
+    return [{**row, "plain": plain.get((row["model"], row["num_robots"]))} for row in rows]
 
 
 def _tabulated(
@@ -124,8 +102,20 @@ def _tabulated(
     return draw
 
 
+_DENOISING = _tabulated("Denoising", {
+    "model": itemgetter("model"),
+    "robots": itemgetter("num_robots"),
+    "engine": itemgetter("engine"),
+    "rules": itemgetter("rules"),
+    "first step, ms": lambda row: milliseconds(row["step"]),
+    "iteration, ms": lambda row: milliseconds(row["iteration"]),
+    "ns per robot-step": lambda row: f"{row['ns_per_robot_step']:.2f}",
+    "ns added per pair check": lambda row: "-" if row["ns_per_pair"] is None else f"{row['ns_per_pair']:.2f}",
+    "times plain JAX": lambda row: "-" if row["plain"] is None else f"{row['plain'] / row['step'].median:.1f}",
+})  # fmt: skip
+
 _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
-    "denoising": _denoising,
+    "denoising": lambda rows: _DENOISING(_with_reference(rows)),
     "threads": _tabulated("Threads", {
         "robots": itemgetter("num_robots"),
         "threads": itemgetter("threads"),

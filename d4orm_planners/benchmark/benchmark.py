@@ -28,11 +28,16 @@ from d4orm_planners.benchmark.env_steps import (
     measure_rooms,
     measure_worlds,
 )
-from d4orm_planners.benchmark.probes import measure_memory, measure_startup
-from d4orm_planners.benchmark.robots import measure_robots
+from d4orm_planners.benchmark.probes import (
+    Where,
+    measure_index,
+    measure_memory,
+    measure_obstacles,
+    measure_robots,
+    measure_startup,
+)
 from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn, measure
-from d4orm_planners.benchmark.walls import Where, measure_index, measure_obstacles
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.d4orm import D4orm

@@ -47,9 +47,6 @@ class BenchmarkSettings(CheckedSettings):
         obstacles: Numbers of boxes among the paths of 8 robots.
         far_obstacles: The same of boxes far away; also what environments are stepped among.
         map_cells: Cells along a side of the maps whose index of obstacles is timed.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
     """
 
     sections: tuple[str, ...] = SECTIONS

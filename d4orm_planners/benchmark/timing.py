@@ -15,16 +15,7 @@ Measurement: TypeAlias = dict[str, Any]
 
 @dataclass(frozen=True)
 class Spread:
-    """A sample of measurements in five numbers, in the unit of what was measured.
-
-    Attributes:
-        median: The middle.
-        lower_quartile: A quarter lie below it.
-        upper_quartile: A quarter lie above it.
-        smallest: The smallest.
-        largest: The largest.
-        count: Number of values.
-    """
+    """A sample of measurements in five numbers, in the unit of what was measured."""
 
     median: float
     lower_quartile: float

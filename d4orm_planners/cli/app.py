@@ -10,17 +10,16 @@ import importlib.metadata
 import io
 import signal
 import sys
-import threading
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from d4orm_planners.base.escaping import one_line
+from d4orm_planners.base.display import one_line
+from d4orm_planners.cli.signals import on_signals
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -36,17 +35,17 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("demo:demo", "Plan, execute, verify and draw a team in a warehouse."),
     "plan": ("plan_command:plan", "Plan for a team; write plan, picture or animation."),
     "run": ("run:run", "Run a plan or a policy in the environment."),
-    "export": ("export_command:export", "Write a plan as setpoints for robots to execute."),
+    "export": ("plan_command:export", "Write a plan as setpoints for robots to execute."),
     "play": ("play:play", "Look at a team live in a browser, and meddle with it."),
     "evaluate": ("evaluate_command:evaluate", "Compare policies on scenarios, seeds and disturbances."),
-    "robustness": ("robustness_command:robustness", "Measure success when something goes wrong."),
-    "leaderboard": ("leaderboard_command:leaderboard", "Write a page with the results of stored trials."),
+    "robustness": ("evaluate_command:robustness", "Measure success when something goes wrong."),
+    "leaderboard": ("evaluate_command:leaderboard", "Write a page with the results of stored trials."),
     "dataset": ("dataset_command:dataset", "Record demonstrations as a Minari dataset."),
     "train": ("train:train", "Train a policy by reinforcement or imitation."),
     "bench": ("bench:bench", "Measure the speed of this machine."),
     "node": ("node_command:node", "Plan as one node of several on a network."),
     "serve": ("serve_command:serve", "Drive robots on a ROS 2 network over Zenoh."),
-    "warmup": ("warmup_command:warmup", "Compile ahead, so that the next start is quick."),
+    "warmup": ("warmup:warmup", "Compile ahead, so that the next start is quick."),
     "scenarios": ("listings:scenarios", "List the scenarios."),
     "planners": ("listings:planners", "List planners and policies, or the settings of one."),
 }
@@ -145,24 +144,12 @@ def _standard_streams() -> None:
             setattr(sys, name, io.TextIOWrapper(pipe, stream.encoding, stream.errors, line_buffering=True))
 
 
-@contextmanager
-def _interrupted_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM be what Ctrl-C is, so that nothing half-written is left behind."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, former)
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     _standard_streams()
     try:
-        with _interrupted_by_sigterm(), warnings.catch_warnings():
+        # SIGTERM is what Ctrl-C is, so that nothing half-written is left behind.
+        with on_signals(signal.default_int_handler, signal.SIGTERM), warnings.catch_warnings():
             warnings.showwarning = _warn
             status = app(arguments, standalone_mode=False)
     except ClickException as error:

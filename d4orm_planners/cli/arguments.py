@@ -1,4 +1,7 @@
-"""Reading and checking what was given on the command line."""
+"""Reading and checking what was given on the command line.
+
+Here and in all commands, what makes no sense is a ``ValueError`` of one line, which names it and says what to change.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +24,7 @@ MOST_SEEDS = 1_000_000
 
 
 def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, Any]:
-    """``name=value`` texts, given to an option, as a dictionary, the values read as YAML 1.2.
-
-    Raises:
-        ValueError: If a text has another form, or gives a name again.
-    """
+    """``name=value`` texts, given to an option, as a dictionary, the values read as YAML 1.2."""
     values: dict[str, object] = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
@@ -36,11 +35,7 @@ def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[st
 
 
 def parse_levels(texts: list[str] | None) -> dict[str, list[object]] | None:
-    """``name=level,level`` texts of ``--disturb`` as levels by name, read as YAML 1.2; ``None`` stays.
-
-    Raises:
-        ValueError: If a text has another form, or gives a name again.
-    """
+    """``name=level,level`` texts of ``--disturb`` as levels by name, read as YAML 1.2; ``None`` stays."""
     if texts is None:
         return None
     parsed: dict[str, object] = {}
@@ -60,11 +55,7 @@ def parse_levels(texts: list[str] | None) -> dict[str, list[object]] | None:
 
 
 def single_levels(texts: list[str] | None) -> dict[str, object]:
-    """The same where every name has one level.
-
-    Raises:
-        ValueError: As :func:`parse_levels`; also if a name has several.
-    """
+    """The same where every name has one level."""
     levels = parse_levels(texts) or {}
     for name, values in levels.items():
         if len(values) != 1:
@@ -83,16 +74,7 @@ def _add(values: dict[str, object], name: str, text: str, option: str, what: str
 
 
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:
-    """Refuse what was given on the command line although it would count for nothing.
-
-    Args:
-        context: Of the command.
-        options: Names of parameters of its function.
-        reason: Text after the option.
-
-    Raises:
-        ValueError: If one of them was given.
-    """
+    """Refuse what was given on the command line although it would count for nothing."""
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
         if parameter.name in options and source is not None and source.name == "COMMANDLINE":
@@ -105,20 +87,12 @@ def names(text: str | None) -> tuple[str, ...] | None:
 
 
 def numbers(option: str, text: str | None) -> tuple[int, ...] | None:
-    """A list of whole numbers separated by commas; ``None`` stays.
-
-    Raises:
-        ValueError: If it is something else; the message names the option.
-    """
+    """A list of whole numbers separated by commas; ``None`` stays."""
     return None if text is None else _listed(option, text, int, "whole numbers, as 4,8,16")
 
 
 def decimals(option: str, text: str) -> tuple[float, ...]:
-    """A list of numbers separated by commas.
-
-    Raises:
-        ValueError: If it is something else; the message names the option.
-    """
+    """A list of numbers separated by commas."""
     return _listed(option, text, float, "numbers, as 0,0.05,0.1")
 
 
@@ -130,11 +104,7 @@ def _listed(option: str, text: str, kind: Callable[[str], N], what: str) -> tupl
 
 
 def seed_list(text: str) -> list[int]:
-    """Seeds of ``--seeds``: how many, a range or a list.
-
-    Raises:
-        ValueError: If it is something else, or asks for too many.
-    """
+    """Seeds of ``--seeds``: how many, a range or a list."""
     try:
         if "," in text:
             return [int(number) for number in text.split(",")]
@@ -150,11 +120,7 @@ def seed_list(text: str) -> list[int]:
 
 @contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
-    """Make a folder, unless it is there; what was made is removed again where nothing was written to it.
-
-    Raises:
-        ValueError: If it cannot be made or written to.
-    """
+    """Make a folder, unless it is there; what was made is removed again where nothing was written to it."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -170,11 +136,7 @@ def output_folder(folder: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Find out whether files can be made in a folder.
-
-    Raises:
-        ValueError: If not.
-    """
+    """Find out whether files can be made in a folder."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -184,12 +146,7 @@ def check_writable(folder: Path) -> None:
 
 
 def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
-    """Find out before planning whether a file can be written.
-
-    Raises:
-        ValueError: If it ends otherwise, or its folder cannot be written to.
-        OSError: If no file can be there.
-    """
+    """Find out before planning whether a file can be written."""
     if path is None:
         return
     if path.suffix not in suffixes:

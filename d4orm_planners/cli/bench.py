@@ -13,7 +13,7 @@ from d4orm_planners.benchmark.benchmark import parts, run_parts
 from d4orm_planners.benchmark.settings import QUICK, SECTIONS, BenchmarkSettings
 from d4orm_planners.cli.arguments import MOST_SEEDS, names, numbers, output_folder
 from d4orm_planners.cli.common_options import Quiet
-from d4orm_planners.cli.progress import parts_progress
+from d4orm_planners.cli.outputs import parts_progress
 
 
 def bench(
@@ -24,14 +24,12 @@ def bench(
     num_robots: Annotated[
         str | None, typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8,16.")
     ] = None,
-    models: Annotated[str | None, typer.Option("--models", help="Robot models, separated by commas.")] = None,
-    engines: Annotated[str | None, typer.Option("--engines", help="Of cpu, jax and plain, with commas.")] = None,
+    models: Annotated[str | None, typer.Option(help="Robot models, separated by commas.")] = None,
+    engines: Annotated[str | None, typer.Option(help="Of cpu, jax and plain, with commas.")] = None,
     sections: Annotated[
-        str | None, typer.Option("--sections", help=f"Of {', '.join(SECTIONS)}, with commas; all by default.")
+        str | None, typer.Option(help=f"Of {', '.join(SECTIONS)}, with commas; all by default.")
     ] = None,
-    seeds: Annotated[
-        int | None, typer.Option("--seeds", max=MOST_SEEDS, help="Seeds for the first feasible plan.")
-    ] = None,
+    seeds: Annotated[int | None, typer.Option(max=MOST_SEEDS, help="Seeds for the first feasible plan.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Measure the engines, the environments and the planner on this machine."""

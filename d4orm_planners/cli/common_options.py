@@ -1,11 +1,14 @@
-"""Options that several commands share."""
+"""Options that several commands share, and commands that take a dataclass of options."""
 
 from __future__ import annotations
 
+import inspect
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar, get_type_hints
 
 import typer
 
@@ -20,6 +23,9 @@ if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
     from d4orm_env.core.trajectory import Trajectory
 
+T = TypeVar("T")
+
+
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
 ScenarioSettings = Annotated[
     list[str] | None,
@@ -28,6 +34,51 @@ ScenarioSettings = Annotated[
 Seed = Annotated[int, typer.Option("--seed", help="Seed of the scenario and of the planner.")]
 Engine = Annotated[str, typer.Option("--engine", help="auto, cpu or jax.")]
 TimeLimit = Annotated[float | None, typer.Option("--time-limit", help="Seconds for planning.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
+ScenarioName = Annotated[
+    str,
+    typer.Option(
+        "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
+    ),
+]
+NumRobots = Annotated[
+    int | None, typer.Option("--num-robots", "--robots", "-k", help="Number of robots; the scenario's own by default.")
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="A setting of the planner or policy, as num_samples=512; repeatable."),
+]
+NoiseLevel = Annotated[
+    float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
+]
+Disturb = Annotated[
+    list[str] | None,
+    typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
+]
+Workers = Annotated[int | None, typer.Option("--workers", "-j", help="Processes; all cores by default.")]
+
+
+def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., None]]:
+    """Make a command of a function of one argument: a dataclass, whose fields are the command's options.
+
+    Args:
+        options: The dataclass; the fields' types are annotated as those of parameters are for Typer.
+    """
+
+    def decorate(function: Callable[[T], None]) -> Callable[..., None]:
+        @wraps(function)
+        def command(**given: object) -> None:
+            function(options(**given))
+
+        hints = get_type_hints(options, include_extras=True)
+        fields = inspect.signature(options).parameters.values()
+        command.__annotations__ = hints
+        command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            [field.replace(annotation=hints[field.name]) for field in fields]
+        )
+        return command
+
+    return decorate
 
 
 def _imported(physics: str) -> str:
@@ -41,7 +92,6 @@ Physics = Annotated[
         "--physics", callback=_imported, help="What moves the robots: model, as planners know them, mujoco, crazyflow."
     ),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no tables.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,16 +99,8 @@ class ProblemOptions:
     """Options on the problem."""
 
     context: typer.Context
-    scenario: Annotated[
-        str,
-        typer.Option(
-            "--scenario", "-s", help="Scenario name (see `d4orm scenarios`), a YAML file or package.module:function."
-        ),
-    ] = "circle"
-    num_robots: Annotated[
-        int | None,
-        typer.Option("--num-robots", "--robots", "-k", help="Number of robots; the scenario's own by default."),
-    ] = None
+    scenario: ScenarioName = "circle"
+    num_robots: NumRobots = None
     model: Model = None
     num_obstacles: Annotated[
         int | None, typer.Option("--num-obstacles", "--obstacles", help="Random obstacles to add.")
@@ -67,11 +109,7 @@ class ProblemOptions:
     seed: Seed = 0
 
     def problem(self) -> Problem:
-        """The problem.
-
-        Raises:
-            ValueError: For an option that makes no sense, or does not go with a scenario file.
-        """
+        """The problem."""
         common = ("num_robots", "model", "num_obstacles")
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"
@@ -92,8 +130,8 @@ class ProblemOptions:
 class PictureOptions:
     """Options on pictures, and on how much to say."""
 
-    picture: Annotated[Path | None, typer.Option("--picture", help="Picture to write: .png, .svg or .pdf.")] = None
-    animation: Annotated[Path | None, typer.Option("--animation", help="Animation to write: .gif or .mp4.")] = None
+    picture: Annotated[Path | None, typer.Option(help="Picture to write: .png, .svg or .pdf.")] = None
+    animation: Annotated[Path | None, typer.Option(help="Animation to write: .gif or .mp4.")] = None
     quiet: Quiet = False
 
     def check_pictures(self) -> None:

@@ -11,9 +11,19 @@ import typer
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.cli.arguments import output_folder, parse_settings, refuse_options, seed_list, single_levels
-from d4orm_planners.cli.common_options import Model, Quiet, ScenarioSettings
-from d4orm_planners.cli.dataclass_options import takes
-from d4orm_planners.cli.progress import resumable
+from d4orm_planners.cli.common_options import (
+    Disturb,
+    Model,
+    NoiseLevel,
+    NumRobots,
+    Quiet,
+    ScenarioName,
+    ScenarioSettings,
+    Settings,
+    Workers,
+    takes,
+)
+from d4orm_planners.cli.outputs import resumable
 from d4orm_planners.rl.dataset import Demonstrations
 from d4orm_planners.rl.dataset.write import checked_id, dataset_folder, write_dataset
 
@@ -24,31 +34,20 @@ class DatasetOptions:
 
     context: typer.Context
     policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm-c2f"
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="A setting of the policy, as num_samples=512; repeatable.")
-    ] = None
-    scenario: Annotated[
-        str, typer.Option("--scenario", "-s", help="Scenario name, a YAML file or package.module:function.")
-    ] = "random"
-    num_robots: Annotated[
-        int | None, typer.Option("--num-robots", "--robots", "-k", help="Size of the team; the scenario's own.")
-    ] = None
+    settings: Settings = None
+    scenario: ScenarioName = "random"
+    num_robots: NumRobots = None
     model: Model = None
     scenario_settings: ScenarioSettings = None
     seeds: Annotated[
         str,
         typer.Option("--seeds", "--episodes", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8."),
     ] = "100"
-    reward: Annotated[str, typer.Option("--reward", help="paper or training.")] = "paper"
-    control_noise_std: Annotated[
-        float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
-    ] = 0.0
-    disturb: Annotated[
-        list[str] | None,
-        typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
-    ] = None
+    reward: Annotated[str, typer.Option(help="paper or training.")] = "paper"
+    control_noise_std: NoiseLevel = 0.0
+    disturb: Disturb = None
     agents: Annotated[
-        str, typer.Option("--agents", help="An episode for the whole team, or one for each robot: team or robot.")
+        str, typer.Option(help="An episode for the whole team, or one for each robot: team or robot.")
     ] = "team"
     only_success: Annotated[
         bool, typer.Option("--only-success", help="Leave out episodes with a contact or a robot that does not arrive.")
@@ -56,19 +55,15 @@ class DatasetOptions:
     dataset_id: Annotated[
         str | None, typer.Option("--id", help="Name in Minari, as d4orm/mine-v0; made of what it holds by default.")
     ] = None
-    shard_size: Annotated[int, typer.Option("--shard-size", help="Seeds whose episodes go into one file.")] = 1000
-    workers: Annotated[int | None, typer.Option("--workers", "-j", help="Processes; all cores by default.")] = None
+    shard_size: Annotated[int, typer.Option(help="Seeds whose episodes go into one file.")] = 1000
+    workers: Workers = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder; by default where Minari finds the name.")] = (
         None
     )
     quiet: Quiet = False
 
     def demonstrations(self) -> Demonstrations:
-        """Return the demonstrations to record.
-
-        Raises:
-            ValueError: For an option that makes no sense, or does not go with a scenario file.
-        """
+        """Return the demonstrations to record."""
         own = parse_settings(self.scenario_settings, "--scenario-set")
         if is_scenario_file(self.scenario):
             reason = f"does not go with a scenario file; change it in {self.scenario}"

@@ -1,17 +1,18 @@
-"""``d4orm evaluate``: policies compared; and the options of everything that runs a study."""
+"""``d4orm evaluate``, ``robustness`` and ``leaderboard``: policies compared by trials."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from d4orm_planners.base.escaping import one_line
+from d4orm_planners.base.display import one_line
 from d4orm_planners.base.planner_registry import list_policies, setting_names
 from d4orm_planners.cli.arguments import (
+    check_target,
     decimals,
     names,
     numbers,
@@ -20,17 +21,20 @@ from d4orm_planners.cli.arguments import (
     parse_settings,
     seed_list,
 )
-from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit
-from d4orm_planners.cli.dataclass_options import takes
-from d4orm_planners.cli.progress import resumable, tell_results
+from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit, Workers, takes
+from d4orm_planners.cli.outputs import resumable, tell_results
 from d4orm_planners.evaluation.evaluate import run_shard, run_study
-from d4orm_planners.evaluation.robustness import tolerance_tables, write_disturbances
+from d4orm_planners.evaluation.leaderboard import leaderboard as page
+from d4orm_planners.evaluation.robustness import tolerance_tables, write_disturbances, write_robustness
+from d4orm_planners.evaluation.store import TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import success_rates
-from d4orm_planners.evaluation.tables import PARQUET_HINT, markdown, write_results
+from d4orm_planners.evaluation.tables import PARQUET_HINT, markdown, read_parquet, target, write_results
 
 if TYPE_CHECKING:
     from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup
+
+T = TypeVar("T")
 
 NoiseLevels = Annotated[
     str | None,
@@ -43,6 +47,23 @@ DisturbanceLevels = Annotated[
     ),
 ]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder to write to, and to go on from.")]
+
+
+STANDARD = (
+    "control_noise=0,0.1,0.2,0.3",
+    "correlated_noise=0,0.1,0.2,0.3",
+    "bias=0,0.05,0.1,0.2",
+    "delay=0,1,2,4",
+    "dropout=0,0.1,0.3,0.5",
+    "gain=0,0.1,0.2,0.4",
+    "state_noise=0,0.01,0.02,0.05",
+    "state_delay=0,1,2,4",
+    "push.speed=0,0.2,0.3,0.5",
+    "stall=0,0.1,0.3",
+    "intruder=0,1,2",
+    "limit_mismatch=1,0.9,0.8,0.7",
+)
+"""Levels that are run where none are named, from harmless to bad; all robot models have these disturbances."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,17 +102,12 @@ class StudyOptions:
         typer.Option("--set", help="A setting of all policies that have it, or of one, as orca.time_horizon=2."),
     ] = None
     time_limit: TimeLimit = None
-    trial_timeout: Annotated[
-        float | None, typer.Option("--trial-timeout", help="Seconds after which a trial ends with an error.")
-    ] = None
-    workers: Annotated[int | None, typer.Option("--workers", "-j", help="Processes; all cores by default.")] = None
-    ray: Annotated[
-        str | None, typer.Option("--ray", help="Address of a Ray cluster to run on, or auto; needs ray.")
-    ] = None
+    trial_timeout: Annotated[float | None, typer.Option(help="Seconds after which a trial ends with an error.")] = None
+    workers: Workers = None
+    ray: Annotated[str | None, typer.Option(help="Address of a Ray cluster to run on, or auto; needs ray.")] = None
     shard: Annotated[
         str | None,
         typer.Option(
-            "--shard",
             help="Run only a part, as 3/20, the third of twenty, in a job array; afterwards the same command without "
             "it puts all together.",
         ),
@@ -100,34 +116,24 @@ class StudyOptions:
     quiet: Quiet = False
 
     def run(self) -> list[TrialGroup]:
-        """Run the trials that are not stored yet, and give all that were asked for.
-
-        Raises:
-            ValueError: For an option that makes no sense. Nothing has run then.
-        """
-        study, kept = self._study(), f"the finished trials are kept in {self.out}"
-        with output_folder(self.out), resumable(kept, enabled=not self.quiet) as progress:
-            return run_study(
-                study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, ray=self.ray, progress=progress
-            )
+        """Run the trials that are not stored yet, and give all that were asked for."""
+        return self._run(run_study, ray=self.ray)
 
     def run_shard(self, shard: str) -> Path:
-        """Run that part of the trials, ``"3/20"``, and give the file that they are in.
-
-        Raises:
-            ValueError: As :meth:`run`, or if it is no part.
-        """
+        """Run that part of the trials, ``"3/20"``, and give the file that they are in."""
         index, slash, count = shard.partition("/")
         if not (slash and index.isdecimal() and count.isdecimal()):
             raise ValueError(f"--shard {shard!r} is no part; give its number and how many there are, as 3/20")
         if self.ray is not None:
             raise ValueError("--shard and --ray both spread trials over machines; give one of them")
+        return self._run(run_shard, shard=(int(index), int(count)))
+
+    def _run(self, run: Callable[..., T], **own: object) -> T:
         study, kept = self._study(), f"the finished trials are kept in {self.out}"
         with output_folder(self.out), resumable(kept, enabled=not self.quiet) as progress:
-            return run_shard(
-                study, self.out, (int(index), int(count)), trial_timeout=self.trial_timeout, workers=self.workers,
-                progress=progress,
-            )  # fmt: skip
+            return run(
+                study, self.out, trial_timeout=self.trial_timeout, workers=self.workers, progress=progress, **own
+            )
 
     def _study(self) -> Study:
         return Study(
@@ -217,3 +223,46 @@ def _with_settings(chosen: dict[str, dict[str, object]], settings: dict[str, obj
         for label in owners:
             chosen[label].setdefault(setting, value)
     return chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustnessOptions(StudyOptions):
+    """Options of ``d4orm evaluate``; without levels of noise or disturbances :data:`STANDARD`."""
+
+    control_noise_std: NoiseLevels = None
+    out: Out = Path("robustness")
+
+
+@takes(RobustnessOptions)
+def robustness(options: RobustnessOptions) -> None:
+    """Measure how often policies succeed when something goes wrong: noise, delays, pushes and others."""
+    if options.control_noise_std is None and options.disturb is None:
+        options = replace(options, disturb=list(STANDARD))
+    rates, _ = report(options, write_robustness)
+    require_trials(rates)
+
+
+def leaderboard(
+    stores: Annotated[
+        list[Path],
+        typer.Argument(help="Folders that d4orm evaluate wrote to, or their trials.sqlite or trials.parquet."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Page to write, .md.")] = Path("leaderboard.md"),
+    deadlines: Annotated[
+        str | None, typer.Option(help="Seconds for planning, as 0.1,0.5,1: success within them.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write a page with the results of all trials in a store, or in several."""
+    check_target(out, (".md",))
+    limits = () if deadlines is None else decimals("--deadlines", deadlines)
+    trials = [
+        trial
+        for store in stores
+        for trial in (read_parquet(store) if store.suffix == ".parquet" else TrialStore.existing(store).trials())
+    ]
+    text = page(trials, limits)
+    with target(out) as path:
+        path.write_text(text, encoding="utf-8")
+    if not quiet:
+        typer.echo(f"wrote {out}")

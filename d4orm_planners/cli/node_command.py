@@ -1,22 +1,129 @@
-"""``d4orm node``: one node of D-D4orm on a network, as on a robot's own computer."""
+"""``d4orm node``: one node of D-D4orm on a network, as on a robot's own computer, told what to do by a file."""
 
 from __future__ import annotations
 
 import logging
-import signal
+import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from d4orm_env.core.arrays import duration, whole_number
+from d4orm_env.core.yaml_text import read_yaml
+from d4orm_env.scenarios import load_problem
+from d4orm_env.scenarios.schema import VERSION, parse
+from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.cli.arguments import check_target
-from d4orm_planners.cli.node_file import load_node
+from d4orm_planners.cli.signals import on_signals
+from d4orm_planners.d_d4orm.planner import DD4orm
 
 if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
     from d4orm_planners.base.plan import IterationRecord
+
+T = TypeVar("T")
+
+REQUIRED = ("node", "nodes", "problem", "time_limit", "out")
+OPTIONAL = ("seed", "settings", "zenoh")
+OWN = ("node", "nodes", "mode", "transport", "zenoh")
+"""Settings of the planner that are not among ``settings``: they have a field of their own, or are given."""
+
+ENDLESS = 10**9
+"""Iterations; a node's budget is its time."""
+
+
+@dataclass(frozen=True)
+class NodeTask:
+    """Task of a node, as its file has it."""
+
+    planner: DD4orm
+    problem: Problem
+    seed: int
+    time_limit: float
+    out: Path
+
+
+def load_node(path: str | os.PathLike[str]) -> NodeTask:
+    """Read a node's file, see :func:`read_task`."""
+    return read_task(path, REQUIRED, OPTIONAL, _task)
+
+
+def read_task(
+    path: str | os.PathLike[str],
+    required: tuple[str, ...],
+    optional: tuple[str, ...],
+    make: Callable[[Mapping[str, Any], Path], T],
+) -> T:
+    """Read a file of fields and make a task of them; paths in it are relative to its folder."""
+    try:
+        fields = mapping("the file", read_yaml(path))
+        for name in fields:
+            if name not in required + optional:
+                raise ValueError(f"unknown field {name!r}; known are {', '.join(required + optional)}")
+        for name in required:
+            if fields.get(name) is None:
+                raise ValueError(f"field {name!r} is missing")
+        return make(fields, Path(path).parent)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _task(fields: Mapping[str, Any], folder: Path) -> NodeTask:
+    settings = mapping("settings", fields.get("settings", {}))
+    for name in OWN:
+        if name in settings:
+            raise ValueError(f"settings has {name!r}, which " + (
+                "is a field of the file itself" if name in fields else "is the same for every node of a network"
+            ))  # fmt: skip
+    network = {"transport": "zenoh", "mode": "async", "zenoh": zenoh_in(fields, folder)}
+    if not isinstance(fields["out"], str):
+        raise ValueError(f"out must be a path, not {fields['out']!r}")
+    planner = make_planner(
+        "d-d4orm",
+        node=whole_number(fields["node"], "node", 0),
+        nodes=whole_number(fields["nodes"], "nodes", 1),
+        **{"max_iterations": ENDLESS, **settings, **network},
+    )
+    assert isinstance(planner, DD4orm)
+    return NodeTask(
+        planner=planner,
+        problem=problem_in(fields["problem"], folder),
+        seed=whole_number(fields.get("seed", 0), "seed", 0),
+        time_limit=duration(fields["time_limit"], "time_limit"),
+        out=folder / fields["out"],
+    )
+
+
+def problem_in(content: object, folder: Path) -> Problem:
+    """The problem that a file names or has."""
+    if isinstance(content, str):
+        return load_problem(folder / content)
+    if not isinstance(content, dict):
+        raise ValueError(f"problem must be a scenario file or a scenario with its arguments, not {content!r}")
+    try:
+        return parse({"version": VERSION, **content})
+    except ValueError as error:
+        raise ValueError(f"problem: {error}") from error
+
+
+def mapping(name: str, content: object) -> Mapping[str, Any]:
+    """A part of a file that must be a mapping."""
+    if not isinstance(content, dict):
+        raise ValueError(f"{name} must be a mapping of fields, not {content!r}")
+    return content
+
+
+def zenoh_in(fields: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+    """The settings of zenoh in a file."""
+    zenoh = mapping("zenoh", fields.get("zenoh", {}))
+    if isinstance(zenoh.get("config_file"), str):
+        zenoh = {**zenoh, "config_file": str(folder / zenoh["config_file"])}
+    return zenoh
 
 
 def node(
@@ -27,7 +134,15 @@ def node(
     check_target(task.out, (".npz",))
     number = task.planner.config.node
     typer.echo(f"node {number} of {task.planner.config.nodes}, problem {task.problem.digest[:8]}")
-    with _events_as_lines(), _ended_by_signals() as over:
+    over = threading.Event()
+
+    def interrupt(*_: object) -> None:
+        # The first ends the solve with the best so far; later ones do nothing.
+        if not over.is_set():
+            over.set()
+            raise KeyboardInterrupt
+
+    with _events_as_lines(), on_signals(interrupt):
         plan = task.planner.solve(task.problem, task.seed, task.time_limit, callback=_tell)
         over.set()
         plan.save(task.out)
@@ -63,24 +178,3 @@ def _events_as_lines() -> Iterator[None]:
     finally:
         logger.setLevel(level)
         logger.removeHandler(handler)
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[threading.Event]:
-    """The first SIGINT or SIGTERM interrupts the solve, which then ends with the best so far; later ones do nothing.
-
-    Nor does the first, once the event that is handed out is set.
-    """
-    over = threading.Event()
-
-    def interrupt(number: int, frame: object) -> None:
-        if not over.is_set():
-            over.set()
-            raise KeyboardInterrupt
-
-    former = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield over
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""``d4orm plan``: a plan for one problem."""
+"""``d4orm plan`` and ``d4orm export``: a plan for one problem, and what robots execute of it."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
-from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
-from d4orm_planners.cli.common_options import Engine, PictureOptions, ProblemOptions, TimeLimit
-from d4orm_planners.cli.dataclass_options import takes
-from d4orm_planners.cli.outputs import print_plan, require_solved
-from d4orm_planners.cli.progress import solve_progress
+from d4orm_planners.cli.arguments import check_target, output_folder, parse_settings, refuse_options
+from d4orm_planners.cli.common_options import Engine, PictureOptions, ProblemOptions, Settings, TimeLimit, takes
+from d4orm_planners.cli.outputs import print_plan, print_table, require_solved, solve_progress
 from d4orm_planners.cli.warmup import compile_for_planning
 from d4orm_planners.engine.select import get_sampling_engine
 
@@ -36,15 +35,11 @@ class PlanOptions(PictureOptions, ProblemOptions):
             show_default="that of make_planner()",
         ),
     ] = None
-    preset: Annotated[
-        str | None, typer.Option("--preset", help="`paper`, `authors` or `tuned`; see `d4orm planners NAME`.")
-    ] = None
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="A planner setting, as num_samples=512; repeatable.")
-    ] = None
+    preset: Annotated[str | None, typer.Option(help="`paper`, `authors` or `tuned`; see `d4orm planners NAME`.")] = None
+    settings: Settings = None
     engine: Engine = "auto"
     time_limit: TimeLimit = None
-    max_iterations: Annotated[int | None, typer.Option("--max-iterations", help="Iterations for planning.")] = None
+    max_iterations: Annotated[int | None, typer.Option(help="Iterations for planning.")] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Plan file (.npz) or replay (.html) to write.")] = None
 
 
@@ -87,3 +82,35 @@ def solving(
         )
     limit = planner.config.max_iterations if max_iterations is None else max_iterations
     return solve_progress(planner.name, problem.num_robots, limit, enabled=not quiet)
+
+
+def export(
+    plan_file: Annotated[Path, typer.Argument(help="Plan to export, .npz.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")],
+    format: Annotated[
+        str, typer.Option("--format", "-f", help="csv, crazyswarm2, rosbag2 or mcap.", show_default=True)
+    ] = "csv",
+    rate: Annotated[float, typer.Option(help="Setpoints per second.")] = 100.0,
+    height: Annotated[float, typer.Option(help="z of a team that moves in the plane [m].")] = 0.0,
+    max_acceleration: Annotated[
+        float | None,
+        typer.Option(help="Limit of the setpoints [m/s^2].", show_default="the team's"),
+    ] = None,
+    max_jerk: Annotated[float | None, typer.Option(help="Limit of the setpoints [m/s^3].", show_default="none")] = None,
+) -> None:
+    """Smooth a plan, verify it again, and write setpoints for robots to execute."""
+    plan = Plan.load(plan_file)
+    with output_folder(out):
+        report = plan.export(
+            format, out, rate=rate, height=height, max_acceleration=max_acceleration, max_jerk=max_jerk
+        )
+    rows = [
+        ("files", f"{len(report.files)} in {out}"),
+        ("duration", f"{report.duration:.2f} s, {report.stretch:.2f} times the plan's"),
+        ("least gap between robots", f"{report.min_separation:.3f} m"),
+        ("least gap to obstacles", f"{report.min_clearance:.3f} m"),
+        ("deviation from the plan", f"{report.deviation:.3f} m"),
+    ]
+    if report.pieces is not None:
+        rows.append(("polynomials a robot", f"{report.pieces}, {report.num_bytes} bytes of 4096"))
+    print_table(f"{format} of {plan.title}", rows)

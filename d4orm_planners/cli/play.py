@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import threading
 import webbrowser
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,8 +13,8 @@ import rich
 import typer
 
 from d4orm_planners.cli.arguments import names
-from d4orm_planners.cli.common_options import ProblemOptions
-from d4orm_planners.cli.dataclass_options import takes
+from d4orm_planners.cli.common_options import ProblemOptions, takes
+from d4orm_planners.cli.signals import on_signals
 
 if TYPE_CHECKING:
     from d4orm_planners.play.playground import Playground
@@ -33,17 +30,18 @@ class PlayOptions(ProblemOptions):
     policy: Annotated[
         str, typer.Option("--policy", "-p", help="What drives (see `d4orm planners`); several, separated by commas.")
     ] = "d4orm-c2f"
-    host: Annotated[
-        str, typer.Option("--host", help="Where to be found; elsewhere than here the address has a token.")
-    ] = "127.0.0.1"
-    port: Annotated[int, typer.Option("--port", help="Port; any free one by default.")] = 0
+    host: Annotated[str, typer.Option(help="Where to be found; elsewhere than here the address has a token.")] = (
+        "127.0.0.1"
+    )
+    port: Annotated[int, typer.Option(help="Port; any free one by default.")] = 0
     open_browser: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser if there is one.")] = True
 
 
 @takes(PlayOptions)
 def play(options: PlayOptions) -> None:
     """Look at a team live in a browser, and meddle with it; needs the extra viz."""
-    with _ended_by_signals():
+    # Some libraries, while they are loaded, swallow what a signal raises.
+    with on_signals(lambda *_: os._exit(130)):
         playground = _playground(options)
     try:
         typer.echo(f"open {playground.address}\nCtrl-C ends it")
@@ -58,18 +56,6 @@ def play(options: PlayOptions) -> None:
         raise
     finally:
         playground.close()
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """End the process at once if a signal comes: some libraries, while they are loaded, swallow what it raises."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    former = {number: signal.signal(number, lambda *_: os._exit(130)) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
 
 
 def _playground(options: PlayOptions) -> Playground:

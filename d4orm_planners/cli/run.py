@@ -17,8 +17,7 @@ from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_policy
 from d4orm_planners.base.policy import OpenLoop
 from d4orm_planners.cli.arguments import check_target, names, refuse_options, single_levels
-from d4orm_planners.cli.common_options import Physics, PictureOptions, ProblemOptions
-from d4orm_planners.cli.dataclass_options import takes
+from d4orm_planners.cli.common_options import Disturb, NoiseLevel, Physics, PictureOptions, ProblemOptions, takes
 from d4orm_planners.cli.outputs import episode_rows, print_table, require_success
 
 if TYPE_CHECKING:
@@ -42,28 +41,18 @@ class RunOptions(PictureOptions, ProblemOptions):
             show_default="the planner of make_planner()",
         ),
     ] = None
-    preset: Annotated[str | None, typer.Option("--preset", help="Preset of the policy, as `paper`.")] = None
-    control_noise_std: Annotated[
-        float, typer.Option("--control-noise-std", "--noise", help="Standard deviation of the execution noise.")
-    ] = 0.0
+    preset: Annotated[str | None, typer.Option(help="Preset of the policy, as `paper`.")] = None
+    control_noise_std: NoiseLevel = 0.0
     compare: Annotated[
         str | None,
-        typer.Option("--compare", help="Several policies, separated by commas, on the same problem and seed."),
+        typer.Option(help="Several policies, separated by commas, on the same problem and seed."),
     ] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Replay to write, .html.")] = None
-
     physics: Physics = "model"
-    disturb: Annotated[
-        list[str] | None,
-        typer.Option("--disturb", help="A disturbance at a level, as delay=2 or push.speed=0.3; repeatable."),
-    ] = None
+    disturb: Disturb = None
 
     def disturbances(self) -> tuple[AnyDisturbance, ...]:
-        """Return the disturbances.
-
-        Raises:
-            ValueError: For an unknown name, or a level that makes no sense.
-        """
+        """Return the disturbances."""
         return disturbances_at(single_levels(self.disturb))
 
     def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[AnyDisturbance]) -> Episode:
@@ -74,11 +63,7 @@ class RunOptions(PictureOptions, ProblemOptions):
         return episode
 
     def chosen(self) -> tuple[Problem, Policy]:
-        """The problem, and what acts in it.
-
-        Raises:
-            ValueError: For an option that makes no sense, or does not go with a plan file.
-        """
+        """The problem, and what acts in it."""
         if self.plan_file is None:
             chosen = {} if self.preset is None else {"preset": self.preset}
             return self.problem(), make_policy(RECOMMENDED if self.policy is None else self.policy, **chosen)
@@ -113,11 +98,7 @@ def run(options: RunOptions) -> None:
 
 
 def compare(options: RunOptions, policies: Sequence[str]) -> None:
-    """Run several policies on the same problem with the same seed, and write them side by side.
-
-    Raises:
-        ValueError: Without a file to write, or for an option that makes no sense or does not go with it.
-    """
+    """Run several policies on the same problem with the same seed, and write them side by side."""
     if options.out is None:
         raise ValueError("--compare needs --out, the replay to write, as --out compare.html")
     alone = {"policy", "preset", "picture", "animation", "plan_file"}

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,9 +12,9 @@ import typer
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.yaml_text import read_yaml
 from d4orm_planners.base.controller import Controller
-from d4orm_planners.cli.node_file import mapping, problem_in, zenoh_in
+from d4orm_planners.cli.node_command import mapping, problem_in, read_task, zenoh_in
+from d4orm_planners.cli.signals import on_signals
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 from d4orm_planners.serve.fleet_server import NODE, FleetServer
 from d4orm_planners.serve.wire import RosSession
@@ -29,17 +26,7 @@ SHARE = 0.9
 
 @dataclass(frozen=True)
 class ServeTask:
-    """Task of a server.
-
-    Attributes:
-        problem: The team and its world.
-        controller: What drives it.
-        names: Of the robots.
-        deadline: Longest silence of one of them [s].
-        domain: ROS domain.
-        seed: Of the controller.
-        zenoh: Network of the robots.
-    """
+    """Task of a server, as its file has it."""
 
     problem: Problem
     controller: Controller
@@ -54,32 +41,15 @@ def serve(
     config: Annotated[Path, typer.Option("--config", "-c", help="YAML file that says what is to be served.")],
 ) -> None:
     """Drive robots on a ROS 2 network over Zenoh: odometry in, velocities and setpoints out, until Ctrl-C."""
-    task = load_task(config)
-    with RosSession(task.zenoh, task.domain, NODE) as session, _signals() as over:
+    task, over = read_task(config, FIELDS[:1], FIELDS[1:], _task), threading.Event()
+    # Robots are told to stand once it is set.
+    with on_signals(lambda *_: over.set()), RosSession(task.zenoh, task.domain, NODE) as session:
         server = FleetServer(session, task.problem, task.controller, task.names, task.deadline, task.seed)
         typer.echo(f"serving {', '.join(task.names)} on domain {task.domain}; Ctrl-C ends it")
         server.run(over)
 
 
-def load_task(path: str | os.PathLike[str]) -> ServeTask:
-    """Read a server's file; paths in it are relative to its folder.
-
-    Raises:
-        ValueError: If it cannot be read, or something in it is missing, unknown or makes no sense; one line that names
-            the file and the field.
-    """
-    try:
-        return _task(mapping("the file", read_yaml(path)), Path(path).parent)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
 def _task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
-    for name in fields:
-        if name not in FIELDS:
-            raise ValueError(f"unknown field {name!r}; known are {', '.join(FIELDS)}")
-    if "problem" not in fields:
-        raise ValueError("field 'problem' is missing")
     problem = problem_in(fields["problem"], folder)
     zenoh = zenoh_in(fields, folder)
     for name in ("namespace", "grace_period"):
@@ -100,18 +70,3 @@ def _task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
         seed=whole_number(fields.get("seed", 0), "seed", 0),
         zenoh=ZenohSettings.of(zenoh),
     )
-
-
-@contextmanager
-def _signals() -> Iterator[threading.Event]:
-    """The event that SIGINT and SIGTERM set, so that robots are told to stand."""
-    over = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield over
-        return
-    former = {number: signal.signal(number, lambda *_: over.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield over
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)

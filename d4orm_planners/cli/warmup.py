@@ -1,4 +1,4 @@
-"""Compile ahead whatever planning, rolling out and the environments need, into the cache on disk.
+"""``d4orm warmup``: compile ahead whatever planning, rolling out and the environments need, into the cache on disk.
 
 What samples and rolls out takes as long as what searches for drives. numba compiles one kernel at a time in a process,
 so that two processes do it in half the time.
@@ -16,6 +16,7 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+import typer
 from gymnasium import make_vec
 from numba.core.dispatcher import Dispatcher
 
@@ -25,7 +26,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 from d4orm_env.dynamics.models import COMMON
-from d4orm_env.engine.caching import Kernel, has_to_be_compiled
+from d4orm_env.engine.caching import Kernel, check_can_be_kept, has_to_be_compiled
 from d4orm_env.engine.threads import Threads
 from d4orm_env.engine.worlds import world_kernels
 from d4orm_env.envs.joint_state import JointState
@@ -35,6 +36,7 @@ from d4orm_planners import engine as sampling_engine
 from d4orm_planners.base.names import PLANNERS
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.engine.cpu_sampling import Sampling
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
@@ -235,3 +237,17 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
     ]
     kernels += map(search_kernel, COMMON)
     return [kernel for kernel in kernels if isinstance(kernel, Dispatcher) and kernel.stats.cache_path is not None]
+
+
+def warmup(quiet: Quiet = False) -> None:
+    """Compile ahead what planning and the environments need, so that the next start is quick."""
+    check_can_be_kept()
+    report = warm_up()
+    if not quiet:
+        typer.echo(
+            f"{len(report.compiled)} kernels compiled, {len(report.loaded)} found in the cache, {report.seconds:.1f} s"
+        )
+        for folder in report.folders:
+            typer.echo(f"cache {folder}")
+    if report.lost:
+        raise OSError(f"{len(report.lost)} kernels could not be kept; free some space, or set NUMBA_CACHE_DIR")

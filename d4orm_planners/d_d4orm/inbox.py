@@ -1,34 +1,82 @@
-"""Messages that a node has received: the newest candidate of every other node, evaluated, and a count of the rest."""
+"""Messages that a node has received: the newest candidate of every other node, evaluated, and a count of the rest.
+
+The nodes of one process share an evaluator: candidates are evaluated once, and it has the word to stop.
+"""
 
 from __future__ import annotations
 
 import logging
+import threading
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.evaluator import Evaluator
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.d_d4orm.messages import KINDS, Message, MessageError, decode
 from d4orm_planners.d_d4orm.selection import merge
 from d4orm_planners.d_d4orm.transport import Transport
+from d4orm_planners.engine.sampling_types import SamplingEngine
 
 logger = logging.getLogger(__name__)
-
 TOLERANCE = 1e-3
 """Rewards that differ by more than this are not the same; engines round differently."""
 
 
-@dataclass(frozen=True, eq=False)
-class Report:
-    """A candidate of another node as it was found to be here.
+class Stopped(Exception):
+    """An iteration was left because its result is no longer wanted."""
+
+
+class Evaluator:
+    """Judges candidates, and remembers some.
+
+    Args:
+        engine: Engine for rollouts.
+        problem: The problem.
+        remembered: Candidates of this process's own nodes that are remembered.
 
     Attributes:
-        node: Its sender.
-        sequence: Number of the candidate.
-        candidate: Rolled out and evaluated by the receiver.
+        engine: Engine for rollouts.
+        problem: The problem.
+        stop: Once set, nodes leave their iterations between denoising steps.
+        solution_ends: Whether to set it at the first solution.
     """
+
+    def __init__(self, engine: SamplingEngine, problem: Problem, remembered: int = 0) -> None:
+        self.stop = threading.Event()
+        self.solution_ends = False
+        self.engine, self.problem, self._remembered = engine, problem, remembered
+        self._known: dict[bytes, Candidate] = {}
+        self._lock = threading.Lock()
+
+    def own(self, controls: FloatArray) -> Candidate:
+        """Judge what a node of this process has made.
+
+        Raises:
+            Stopped: If it is no longer wanted.
+        """
+        # Evaluation holds the interpreter's lock: two at once would both be half as fast.
+        with self._lock:
+            if self.stop.is_set():
+                raise Stopped
+            candidate = evaluate_controls(self.engine, self.problem, controls)
+            self._known[candidate.planned.tobytes()] = candidate
+            while len(self._known) > self._remembered:
+                del self._known[next(iter(self._known))]
+            if candidate.solved and self.solution_ends:
+                self.stop.set()
+        return candidate
+
+    def received(self, controls: FloatArray) -> Candidate:
+        """Judge what has arrived; the very controls that a node of this process has made are known already."""
+        return self._known.get(controls.tobytes()) or evaluate_controls(self.engine, self.problem, controls)
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A candidate of another node as it was found to be here."""
 
     node: int
     sequence: int
@@ -70,8 +118,7 @@ class Inbox:
                 messages.append(self._decoded(data))
             except MessageError as error:
                 self._drop(error.kind, str(error))
-        newest: dict[int, Report | Message]
-        newest, stale = merge(dict(self.newest), messages)
+        newest, stale = merge(self.newest, messages)
         for message in stale:
             self._drop("stale", f"number {message.sequence} of node {message.node}, which has sent a newer one")
         fresh = [newest[node] for node in sorted(newest)]

@@ -51,11 +51,7 @@ class Message:
 
 
 class MessageError(ValueError):
-    """Bytes that are no usable message.
-
-    Attributes:
-        kind: One of :data:`KINDS`.
-    """
+    """Bytes that are no usable message, with their kind of fault, one of :data:`KINDS`."""
 
     def __init__(self, kind: str, text: str) -> None:
         super().__init__(text)

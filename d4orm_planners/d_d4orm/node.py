@@ -1,9 +1,13 @@
-"""One node of D-D4orm: refine, broadcast, collect, choose (paper, Algorithm 5)."""
+"""One node of D-D4orm: refine, broadcast, collect, choose (paper, Algorithm 5).
+
+An observer may be told of all that it does, for timelines (section VIII-D).
+"""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,16 +17,45 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm.evaluator import Evaluator
-from d4orm_planners.d_d4orm.inbox import TOLERANCE, Inbox
+from d4orm_planners.d_d4orm.inbox import TOLERANCE, Evaluator, Inbox
 from d4orm_planners.d_d4orm.messages import Message, encode
-from d4orm_planners.d_d4orm.node_events import Event, Observer
 from d4orm_planners.d_d4orm.selection import choose
-from d4orm_planners.d_d4orm.traffic import TrafficStats
-from d4orm_planners.d_d4orm.transport import Transport
+from d4orm_planners.d_d4orm.transport import TrafficStats, Transport
+
+KINDS = ("computed", "sent", "received", "selected")
+"""A node has made a candidate, sent it, got one, or chosen it to go on from."""
+
 
 RESEND = 0.2
 """Seconds after which a candidate is sent again, as messages may get lost."""
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """Something that a node did.
+
+    Attributes:
+        node: The node that did it.
+        kind: One of :data:`KINDS`.
+        begin: Time at which it began to, by :func:`time.perf_counter` [s].
+        end: Time at which it was done, likewise. Messages take no time here.
+        of: The node that the candidate came from.
+        sequence: Number among that node's messages, from 1; 0 for one that was not sent yet.
+        candidate: The candidate, as evaluated by ``node``.
+        size: Bytes of the message that was sent, else 0.
+    """
+
+    node: int
+    kind: str
+    begin: float
+    end: float
+    of: int
+    sequence: int
+    candidate: Candidate
+    size: int = 0
+
+
+Observer = Callable[[Event], object]
 
 
 def node_seed(seed: int, node: int) -> int:
@@ -60,7 +93,7 @@ class Node:
         evaluator: Evaluator, in common with other nodes of this process.
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
             network the time at which it began, by which two nodes of one number know which was first.
-        observer: Called with every :class:`~d4orm_planners.d_d4orm.node_events.Event`, in the node's own thread.
+        observer: Called with every :class:`~d4orm_planners.d_d4orm.node.Event`, in the node's own thread.
 
     Attributes:
         number: From 0.

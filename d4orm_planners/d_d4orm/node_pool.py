@@ -1,4 +1,4 @@
-"""Nodes in threads of one process: synchronous rounds, or every node at its own pace."""
+"""Nodes in threads of one process, in synchronous rounds."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm.evaluator import Evaluator, Stopped
-from d4orm_planners.d_d4orm.inbox import Inbox
+from d4orm_planners.d_d4orm.inbox import Evaluator, Stopped
 from d4orm_planners.d_d4orm.node import Node
 from d4orm_planners.d_d4orm.transport import Transport
 
@@ -23,15 +22,11 @@ logger = logging.getLogger(__name__)
 
 MODES = ("sync", "async")
 
-GLANCE = 0.05
-"""Seconds between looks at whether the nodes still live, while nothing arrives."""
-
-
 LAST_WAIT = 30.0
 """Seconds that the end of the process waits for a thread that nothing else waited for: native code must not be cut."""
 
 
-class _Job:
+class ThreadJob:
     """Work of a node, to be done in a thread of its own; an exception is kept instead of lost."""
 
     def __init__(self, node: Node, work: Callable[[Node], object]) -> None:
@@ -105,7 +100,7 @@ class NodePool(ABC):
         self._evaluator = evaluator
         self._nodes = tuple(nodes)
         self._transports = tuple(transports)
-        self._jobs: list[_Job] = []
+        self._jobs: list[ThreadJob] = []
         self._notes: list[str] = []
         self._losses: list[str] = []
         self._error: Exception | None = None
@@ -180,14 +175,14 @@ class NodePool(ABC):
             improve: Whether nodes go on once there is a solution.
         """
 
-    def _lose(self, job: _Job, reason: str) -> None:
+    def _lose(self, job: ThreadJob, reason: str) -> None:
         self.alive.remove(job.node)
         loss = f"node {job.node.number} {reason}"
         logger.warning("%s", loss, exc_info=job.error)
         self._notes.append(loss)
         self._losses.append(loss)
 
-    def _lose_failed(self, job: _Job) -> None:
+    def _lose_failed(self, job: ThreadJob) -> None:
         assert job.error is not None
         self._error = job.error
         self._lose(job, f"failed ({type(job.error).__name__}: {' '.join(str(job.error).split())})")
@@ -230,7 +225,6 @@ class SyncNodePool(NodePool):
     """Rounds: all nodes refine, then all of them exchange. The same seed gives the same rounds."""
 
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
-        """See :meth:`NodePool._round`."""
         self._all(Node.refine, time_left)
         candidates = [node.candidate for node in self.alive]
         # Judging what others claim to be solutions takes its time, and after the last round nobody goes on from it.
@@ -242,7 +236,7 @@ class SyncNodePool(NodePool):
 
     def _all(self, work: Callable[[Node], object], time_left: Callable[[], float | None]) -> None:
         begin = time.perf_counter()
-        self._jobs = [_Job(node, work) for node in self.alive]
+        self._jobs = [ThreadJob(node, work) for node in self.alive]
         for job in self._jobs:
             job.start()
         for job in self._jobs:
@@ -259,78 +253,3 @@ class SyncNodePool(NodePool):
         seconds = time.perf_counter() - begin
         self._seconds += seconds * len(self._jobs)
         self._waited += sum(seconds - job.seconds for job in self._jobs)
-
-
-class AsyncNodePool(NodePool):
-    """Every node runs on by itself; a round is over when each was heard from, or the timeout passed after the first.
-
-    Args:
-        nodes: The nodes.
-        transports: All ends to close in the end.
-        timeout: See :class:`NodePool`.
-        evaluator: See :class:`NodePool`.
-        observer: Observer of the nodes for the solve itself.
-    """
-
-    def __init__(
-        self,
-        nodes: Sequence[Node],
-        transports: Sequence[Transport],
-        timeout: float,
-        evaluator: Evaluator,
-        observer: Inbox,
-    ) -> None:
-        super().__init__(nodes, transports, timeout, evaluator)
-        self._observer = observer
-
-    def close(self) -> Candidate:
-        """See :meth:`NodePool.close`."""
-        best = super().close()
-        self._seconds += sum(job.seconds for job in self._jobs)
-        self._waited = sum(node.transport.waited for node in self._nodes)
-        return best
-
-    def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
-        """See :meth:`NodePool._round`."""
-        self._run(improve)
-        heard: set[int] = set()
-        first = None
-        while True:
-            ended = not any(job.running for job in self._jobs)
-            heard |= {report.node for report in self._observer.receive(GLANCE)}
-            self._lose_dead()
-            now = time.perf_counter()
-            first = now if heard and first is None else first
-            left = time_left()
-            candidates = [self._observer.newest[number].candidate for number in sorted(heard)]
-            if (
-                heard >= {node.number for node in self.alive}
-                or (first is not None and now - first >= self.timeout)
-                or (left is not None and left <= 0)
-                or ended
-                or (not improve and any(candidate.solved for candidate in candidates))
-            ):
-                return candidates
-
-    def _run(self, improve: bool) -> None:
-        """Start idle nodes: at first all, later those that stopped at what proved to be no solution here."""
-        self._evaluator.solution_ends = not improve
-        running = [job for job in self._jobs if job.running]
-        failed = [job for job in self._jobs if job.error is not None]
-        self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
-        idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
-        if not running:
-            self._evaluator.stop.clear()
-
-        def run(node: Node) -> None:
-            node.run(self._evaluator.stop, self.timeout, improve)
-
-        begun = [_Job(node, run) for node in idle]
-        self._jobs = [*running, *failed, *begun]
-        for job in begun:
-            job.start()
-
-    def _lose_dead(self) -> None:
-        for job in self._jobs:
-            if job.error is not None and job.node in self.alive:
-                self._lose_failed(job)

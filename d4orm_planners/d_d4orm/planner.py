@@ -11,13 +11,11 @@ from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD
-from d4orm_planners.d_d4orm.evaluator import Evaluator
-from d4orm_planners.d_d4orm.inbox import Inbox
-from d4orm_planners.d_d4orm.network_node import NetworkNodePool
+from d4orm_planners.d_d4orm.async_pool import AsyncNodePool, NetworkNodePool
+from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox
 from d4orm_planners.d_d4orm.node import Node, Task, node_seed
-from d4orm_planners.d_d4orm.node_pool import AsyncNodePool, NodePool, SyncNodePool
-from d4orm_planners.d_d4orm.ray_connection import RayConnection, import_ray
-from d4orm_planners.d_d4orm.ray_planner import ray_planners
+from d4orm_planners.d_d4orm.node_pool import NodePool, SyncNodePool
+from d4orm_planners.d_d4orm.ray_planner import RayConnection, import_ray, ray_planners
 from d4orm_planners.d_d4orm.settings import DD4ormConfig
 from d4orm_planners.d_d4orm.transport import LocalNetwork
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
@@ -26,12 +24,7 @@ from d4orm_planners.engine.select import get_sampling_engine
 
 @dataclass(frozen=True)
 class RunningNodes:
-    """The state of a solve: its nodes live from one iteration to the next.
-
-    Attributes:
-        crew: The nodes.
-        opened: Resources that they need and that end after them.
-    """
+    """The state of a solve: its nodes live from one iteration to the next."""
 
     crew: NodePool
     opened: ExitStack
@@ -76,7 +69,6 @@ class DD4orm(Planner):
         return state, state.crew.iterate(search)
 
     def finish(self, search: SolveRun, state: RunningNodes) -> None:
-        """See :meth:`Planner.finish`."""
         with state.opened:
             best = state.crew.close()
             if best.rank > search.best.rank:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,27 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.errors import unknown
 
+if TYPE_CHECKING:
+    from d4orm_planners.d_d4orm.inbox import Report
+    from d4orm_planners.d_d4orm.messages import Message
+
+Item: TypeAlias = "Report | Message"
+"""Candidate of a node, evaluated or as it was sent."""
+
 SELECTIONS = ("top-k", "max", "k-means")
 
 ROUNDS = 50
 """Rounds after which k-means stops, converged or not."""
-
-
-class Numbered(Protocol):
-    """Anything that a node sent, and its number."""
-
-    @property
-    def node(self) -> int:
-        """Sender's number."""
-        ...
-
-    @property
-    def sequence(self) -> int:
-        """Its number among what this node sent."""
-        ...
-
-
-Item = TypeVar("Item", bound=Numbered)
 
 
 def shares(total: int, parts: int) -> tuple[int, ...]:
@@ -39,17 +29,13 @@ def shares(total: int, parts: int) -> tuple[int, ...]:
     return tuple(total // parts + (part < total % parts) for part in range(parts))
 
 
-def merge(newest: Mapping[int, Item], arrivals: Iterable[Item]) -> tuple[dict[int, Item], tuple[Item, ...]]:
+def merge(newest: Mapping[int, Item], arrivals: Iterable[Message]) -> tuple[dict[int, Item], tuple[Message, ...]]:
     """The newest item of every node.
-
-    Args:
-        newest: Items held so far, by node.
-        arrivals: Items that came in, in any order.
 
     Returns:
         What is held now, and the stale arrivals: those that are no newer than what was held before.
     """
-    merged, stale = dict(newest), []
+    merged, stale = dict(newest), list["Message"]()
     for item in arrivals:
         if item.node in newest and item.sequence <= newest[item.node].sequence:
             stale.append(item)

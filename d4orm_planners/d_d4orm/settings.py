@@ -15,7 +15,7 @@ from d4orm_planners.base.planner import PlannerConfig
 from d4orm_planners.base.settings import NOTHING, Count, Seconds, Whole, one_of
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d_d4orm.node_pool import MODES
-from d4orm_planners.d_d4orm.ray_connection import host_and_port
+from d4orm_planners.d_d4orm.ray_planner import host_and_port
 from d4orm_planners.d_d4orm.selection import SELECTIONS, shares
 from d4orm_planners.d_d4orm.transport import TRANSPORTS
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
@@ -95,7 +95,6 @@ class DD4ormConfig(PlannerConfig):
         return cls(refinement=_node_planner(given).config_class(**rest), **own)
 
     def keywords(self) -> dict[str, object]:
-        """See :meth:`CheckedSettings.keywords`."""
         own = super().keywords()
         del own["refinement"]
         return {"planner": self.node_planner.name, **self.refinement.keywords(), **own}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from typing import Protocol
 
@@ -32,11 +33,7 @@ class Transport(Protocol):
 
 
 class Mailbox:
-    """Queue of messages for one receiver, whatever thread they come from.
-
-    Attributes:
-        closed: Whether there will be no more.
-    """
+    """The receiving end of a transport: a queue of messages, whatever thread they come from."""
 
     def __init__(self) -> None:
         self._arrived: deque[bytes] = deque(maxlen=WAITING)
@@ -49,8 +46,8 @@ class Mailbox:
             self._arrived.append(data)
             self._changed.notify_all()
 
-    def take(self, timeout: float = 0.0) -> list[bytes]:
-        """See :meth:`Transport.collect`."""
+    def collect(self, timeout: float = 0.0) -> list[bytes]:
+        """Return what has arrived, see :meth:`Transport.collect`."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._arrived, timeout)
             messages = [] if self.closed else list(self._arrived)
@@ -58,31 +55,23 @@ class Mailbox:
         return messages
 
     def close(self) -> None:
-        """Wake waiting calls; from now on there is nothing to take."""
+        """Wake waiting calls; from now on nothing arrives."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
 
-class LocalTransport:
+class LocalTransport(Mailbox):
     """The ``"local"`` transport: one end of a :class:`LocalNetwork`."""
 
     def __init__(self, network: LocalNetwork) -> None:
+        super().__init__()
         self._network = network
-        self.mailbox = Mailbox()
 
     def publish(self, data: bytes) -> None:
-        """See :meth:`Transport.publish`."""
-        if not self.mailbox.closed:
+        """Send to all other ends."""
+        if not self.closed:
             self._network.deliver(self, bytes(data))
-
-    def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """See :meth:`Transport.collect`."""
-        return self.mailbox.take(timeout)
-
-    def close(self) -> None:
-        """See :meth:`Transport.close`."""
-        self.mailbox.close()
 
 
 class LocalNetwork:
@@ -104,4 +93,34 @@ class LocalNetwork:
         with self._lock:
             ends = [end for end in self._ends if end is not sender]
         for end in ends:
-            end.mailbox.put(data)
+            end.put(data)
+
+
+class TrafficStats:
+    """A transport that counts.
+
+    Attributes:
+        messages: Messages published so far; each goes to all other nodes.
+        message_bytes: Their length together.
+        waited: Seconds spent in :meth:`collect` so far.
+    """
+
+    def __init__(self, transport: Transport) -> None:
+        self.messages = self.message_bytes = 0
+        self.waited = 0.0
+        self._transport = transport
+
+    def publish(self, data: bytes) -> None:
+        self._transport.publish(data)
+        self.messages += 1
+        self.message_bytes += len(data)
+
+    def collect(self, timeout: float = 0.0) -> list[bytes]:
+        begin = time.perf_counter()
+        try:
+            return self._transport.collect(timeout)
+        finally:
+            self.waited += time.perf_counter() - begin
+
+    def close(self) -> None:
+        self._transport.close()

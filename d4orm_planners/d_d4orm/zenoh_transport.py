@@ -117,11 +117,8 @@ class ZenohSettings:
         return all(_is_loopback(endpoint) for endpoint in self.listen)
 
 
-class ZenohTransport:
+class ZenohTransport(Mailbox):
     """One end of a network of zenoh peers. The environment variable ``RUST_LOG`` makes zenoh log what it does.
-
-    Args:
-        settings: Network of the others.
 
     Raises:
         ImportError: If zenoh is not installed.
@@ -129,11 +126,11 @@ class ZenohTransport:
     """
 
     def __init__(self, settings: ZenohSettings) -> None:
+        super().__init__()
         zenoh = load(_zenoh)
         zenoh.try_init_log_from_env()
         config = zenoh_config(zenoh, settings)
         key = f"{settings.namespace}/candidates"
-        self._mailbox = Mailbox()
         self._error: type[Exception] = zenoh.ZError
         try:
             self._session = zenoh.open(config)
@@ -157,22 +154,18 @@ class ZenohTransport:
         atexit.register(self._leave)
 
     def publish(self, data: bytes) -> None:
-        """See :meth:`~d4orm_planners.d_d4orm.transport.Transport.publish`."""
-        if self._mailbox.closed:
+        """Send to all other nodes."""
+        if self.closed:
             return
         try:
             self._publisher.put(data)
         except self._error as error:
-            if not self._mailbox.closed:
+            if not self.closed:
                 logger.warning("a candidate was not sent: %s", _reason(error))
 
-    def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """See :meth:`~d4orm_planners.d_d4orm.transport.Transport.collect`."""
-        return self._mailbox.take(timeout)
-
     def close(self) -> None:
-        """See :meth:`~d4orm_planners.d_d4orm.transport.Transport.close`."""
-        self._mailbox.close()
+        """Leave the network."""
+        super().close()
         atexit.unregister(self._leave)
         self._leave()
 
@@ -183,7 +176,7 @@ class ZenohTransport:
     def _receive(self) -> None:
         with contextlib.suppress(self._error):  # which says that the session is closed
             while True:
-                self._mailbox.put(self._subscriber.recv().payload.to_bytes())
+                self.put(self._subscriber.recv().payload.to_bytes())
 
     @property
     def has_listeners(self) -> bool:

@@ -99,10 +99,6 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
     Q. McNemar, "Note on the sampling error of the difference between correlated proportions", Psychometrika 12, 1947;
     exact, by the binomial distribution.
-
-    Args:
-        only_first: Trials in which only the first succeeded.
-        only_second: Those in which only the second did.
     """
     apart = only_first + only_second
     return float(stats.binomtest(only_first, apart).pvalue) if apart else 1.0
@@ -116,13 +112,9 @@ def _circumstances(trial: Trial) -> tuple[str, float, int, str, str]:
 class PairedPolicies:
     """Paired comparison of two policies under one condition, by trials with the same problem and seed.
 
+    The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
+
     Attributes:
-        scenario: Scenario name.
-        num_robots: Team size.
-        model: Models of the team.
-        control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbance: Further disturbance; empty for none.
-        level: Its level.
         first: A policy's label.
         second: Another's.
         trials: Pairs of trials.

@@ -1,8 +1,8 @@
-"""Figures of success under disturbances that stand in a paper of two columns: small multiples, and a heat map."""
+"""Figures of success against noise, and under disturbances for a paper of two columns: small multiples, a heat map."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -101,20 +101,45 @@ def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
     return paths
 
 
+def _grid(
+    count: int, across: int, size: Callable[[int], tuple[float, float]], **options: Any
+) -> tuple[Figure, Sequence[Axes]]:
+    """A figure of so many axes, in inches by its rows; made without pyplot, which keeps state and wants a display."""
+    rows = -(-count // across)
+    figure: Figure = figures.Figure(figsize=size(rows), layout="constrained")
+    axes = figure.subplots(rows, across, squeeze=False, **options).ravel()
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    return figure, axes[:count]
+
+
+def draw_noise(groups: Mapping[str, Sequence[SuccessRate]]) -> Figure:
+    """Success against the execution noise: a panel per title, and in it a line with a confidence band per policy."""
+    across = min(3, len(groups))
+    figure, axes = _grid(len(groups), across, lambda rows: (4.8 * across, 3.6 * rows))
+    for ax, (title, group) in zip(axes, groups.items()):
+        for label in dict.fromkeys(rate.label for rate in sorted(group, key=lambda rate: rate.control_noise_std)):
+            line = sorted((rate for rate in group if rate.label == label), key=lambda rate: rate.control_noise_std)
+            x = [rate.control_noise_std for rate in line]
+            (drawn,) = ax.plot(x, [rate.rate for rate in line], marker="o", label=label, clip_on=False)
+            lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
+            ax.fill_between(x, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
+        ax.set(title=title, xlabel="standard deviation of the control noise", ylabel="success rate", ylim=(0, 1))
+        ax.grid(alpha=0.3)
+    axes[0].legend(loc="best")
+    return figure
+
+
 @own_style(_STYLE)
 def draw_lines(title: str, rates: Sequence[SuccessRate]) -> Figure:
     """Success against the level of every disturbance: a panel each, a line with confidence intervals per policy."""
     names, labels = (list(dict.fromkeys(all_of)) for all_of in zip(*((one.disturbance, one.label) for one in rates)))
     across = min(4, len(names))
-    rows = -(-len(names) // across)
-    figure: Figure = figures.Figure(figsize=(PAGE * across / 4 if across > 1 else COLUMN, 0.45 + 1.45 * rows))
-    figure.set_layout_engine("constrained")
-    axes = figure.subplots(rows, across, squeeze=False, sharey=True).ravel()
+    width = PAGE * across / 4 if across > 1 else COLUMN
+    figure, axes = _grid(len(names), across, lambda rows: (width, 0.45 + 1.45 * rows), sharey=True)
     for number, (ax, name) in enumerate(zip(axes, names)):
         _draw_panel(ax, name, labels, [rate for rate in rates if rate.disturbance == name])
         ax.set_ylabel("success rate" if number % across == 0 else "")
-    for ax in axes[len(names) :]:
-        ax.set_visible(False)
     figure.suptitle(title, fontsize=7)
     figure.legend(
         *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(4, len(labels)), frameon=False

@@ -14,8 +14,7 @@ from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.evaluation.pool import Pool, run_here, run_jobs
-from d4orm_planners.evaluation.process_pool import ProcessPool
-from d4orm_planners.evaluation.ray_pool import RayPool
+from d4orm_planners.evaluation.process_pool import ProcessPool, RayPool
 from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
 from d4orm_planners.evaluation.study import DisturbanceLevels, Policies, Scenarios, Study
@@ -138,9 +137,7 @@ def run_study(
     store = TrialStore(Path(out) / STORE)
     for path in sorted(Path(out).glob(SHARD_STORES)):
         store.add(*TrialStore(path, alone=True).trials())
-    missing, done, total = _missing([job for group in groups for job in group], store.finished())
-    running = _run(missing, workers, ray, trial_timeout)
-    _store(running, store, done, total, progress or (lambda what, done, total: None))
+    _complete(store, [job for group in groups for job in group], workers, ray, trial_timeout, progress)
     stored = {trial.key: trial for trial in store.trials()}
     return [
         TrialGroup(
@@ -186,9 +183,7 @@ def run_shard(
     Path(out).mkdir(parents=True, exist_ok=True)
     path = Path(out) / SHARD_STORES.replace("*", f"{index}-of-{count}")
     store = TrialStore(path, alone=True)
-    missing, done, total = _missing(jobs, store.finished())
-    running = _run(missing, workers, None, trial_timeout)
-    _store(running, store, done, total, progress or (lambda what, done, total: None))
+    _complete(store, jobs, workers, None, trial_timeout, progress)
     return path
 
 
@@ -197,17 +192,14 @@ def _missing(jobs: Sequence[Job], finished: Set[TrialKey]) -> tuple[list[Job], i
     wanted: set[TrialKey] = set()
     missing = []
     for job in jobs:
-        keys = {condition: job.key(condition) for condition in job.conditions}
-        # The same problem may be asked for under two names, and all disturbances at level zero are one condition.
-        first = {key: condition for condition, key in reversed(keys.items())}
-        left = tuple(
-            condition
-            for condition, key in keys.items()
-            if key not in finished and key not in wanted and first[key] is condition
-        )
-        wanted.update(keys.values())
+        left = []
+        for condition in job.conditions:
+            # The same problem may be asked for under two names, and all disturbances at level zero are one condition.
+            if (key := job.key(condition)) not in wanted:
+                wanted.add(key)
+                left += [condition] if key not in finished else []
         if left:
-            missing.append(replace(job, conditions=left))
+            missing.append(replace(job, conditions=tuple(left)))
     return missing, len(wanted) - sum(len(job.conditions) for job in missing), len(wanted)
 
 
@@ -226,11 +218,20 @@ def _run(
     return run_jobs(jobs, pool, trial_timeout)
 
 
-def _store(running: Generator[list[Trial]], store: TrialStore, done: int, total: int, progress: Progress) -> None:
-    """Write down trials as they come, while the next ones run."""
-    progress("starting", done, total)
+def _complete(
+    store: TrialStore,
+    jobs: Sequence[Job],
+    workers: int | None,
+    ray: str | None,
+    trial_timeout: float | None,
+    progress: Progress | None,
+) -> None:
+    """Run the trials that a store lacks, and write them down as they come, while the next ones run."""
+    missing, done, total = _missing(jobs, store.finished())
+    progress = progress or (lambda what, done, total: None)
     written: Future[int] | None = None
-    with closing(running), ThreadPoolExecutor(1) as writer:
+    with closing(_run(missing, workers, ray, trial_timeout)) as running, ThreadPoolExecutor(1) as writer:
+        progress("starting", done, total)
         for trials in running:
             if written is not None:
                 written.result()

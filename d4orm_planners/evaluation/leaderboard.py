@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
-from d4orm_planners.base.escaping import markdown_text
+from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_by, success_rates
 from d4orm_planners.evaluation.tables import deadline_table, errors, in_physics, panels, rate_table, share, table

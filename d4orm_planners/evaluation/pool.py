@@ -1,20 +1,35 @@
-"""Handing jobs to processes, of this machine or others, and what happens when one dies or a trial takes too long."""
+"""Handing jobs to processes, of this machine or others, and what happens when one dies or a part takes too long.
+
+Trials and recorded episodes are such jobs: their results come one by one, so that what is done is not lost.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Generator, Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Iterable, Iterator
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
-from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.trials import Job, run_job
+Result = TypeVar("Result")
+
+
+class Work(Protocol[Result]):
+    """Work of one process, in parts with a result each."""
+
+    @property
+    def num_parts(self) -> int: ...
+
+    def run(self) -> Iterable[Result]:
+        """Do the parts, one after another."""
+
+    def lost(self, done: int, reason: str) -> tuple[list[Result], Self | None]:
+        """Results of the parts that fail with their process, after so many are done, and the job that is left."""
 
 
 class JobEvent(Enum):
-    """Event of a job, apart from its trials."""
+    """Event of a job, apart from its results."""
 
     BEGUN = "begun"
     ENDED = "ended"
@@ -22,11 +37,7 @@ class JobEvent(Enum):
 
 @dataclass(frozen=True)
 class WorkerLost:
-    """The process that ran a job is gone.
-
-    Attributes:
-        reason: Kind of error and message.
-    """
+    """The process that ran a job is gone."""
 
     reason: str
 
@@ -36,11 +47,11 @@ class WorkerMessage(NamedTuple):
 
     Attributes:
         ticket: Of the job.
-        content: A finished trial, a sign, or that the job is lost.
+        content: The result of a part, an event, or that the job is lost.
     """
 
     ticket: int
-    content: Trial | JobEvent | WorkerLost
+    content: Any
 
 
 class Pool(Protocol):
@@ -49,7 +60,7 @@ class Pool(Protocol):
     def free(self) -> bool:
         """True if it takes another job now."""
 
-    def start(self, job: Job) -> int:
+    def start(self, job: Work[Any]) -> int:
         """Hand a job over; returns a ticket for it."""
 
     def wait(self, timeout: float | None) -> list[WorkerMessage]:
@@ -64,18 +75,18 @@ class Pool(Protocol):
 
 @dataclass
 class _RunningJob:
-    """A job under way: how many of its trials are done, and since when the present one runs."""
+    """A job under way: how many of its parts are done, and since when the present one runs."""
 
-    job: Job
+    job: Work[Any]
     done: int = 0
     since: float | None = None
 
 
 @dataclass
-class _Schedule:
+class _Schedule(Generic[Result]):
     pool: Pool
-    trial_timeout: float | None
-    waiting: deque[Job]
+    timeout: float | None
+    waiting: deque[Work[Result]]
     running: dict[int, _RunningJob] = field(default_factory=dict)
 
     def hand_out(self) -> None:
@@ -83,58 +94,56 @@ class _Schedule:
             job = self.waiting.popleft()
             self.running[self.pool.start(job)] = _RunningJob(job)
 
-    def collect(self) -> list[Trial]:
-        """Wait for news; the trials that have ended."""
-        trials = []
+    def collect(self) -> list[Result]:
+        """Wait for news; the results that there are now."""
+        results = []
         for ticket, content in self.pool.wait(self._patience()):
             run = self.running[ticket]
             if isinstance(content, WorkerLost):
-                trials += self._give_up(ticket, content.reason)
+                results += self._give_up(ticket, content.reason)
             elif content is JobEvent.ENDED:
                 del self.running[ticket]
             else:
                 run.since = time.monotonic()
-                if isinstance(content, Trial):
+                if content is not JobEvent.BEGUN:
                     run.done += 1
-                    trials.append(content)
+                    results.append(content)
         for ticket in [ticket for ticket, run in self.running.items() if self._left(run) <= 0]:
             self.pool.stop(ticket)
-            trials += self._give_up(ticket, f"TimeoutError: took longer than {self.trial_timeout:g} s")
-        return trials
+            results += self._give_up(ticket, f"TimeoutError: took longer than {self.timeout:g} s")
+        return results
 
-    def _give_up(self, ticket: int, reason: str) -> list[Trial]:
-        """The trials that a job fails in without its process; the others of the job are put back."""
+    def _give_up(self, ticket: int, reason: str) -> list[Result]:
+        """The results of a job that has lost its process; what is left of it is put back."""
         run = self.running.pop(ticket)
-        left = run.job.conditions[run.done :]
-        # Without a plan there is nothing to execute, under any condition.
-        lost = len(left) if run.done == 0 and run.job.policy.planned else 1
-        if left[lost:]:
-            self.waiting.appendleft(replace(run.job, conditions=left[lost:]))
-        return [run.job.failed(condition, reason) for condition in left[:lost]]
+        results, left = run.job.lost(run.done, reason)
+        if left is not None:
+            self.waiting.appendleft(left)
+        return results
 
     def _left(self, run: _RunningJob) -> float:
-        if self.trial_timeout is None or run.since is None or run.done == len(run.job.conditions):
+        if self.timeout is None or run.since is None or run.done == run.job.num_parts:
             return float("inf")
-        return run.since + self.trial_timeout - time.monotonic()
+        return run.since + self.timeout - time.monotonic()
 
     def _patience(self) -> float | None:
         shortest = min(map(self._left, self.running.values()), default=float("inf"))
         return None if shortest == float("inf") else max(shortest, 0.0)
 
 
-def run_jobs(jobs: Iterable[Job], pool: Pool, trial_timeout: float | None = None) -> Generator[list[Trial]]:
-    """Run jobs and yield trials as they end. A trial whose process dies, or which takes too long, ends with an error.
+def run_jobs(jobs: Iterable[Work[Result]], pool: Pool, timeout: float | None = None) -> Generator[list[Result]]:
+    """Run jobs and yield results as they come, :meth:`Work.lost` where a process dies or a part takes too long.
 
     Args:
         jobs: Jobs to run.
-        pool: Pool that runs it; closed at the end, also when the iteration is broken off.
-        trial_timeout: Seconds that a trial may take, that of the plan included; ``None`` is no limit.
+        pool: Pool that runs them; closed at the end, also when the iteration is broken off.
+        timeout: Seconds that a part may take; ``None`` is no limit.
 
     Raises:
         OSError: If no process can be started.
     """
-    schedule = _Schedule(pool, trial_timeout, deque(jobs))
-    ended: list[Trial] = []
+    schedule = _Schedule(pool, timeout, deque(jobs))
+    ended: list[Result] = []
     try:
         while schedule.waiting or schedule.running or ended:
             # Nobody waits for work while somebody writes down what is done.
@@ -146,8 +155,15 @@ def run_jobs(jobs: Iterable[Job], pool: Pool, trial_timeout: float | None = None
         pool.close()
 
 
-def run_here(jobs: Iterable[Job]) -> Generator[list[Trial]]:
-    """Run jobs in this process, on all its cores, and yield trials as they end."""
+def events(job: Work[Any]) -> Iterator[Any]:
+    """Do a job, and yield what a worker says of it: that it has begun, each result, and that it has ended."""
+    yield JobEvent.BEGUN
+    yield from job.run()
+    yield JobEvent.ENDED
+
+
+def run_here(jobs: Iterable[Work[Result]]) -> Generator[list[Result]]:
+    """Run jobs in this process, on all its cores, and yield results as they come."""
     for job in jobs:
-        for trial in run_job(job):
-            yield [trial]
+        for result in job.run():
+            yield [result]

@@ -1,4 +1,4 @@
-"""Worker processes of this machine that can be stopped one by one, which executors of ``concurrent.futures`` cannot."""
+"""Pools of processes that can be stopped one by one, which executors of ``concurrent.futures`` cannot: here, on Ray."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
@@ -15,8 +15,12 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from d4orm_planners.evaluation.pool import JobEvent, WorkerLost, WorkerMessage
-from d4orm_planners.evaluation.trials import run_job
+from d4orm_env.core.errors import describe
+from d4orm_planners.d_d4orm.ray_planner import RayConnection
+from d4orm_planners.evaluation.pool import JobEvent, Work, WorkerLost, WorkerMessage, events
+
+QUEUED = 2
+"""Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
 
 
 @dataclass
@@ -30,16 +34,10 @@ class _Worker:
 
 
 class ProcessPool:
-    """Worker processes. They stop at once when the pool is closed, or when this process dies.
+    """Worker processes. They stop at once when the pool is closed, or when this process dies."""
 
-    Args:
-        size: Processes.
-        threads: Threads of each.
-        run: Function that runs a job; by default its trials.
-    """
-
-    def __init__(self, size: int, threads: int = 1, run: Callable[[Any], Iterator[object]] = run_job) -> None:
-        self._size, self._threads, self._run = size, threads, run
+    def __init__(self, size: int, threads: int = 1) -> None:
+        self._size, self._threads = size, threads
         self._context = multiprocessing.get_context("spawn")
         # Nobody else holds the sending end: when this process dies, the workers notice.
         self._receiver, self._sender = self._context.Pipe(duplex=False)
@@ -49,7 +47,7 @@ class ProcessPool:
     def free(self) -> bool:
         return len(self._workers) < self._size or any(worker.ticket is None for worker in self._workers)
 
-    def start(self, job: object) -> int:
+    def start(self, job: Work[Any]) -> int:
         idle = (worker for worker in self._workers if worker.ticket is None)
         worker = next(idle, None) or self._new()
         worker.ticket = next(self._tickets)
@@ -85,8 +83,7 @@ class ProcessPool:
 
     def _new(self) -> _Worker:
         ours, theirs = self._context.Pipe()
-        work = (theirs, self._receiver, self._threads, self._run)
-        process = self._context.Process(target=_work, args=work, daemon=True)
+        process = self._context.Process(target=_work, args=(theirs, self._receiver, self._threads), daemon=True)
         with _interrupts_wait():
             process.start()
         theirs.close()  # or a dead worker would not close the pipe
@@ -132,7 +129,7 @@ def _interrupts_wait() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
-def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any], Iterator[object]]) -> None:
+def _work(pipe: Connection, parent: Connection, threads: int) -> None:
     """Run jobs until the parent is gone; Ctrl-C is for the parent, which decides."""
     os.environ.update(D4ORM_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -144,8 +141,69 @@ def _work(pipe: Connection, parent: Connection, threads: int, run: Callable[[Any
     threading.Thread(target=follow_parent, daemon=True).start()
     with suppress(EOFError, BrokenPipeError):  # the parent is gone
         while True:
-            job = pipe.recv()
-            pipe.send(JobEvent.BEGUN)
-            for result in run(job):
-                pipe.send(result)
-            pipe.send(JobEvent.ENDED)
+            for content in events(pipe.recv()):
+                pipe.send(content)
+
+
+class RayPool:
+    """Tasks on a Ray cluster, one per job and core, never tried again by Ray itself.
+
+    Args:
+        address: ``"auto"`` for the cluster that this machine belongs to, an address, or ``"local"`` for a new one on
+            this machine.
+        size: Jobs under way at most; by default twice as many as the cluster has cores.
+
+    Raises:
+        ValueError: If the address is none.
+        ImportError: If Ray is not installed.
+        ConnectionError: If there is no cluster.
+    """
+
+    def __init__(self, address: str, size: int | None = None) -> None:
+        self._connection = RayConnection(address, "running on a cluster")
+        self._ray = self._connection.ray
+        cores = int(self._ray.cluster_resources().get("CPU", 1))
+        self._size = size or QUEUED * max(cores, 1)
+        # A generator's results come back one by one, so that what is done is not lost with the process.
+        self._task = self._ray.remote(num_cpus=1, max_retries=0)(_work_remotely)
+        self._jobs: dict[Iterator[object], int] = {}
+        self._tickets = count()
+
+    def free(self) -> bool:
+        return len(self._jobs) < self._size
+
+    def start(self, job: Work[Any]) -> int:
+        ticket = next(self._tickets)
+        self._jobs[self._task.remote(job)] = ticket
+        return ticket
+
+    def wait(self, timeout: float | None) -> list[WorkerMessage]:
+        running = list(self._jobs)
+        ready, _ = self._ray.wait(running, num_returns=1, timeout=timeout)
+        return [WorkerMessage(self._jobs[task], self._next(task)) for task in ready]
+
+    def stop(self, ticket: int) -> None:
+        task = next(task for task, number in self._jobs.items() if number == ticket)
+        del self._jobs[task]
+        self._ray.cancel(task, force=True)
+
+    def close(self) -> None:
+        for task in self._jobs:
+            self._ray.cancel(task, force=True)
+        self._connection.close()
+
+    def _next(self, task: Iterator[object]) -> Any:
+        try:
+            content = self._ray.get(next(task))
+        except (self._ray.exceptions.RayError, StopIteration) as error:
+            del self._jobs[task]
+            return WorkerLost(f"ChildProcessError: the worker was lost ({describe(error)})")
+        if content is JobEvent.ENDED:
+            del self._jobs[task]
+        return content
+
+
+def _work_remotely(job: Work[Any]) -> Iterator[Any]:
+    """Run a job on one core of some machine."""
+    os.environ.update(D4ORM_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    yield from events(job)

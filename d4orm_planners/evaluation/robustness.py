@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.render.style import own_style
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
-from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, quantity_of, write_figure
-from d4orm_planners.evaluation.summary import THRESHOLD, SuccessRate, TrialGroup, success_rates, tolerances
+from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, draw_noise, quantity_of, write_figure
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.tables import markdown, panels, table, target, write_csv, write_rates
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 figures: Any = LazyModule("matplotlib.figure")
+
+THRESHOLD = 0.9
+"""Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
+
+
+_PAIRS = """\
+Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
+succeeded; p is that of McNemar's exact test. Differences have 95% intervals by a paired bootstrap."""
 
 
 def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
@@ -43,8 +49,8 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
         path.write_text(markdown(rates), encoding="utf-8")
     if any(rate.disturbance for rate in rates):
         return paths[:2]
-    with target(paths[2]) as path:
-        _draw_noise(path, rates)
+    with target(paths[2]) as path, own_style({"text.parse_math": False}):  # no name is a formula
+        draw_noise(panels(rates)).savefig(path, dpi=150)
     return paths
 
 
@@ -96,11 +102,6 @@ def tolerance_tables(rates: Sequence[SuccessRate]) -> str:
     return "\n\n".join(blocks)
 
 
-_PAIRS = """\
-Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
-succeeded; p is that of McNemar's exact test. Differences have 95% intervals by a paired bootstrap."""
-
-
 def _pair_tables(rates: Sequence[SuccessRate], pairs: Sequence[PairedPolicies]) -> list[str]:
     header = ("first", "second", "noise", "disturbance", "level", "trials", "only first", "only second", "p",
               "difference in success", "first slower by, s")  # fmt: skip
@@ -132,30 +133,6 @@ def _pair_cells(pair: PairedPolicies) -> tuple[str, ...]:
     )
 
 
-@own_style({"text.parse_math": False})  # no name is a formula
-def _draw_noise(path: Path, rates: Sequence[SuccessRate]) -> None:
-    """Success against the execution noise: one line per policy, one panel per scenario and team."""
-    groups = panels(rates)
-    figure, axes = _figure(len(groups), 4.8, 3.6)
-    for ax, (title, group) in zip(axes, groups.items()):
-        _draw_lines(ax, sorted(group, key=lambda rate: rate.control_noise_std), lambda rate: rate.control_noise_std)
-        ax.set(title=title, xlabel="standard deviation of the control noise")
-    axes[0].legend(loc="best")
-    figure.savefig(path, dpi=150)
-
-
-def _draw_lines(ax: Any, rates: Sequence[SuccessRate], place: Callable[[SuccessRate], float | None]) -> None:
-    """A line with a confidence band per policy."""
-    for policy in dict.fromkeys(rate.label for rate in rates):
-        line = [rate for rate in rates if rate.label == policy]
-        x = [place(rate) for rate in line]
-        (drawn,) = ax.plot(x, [rate.rate for rate in line], marker="o", label=policy, clip_on=False)
-        lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
-        ax.fill_between(x, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
-    ax.set(ylabel="success rate", ylim=(0, 1))
-    ax.grid(alpha=0.3)
-
-
 def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
     """Group rates as in the tables, but for levels of noise too."""
     groups: dict[str, list[SuccessRate]] = {}
@@ -166,12 +143,68 @@ def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
     return groups
 
 
-def _figure(count: int, width: float, height: float) -> tuple[Figure, NDArray[np.object_]]:
-    """A figure made without pyplot, which would keep state and want a display, and its axes."""
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    figure = figures.Figure(figsize=(width * columns, height * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax in axes[count:]:
-        ax.set_visible(False)
-    return figure, axes
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """At which level of a disturbance the success of a policy falls below a share of what it is undisturbed.
+
+    The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
+
+    Attributes:
+        stands: The last level before that, in the order in which they were given; ``None`` if it fails at the first.
+        fails: The first level with a success rate below the threshold; ``None`` if it tolerates all.
+        undisturbed: Success rate at the first level, which is the undisturbed one unless that is left out.
+        threshold: That share of it.
+    """
+
+    label: str
+    scenario: str
+    num_robots: int
+    model: str
+    control_noise_std: float
+    disturbance: str
+    stands: float | None
+    fails: float | None
+    undisturbed: float
+    threshold: float
+
+    @property
+    def text(self) -> str:
+        """Return the level as text: ``"4"``, ``"over 4"`` where it tolerates the last level, 4, or ``"-"`` if it never
+        succeeds.
+        """
+        if self.undisturbed == 0:
+            return "-"
+        return f"{self.fails:g}" if self.fails is not None else f"over {self.stands:g}"
+
+
+def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
+    """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
+
+    Args:
+        rates: Those of one policy and disturbance from harmless to bad; those without a disturbance are passed over.
+        share: Share of the success rate at the first level that is asked for.
+    """
+    lines: dict[tuple[object, ...], list[SuccessRate]] = {}
+    for rate in rates:
+        if rate.disturbance:
+            key = (rate.label, rate.scenario, rate.num_robots, rate.model, rate.control_noise_std, rate.disturbance)
+            lines.setdefault(key, []).append(rate)
+    return [_tolerance(line, share) for line in lines.values()]
+
+
+def _tolerance(line: Sequence[SuccessRate], share: float) -> Tolerance:
+    threshold = share * line[0].rate
+    failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
+    first = line[0]
+    return Tolerance(
+        label=first.label,
+        scenario=first.scenario,
+        num_robots=first.num_robots,
+        model=first.model,
+        control_noise_std=first.control_noise_std,
+        disturbance=first.disturbance,
+        stands=line[failing - 1].level if failing else None,
+        fails=line[failing].level if failing < len(line) else None,
+        undisturbed=first.rate,
+        threshold=threshold,
+    )

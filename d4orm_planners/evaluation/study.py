@@ -240,7 +240,10 @@ def _varied(name: str, levels: Levels) -> list[Varied]:
         chosen = [checked_disturbances(one) for one in listed]
         return [(name, one, level) for one, level in zip(chosen, _levels_of(chosen))]
     made = [(level, disturbance_at(name, level)) for level in listed]
-    return [(name, (one,), _number(level, place)) for place, (level, one) in enumerate(made)]
+    return [
+        (name, (one,), float(level if isinstance(level, int | float) else place))
+        for place, (level, one) in enumerate(made)
+    ]
 
 
 def _holds(given: object) -> bool:
@@ -256,7 +259,3 @@ def _levels_of(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
         if len(differing) == 1 and all(isinstance(each[differing[0]], int | float) for each in values):
             return [float(each[differing[0]]) for each in values]  # type: ignore[arg-type] # a number, as was asked
     return [float(place) for place in range(len(chosen))]
-
-
-def _number(level: object, place: int) -> float:
-    return float(level) if isinstance(level, int | float) else float(place)

@@ -14,9 +14,6 @@ from d4orm_planners.evaluation.store import Trial
 
 stats: Any = LazyModule("scipy.stats")
 
-THRESHOLD = 0.9
-"""Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
-
 
 class TrialGroup(NamedTuple):
     """Trials of one policy, one per seed, that have all but their seeds in common.
@@ -182,10 +179,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
     Unlike the normal approximation it stays inside [0, 1] and says something at 0 and at all successes.
 
-    Args:
-        successes: Number that succeeded.
-        trials: Out of how many.
-
     Raises:
         ValueError: If there are no trials, more successes than trials, or fewer than none.
     """
@@ -202,12 +195,7 @@ def success_rates(groups: Iterable[TrialGroup]) -> list[SuccessRate]:
 
 
 def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRate:
-    """Sum up the trials, at least one, of one policy on one scenario, team size and level of noise.
-
-    Args:
-        trials: The trials.
-        label: Name of the policy; by default that in the first trial.
-    """
+    """Sum up the trials, at least one, of one policy on one scenario, team size and level of noise."""
     successes = [trial for trial in trials if trial.success]
     travel = mean_interval([trial.travel_time for trial in successes if trial.travel_time is not None])
     stretch = [trial.stretch for trial in successes if trial.stretch is not None]
@@ -270,74 +258,3 @@ def success_by(trials: Iterable[Trial], deadline: float) -> SuccessWithin:
         raise ValueError("there are no trials; run some with evaluate()")
     successes = sum(time is not None and time <= deadline for time in times)
     return SuccessWithin(deadline, len(times), successes, *wilson_interval(successes, len(times)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tolerance:
-    """At which level of a disturbance the success of a policy falls below a share of what it is undisturbed.
-
-    Attributes:
-        label: Name of the policy with its settings.
-        scenario: Scenario name.
-        num_robots: Team size.
-        model: Models of the team.
-        control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbance: Disturbance, such as ``"push.speed"``.
-        stands: The last level before that, in the order in which they were given; ``None`` if it fails at the first.
-        fails: The first level with a success rate below the threshold; ``None`` if it tolerates all.
-        undisturbed: Success rate at the first level, which is the undisturbed one unless that is left out.
-        threshold: That share of it.
-    """
-
-    label: str
-    scenario: str
-    num_robots: int
-    model: str
-    control_noise_std: float
-    disturbance: str
-    stands: float | None
-    fails: float | None
-    undisturbed: float
-    threshold: float
-
-    @property
-    def text(self) -> str:
-        """Return the level as text: ``"4"``, ``"over 4"`` where it tolerates the last level, 4, or ``"-"`` if it never
-        succeeds.
-        """
-        if self.undisturbed == 0:
-            return "-"
-        return f"{self.fails:g}" if self.fails is not None else f"over {self.stands:g}"
-
-
-def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
-    """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
-
-    Args:
-        rates: Those of one policy and disturbance from harmless to bad; those without a disturbance are passed over.
-        share: Share of the success rate at the first level that is asked for.
-    """
-    lines: dict[tuple[object, ...], list[SuccessRate]] = {}
-    for rate in rates:
-        if rate.disturbance:
-            key = (rate.label, rate.scenario, rate.num_robots, rate.model, rate.control_noise_std, rate.disturbance)
-            lines.setdefault(key, []).append(rate)
-    return [_tolerance(line, share) for line in lines.values()]
-
-
-def _tolerance(line: Sequence[SuccessRate], share: float) -> Tolerance:
-    threshold = share * line[0].rate
-    failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
-    first = line[0]
-    return Tolerance(
-        label=first.label,
-        scenario=first.scenario,
-        num_robots=first.num_robots,
-        model=first.model,
-        control_noise_std=first.control_noise_std,
-        disturbance=first.disturbance,
-        stands=line[failing - 1].level if failing else None,
-        fails=line[failing].level if failing < len(line) else None,
-        undisturbed=first.rate,
-        threshold=threshold,
-    )

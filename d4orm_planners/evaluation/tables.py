@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done, require_file
 from d4orm_env.core.lazy import LazyModule, load
-from d4orm_planners.base.escaping import markdown_text, one_line, spreadsheet_cell
+from d4orm_planners.base.display import markdown_text, one_line, spreadsheet_cell
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore, checked_trial
 from d4orm_planners.evaluation.summary import SuccessRate, SuccessWithin
 
@@ -60,11 +60,7 @@ def write_rates(path: Path, rates: Sequence[SuccessRate]) -> None:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write at least one row, all with the same columns, as CSV; what is ``None`` is empty, and no text a formula.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write at least one row, all with the same columns, as CSV; what is ``None`` is empty, and no text a formula."""
     with target(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -76,9 +72,6 @@ def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
 
     Returns:
         Whether it was written: ``False`` where pyarrow is not installed.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     try:
         load(pyarrow)
@@ -138,11 +131,7 @@ def _trials(file: ParquetFile) -> Iterator[Trial]:
 
 @contextmanager
 def target(path: Path) -> Iterator[Path]:
-    """A temporary file that takes the place of ``path``; what goes wrong with it names ``path``.
-
-    Raises:
-        OSError: If it cannot be written.
-    """
+    """A temporary file that takes the place of ``path``; one that cannot be written is an ``OSError`` naming that."""
     try:
         with replaced_when_done(path) as temporary:
             yield temporary

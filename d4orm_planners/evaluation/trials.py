@@ -119,15 +119,7 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Job:
-    """A policy on a problem with one seed, under several conditions.
-
-    Attributes:
-        policy: The policy with its settings.
-        problem: The problem.
-        scenario: Its name in the results.
-        seed: Of the policy and of the noise.
-        conditions: Conditions.
-    """
+    """A policy on a problem with one seed, under several conditions."""
 
     policy: Configuration
     problem: Problem
@@ -154,27 +146,38 @@ class Job:
             error=error,
         )
 
+    @property
+    def num_parts(self) -> int:
+        """Number of trials."""
+        return len(self.conditions)
 
-def run_job(job: Job) -> Iterator[Trial]:
-    """Run the trials of a job one after another; a plan is made once and executed under all conditions.
+    def run(self) -> Iterator[Trial]:
+        """Run the trials one after another; a plan is made once and executed under all conditions.
 
-    Whatever a policy raises is the result of its trial.
+        Whatever a policy raises is the result of its trial.
 
-    Raises:
-        KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
-    """
-    timed: _TimedPolicy | None = None
-    for condition in job.conditions:
-        begin = time.perf_counter()
-        error, outcome = "", {}
-        try:
-            timed = timed or _TimedPolicy(make_policy(job.policy.source, **job.policy.settings))
-            outcome = _outcome(timed, job, condition)
-        except Exception as problem:
-            error = describe(problem)
-        libraries, machine = _origin()
-        trial = replace(job.failed(condition, error), versions=libraries, machine=machine, **outcome)
-        yield replace(trial, elapsed=time.perf_counter() - begin)
+        Raises:
+            KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
+        """
+        timed: _TimedPolicy | None = None
+        for condition in self.conditions:
+            begin = time.perf_counter()
+            error, outcome = "", {}
+            try:
+                timed = timed or _TimedPolicy(make_policy(self.policy.source, **self.policy.settings))
+                outcome = _outcome(timed, self, condition)
+            except Exception as problem:
+                error = describe(problem)
+            libraries, machine = _origin()
+            trial = replace(self.failed(condition, error), versions=libraries, machine=machine, **outcome)
+            yield replace(trial, elapsed=time.perf_counter() - begin)
+
+    def lost(self, done: int, reason: str) -> tuple[list[Trial], Job | None]:
+        left = self.conditions[done:]
+        # Without a plan there is nothing to execute, under any condition.
+        count = len(left) if done == 0 and self.policy.planned else 1
+        rest = replace(self, conditions=left[count:]) if left[count:] else None
+        return [self.failed(condition, reason) for condition in left[:count]], rest
 
 
 def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, Any]:

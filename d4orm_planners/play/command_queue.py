@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, Concatenate, ParamSpec
 
+P = ParamSpec("P")
 Command = Callable[[], None]
 
 MOST_WAITING = 100
@@ -57,3 +60,18 @@ class CommandQueue:
     def closed(self) -> bool:
         """True if it was closed."""
         return self._closed
+
+
+def queued(
+    setting: str | None = None,
+) -> Callable[[Callable[Concatenate[Any, P], None]], Callable[Concatenate[Any, P], None]]:
+    """Have calls of a method wait among its object's ``commands``; of one setting the last call counts."""
+
+    def decorate(method: Callable[Concatenate[Any, P], None]) -> Callable[Concatenate[Any, P], None]:
+        @wraps(method)
+        def put(owner: Any, /, *arguments: P.args, **keywords: P.kwargs) -> None:
+            owner.commands.put(partial(method, owner, *arguments, **keywords), setting)
+
+        return put
+
+    return decorate

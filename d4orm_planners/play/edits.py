@@ -108,14 +108,7 @@ def remove_obstacle(problem: Problem) -> Problem:
 
 
 def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> Problem:
-    """Move an obstacle by ``shift`` ``(d,)`` [m].
-
-    Args:
-        problem: The scene.
-        kind: ``"circles"``, ``"spheres"``, ``"cylinders"``, ``"boxes"`` or ``"polygons"``.
-        index: Number of the one.
-        shift: By how much.
-    """
+    """Move an obstacle by ``shift`` ``(d,)`` [m]."""
     by, d = np.asarray(shift, np.float32), problem.dimension
     shapes = [np.array(shape) for shape in getattr(problem.world, kind)]
     if not 0 <= index < len(shapes):
@@ -131,14 +124,7 @@ def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> 
 
 
 def followed(before: Problem, after: Problem, other: Problem, who: str) -> Problem:
-    """Another team's scene changed as this one was: what was moved, added or removed is, all else stays.
-
-    Args:
-        before: This scene.
-        after: Its new state.
-        other: Another with the same team and world, whose robots are elsewhere.
-        who: Its owner, for messages.
-    """
+    """Another team's scene changed as this one was: what was moved, added or removed is, all else stays."""
     kept = min(before.num_robots, after.num_robots)
     places, moved = [], []
     for here, there, elsewhere in zip(_places(before), _places(after), _places(other)):

@@ -18,12 +18,12 @@ from d4orm_env.scenarios import list_scenarios
 from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
 from d4orm_env.scenarios.schema import parse
-from d4orm_planners.base.escaping import markdown_text
+from d4orm_planners.base.display import markdown_text
 from d4orm_planners.play import edits
+from d4orm_planners.play.origin_check import LARGEST_UPLOAD
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.sliders import Dials
-from d4orm_planners.play.validation import LARGEST_UPLOAD
 from d4orm_planners.play.view import View
 
 POLICIES = {
@@ -45,13 +45,7 @@ PUSH = 0.8
 
 
 class Panel:
-    """Buttons, sliders and menus of a page.
-
-    Args:
-        server: The page.
-        session: Session that they control.
-        view: Its view.
-    """
+    """Buttons, sliders and menus of a page."""
 
     def __init__(self, server: viser.ViserServer, session: Session, view: View) -> None:
         self._gui, self._session, self._view = server.gui, session, view

@@ -28,15 +28,6 @@ class AuthenticatingProxy:
     The page and its web socket are asked for by requests of their own, one per connection. The first brings the token
     in its address and gets it back as a cookie, which the others show.
 
-    Args:
-        host: Host to listen on.
-        port: Port to listen on; 0 for any free one.
-        target: The port of this machine that is behind it.
-
-    Attributes:
-        port: Port that it listens on.
-        token: Token that opens it.
-
     Raises:
         OSError: If it cannot listen there.
     """

@@ -20,19 +20,14 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render.replay import Replay
-from d4orm_planners.base.planner_registry import make_policy, setting_names
-from d4orm_planners.base.policy import Policy
-from d4orm_planners.play.command_queue import MOST_WAITING, Command, CommandQueue
+from d4orm_planners.play.command_queue import MOST_WAITING, CommandQueue, queued
 from d4orm_planners.play.edits import Edit, followed
 from d4orm_planners.play.scene_frame import Frame, Status
-from d4orm_planners.play.viewport import EpisodeOptions, Viewport
+from d4orm_planners.play.viewport import Drivers, EpisodeOptions, Viewport
 
 _IDLE = 0.1
 _MOST_EDITING = 0.25
 """Seconds from one step to the next after which no other change is begun; the clock goes on first."""
-
-HORIZON = "predict_horizon"
-"""Setting of policies that look ahead."""
 
 MOST_LANES = 6
 
@@ -40,13 +35,11 @@ MOST_LANES = 6
 class Session:
     """A team in its world, driven by a policy, or by several side by side.
 
-    Args:
-        problem: The scene to begin with.
-        policies: Names of what drives; of :func:`~d4orm_planners.list_policies`.
-        seed: Of the policies, of what goes wrong, and of new goals.
-        lifelong: Whether robots go on to new goals.
-
     Attributes:
+        commands: What was asked for by methods that wait for the next step.
+        frames: The present moment of all that drive, in their order.
+        policies: Their names.
+        levels: Disturbances, by name and level.
         failure: Error that ended the thread, if it was not :meth:`close`.
 
     Raises:
@@ -54,38 +47,22 @@ class Session:
     """
 
     def __init__(self, problem: Problem, *policies: str, seed: int = 0, lifelong: bool = False) -> None:
-        self._loaded, self._names = problem, policies or ("d4orm-c2f",)
-        self._terms, self._levels = EpisodeOptions(seed, lifelong), dict[str, float]()
-        self._policies: dict[tuple[str, int | None], Policy] = {}
-        self._horizon: int | None = None
-        self._commands = CommandQueue()
+        self._loaded, self.policies = problem, policies or ("d4orm-c2f",)
+        self._terms, self.levels = EpisodeOptions(seed, lifelong), dict[str, float]()
+        self._drivers = Drivers()
+        self.commands = CommandQueue()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
         self._status = Status(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
-        self._frames: tuple[Frame, ...] = ()
+        self.frames: tuple[Frame, ...] = ()
         self._lanes: tuple[Viewport, ...] = ()
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="d4orm-play", daemon=True)
-        self._begin([problem] * len(self._names), afresh=True)
-
-    @property
-    def frames(self) -> tuple[Frame, ...]:
-        """The present moment of all that drive, in their order."""
-        return self._frames
+        self._begin([problem] * len(self.policies), afresh=True)
 
     @property
     def frame(self) -> Frame:
         """The present moment of the first that drives."""
-        return self._frames[0]
-
-    @property
-    def policies(self) -> tuple[str, ...]:
-        """Names of what drives."""
-        return self._names
-
-    @property
-    def levels(self) -> Mapping[str, float]:
-        """Disturbances, by name and level."""
-        return self._levels
+        return self.frames[0]
 
     @property
     def scene(self) -> Problem:
@@ -93,17 +70,12 @@ class Session:
         frame = self.frame
         return frame.problem.with_state(frame.states, frame.goals)
 
-    @property
-    def recorded_steps(self) -> int:
-        """Number of steps since team, world or policies last changed."""
-        return len(self._lanes[0].recording) - 1
-
     def replay(self) -> Replay:
         """Return a replay since team, world or policies last changed, side by side."""
         lanes = self._lanes
         scene = lanes[0].scene
         motions = [lane.recording.motion(lane.name) for lane in lanes]
-        return Replay(f"{scene.name}, {count(scene.num_robots, 'robot')} by {', '.join(self._names)}", tuple(motions))
+        return Replay(f"{scene.name}, {count(scene.num_robots, 'robot')} by {', '.join(self.policies)}", tuple(motions))
 
     def start(self) -> None:
         """Let the clock run."""
@@ -111,159 +83,126 @@ class Session:
 
     def close(self) -> None:
         """Stop the clock and wait for the thread."""
-        self._commands.close()
+        self.commands.close()
         if self._thread.is_alive():
             self._thread.join()
 
+    @queued("refusal")
     def refuse(self, reason: str) -> None:
         """Say why a request is refused."""
+        raise ValueError(reason)
 
-        def make() -> None:
-            raise ValueError(reason)
-
-        self._post(make, "refusal")
-
+    @queued()
     def edit(self, edit: Edit, lane: int = 0) -> None:
-        """Change the scene between two steps; what cannot be is left, and the next frame's message says why.
+        """Change the scene between two steps, as the team of this lane has it; all others follow.
 
-        Args:
-            edit: The change.
-            lane: Number of the team that it goes by, where several drive side by side; all others follow.
+        What cannot be is left, and the next frame's message says why.
         """
+        before = [one.scene for one in self._lanes]
+        leader = min(lane, len(before) - 1)
+        after = edit(before[leader])
+        scenes = [
+            after if index == leader else followed(before[leader], after, other, self.policies[index])
+            for index, other in enumerate(before)
+        ]
+        self._begin(scenes, afresh=after.team is not before[0].team or after.world is not before[0].world)
 
-        def make() -> None:
-            before = [one.scene for one in self._lanes]
-            leader = min(lane, len(before) - 1)
-            after = edit(before[leader])
-            scenes = [
-                after if index == leader else followed(before[leader], after, other, self._names[index])
-                for index, other in enumerate(before)
-            ]
-            self._begin(scenes, afresh=after.team is not before[0].team or after.world is not before[0].world)
-
-        self._post(make)
-
+    @queued()
     def push(self, robot: int | None, velocity: ArrayLike, lane: int = 0) -> None:
         """Give a robot a velocity on top of its own at the next step's beginning, in all that drive side by side.
 
         The policies are not told, and have to find out.
 
         Args:
-            robot: Its number; ``None`` is the one that is farthest from its goal.
+            robot: Its number; ``None`` is the one of this lane that is farthest from its goal.
             velocity: ``(d,)`` [m/s].
-            lane: Whose robot has to be under way, and counts as the farthest.
+            lane: Whose robot has to be under way.
         """
+        given = np.asarray(velocity, np.float32)
+        leader = self._lanes[min(lane, len(self._lanes) - 1)]
+        chosen = leader.farthest if robot is None else robot
+        leader.push(chosen, given)
+        for other in self._lanes:
+            if other is not leader and not other.docked[chosen]:
+                other.push(chosen, given)
+        self._show(self._state)
 
-        def make() -> None:
-            given = np.asarray(velocity, np.float32)
-            leader = self._lanes[min(lane, len(self._lanes) - 1)]
-            chosen = leader.farthest if robot is None else robot
-            leader.push(chosen, given)
-            for other in self._lanes:
-                if other is not leader and not other.docked[chosen]:
-                    other.push(chosen, given)
-            self._show(self._state)
-
-        self._post(make)
-
+    @queued()
     def load(self, make_scene: Callable[[], Problem], seed: int = 0) -> None:
         """Begin anew with another scene."""
+        scene = make_scene()
+        self._begin([scene] * len(self.policies), terms=replace(self._terms, seed=seed), afresh=True)
+        self._loaded = scene
 
-        def make() -> None:
-            scene = make_scene()
-            self._begin([scene] * len(self._names), terms=replace(self._terms, seed=seed), afresh=True)
-            self._loaded = scene
-
-        self._post(make)
-
+    @queued()
     def reset(self) -> None:
         """Begin the scene anew that was loaded last."""
-        self._post(lambda: self._begin([self._loaded] * len(self._names), afresh=True))
+        self._begin([self._loaded] * len(self.policies), afresh=True)
 
+    @queued("policies")
     def choose(self, *policies: str) -> None:
         """Let other policies drive on from here, side by side; one that comes in begins where the first is."""
+        if policies == self.policies:
+            return
+        if not 1 <= len(set(policies)) == len(policies) <= MOST_LANES:
+            raise ValueError(f"{len(policies)} policies are chosen; choose 1 to {MOST_LANES}, each once")
+        scenes = {lane.name: lane.scene for lane in self._lanes}
+        self._begin([scenes.get(name, self._lanes[0].scene) for name in policies], names=policies, afresh=True)
 
-        def make() -> None:
-            if policies == self._names:
-                return
-            if not 1 <= len(set(policies)) == len(policies) <= MOST_LANES:
-                raise ValueError(f"{len(policies)} policies are chosen; choose 1 to {MOST_LANES}, each once")
-            scenes = {lane.name: lane.scene for lane in self._lanes}
-            self._begin([scenes.get(name, self._lanes[0].scene) for name in policies], names=policies, afresh=True)
-
-        self._post(make, "policies")
-
+    @queued("horizon")
     def set_horizon(self, steps: int) -> None:
         """Set the steps that a policy which predicts looks ahead; others have no such setting."""
+        former, self._drivers.horizon = self._drivers.horizon, steps
+        try:
+            self._begin()
+        except Exception:
+            self._drivers.horizon = former
+            raise
 
-        def make() -> None:
-            former, self._horizon = self._horizon, steps
-            try:
-                self._begin_here()
-            except Exception:
-                self._horizon = former
-                raise
-
-        self._post(make, "horizon")
-
+    @queued("lifelong")
     def set_lifelong(self, lifelong: bool) -> None:
         """Set whether robots that arrive go on to new goals."""
-        self._post(lambda: self._begin_here(replace(self._terms, lifelong=lifelong)), "lifelong")
+        self._begin(terms=replace(self._terms, lifelong=lifelong))
 
+    @queued("disturbances")
     def disturb(self, levels: Mapping[str, float]) -> None:
-        """Set the disturbances from the next step on.
+        """Set the disturbances by name and level, from the next step on."""
+        if levels != self.levels:
+            self._begin(terms=replace(self._terms, disturbances=disturbances_at(levels)))
+            self.levels = dict(levels)
 
-        Args:
-            levels: Names and levels of :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`.
-        """
-
-        def make() -> None:
-            if levels != self._levels:
-                self._begin_here(replace(self._terms, disturbances=disturbances_at(levels)))
-                self._levels = dict(levels)
-
-        self._post(make, "disturbances")
-
+    @queued("paused")
     def pause(self, paused: bool) -> None:
         """Stop the clock, or let it run."""
+        self._paused, self._steps_wanted = paused, 0
+        self._show(self._state)
 
-        def make() -> None:
-            self._paused, self._steps_wanted = paused, 0
-            self._show(self._state)
-
-        self._post(make, "paused")
-
+    @queued("step")
     def step(self) -> None:
         """Stop the clock after one step."""
-
-        def make() -> None:
-            self._paused, self._steps_wanted = True, 1
-
-        self._post(make, "step")
+        self._paused, self._steps_wanted = True, 1
 
     def set_speed(self, speed: float) -> None:
         """Set how many times faster than real time the clock runs."""
         self._speed = min(max(float(speed), 0.05), 50.0)
 
-    def _post(self, command: Command, setting: str | None = None) -> None:
-        self._commands.put(command, setting)
-
     def _live(self) -> None:
         try:
             due = time.perf_counter()
-            while not self._commands.closed:
+            while not self.commands.closed:
                 if self._obey():
                     due = time.perf_counter()
                 if self._state != "running" and not self._steps_wanted:
-                    self._commands.wait(_IDLE)
+                    self.commands.wait(_IDLE)
                     due = time.perf_counter()
                     continue
                 left = due - time.perf_counter()
                 if left > 0 and not self._steps_wanted:
-                    self._commands.wait(left)
+                    self.commands.wait(left)
                     continue
                 self._steps_wanted = 0
-                due = max(due, time.perf_counter() - self._pace) + self._pace
+                pace = self.frame.problem.dt / self._speed
+                due = max(due, time.perf_counter() - pace) + pace
                 self._advance_or_pause()
         except BaseException as error:
             self.failure = error
@@ -283,14 +222,14 @@ class Session:
     def _obey(self) -> bool:
         """Do what was asked for meanwhile, or some of it if that takes long; whether there was anything."""
         begin, obeyed = time.perf_counter(), False
-        while time.perf_counter() - begin < _MOST_EDITING and (command := self._commands.take()) is not None:
+        while time.perf_counter() - begin < _MOST_EDITING and (command := self.commands.take()) is not None:
             obeyed = True
             self._status = replace(self._status, message="")
             try:
                 command()
             except Exception as error:  # nothing that anybody asks for ends the session
                 self._say_refused(1, _told(error))
-        if dropped := self._commands.dropped():
+        if dropped := self.commands.dropped():
             self._say_refused(dropped, f"{dropped} changes are left, as {MOST_WAITING} were waiting; make them slower")
         return obeyed
 
@@ -299,55 +238,40 @@ class Session:
         self._show(self._state, reason)
 
     @property
-    def _pace(self) -> float:
-        return self.frame.problem.dt / self._speed
-
-    @property
     def _state(self) -> str:
         if self._paused:
             return "paused"
         return "arrived" if all(lane.finished for lane in self._lanes) else "running"
 
-    def _begin_here(self, terms: EpisodeOptions | None = None) -> None:
-        """Go on from the present states."""
-        self._begin([lane.scene for lane in self._lanes], terms=terms)
-
     def _begin(
         self,
-        scenes: Sequence[Problem],
+        scenes: Sequence[Problem] | None = None,
         names: tuple[str, ...] | None = None,
         terms: EpisodeOptions | None = None,
         afresh: bool = False,
     ) -> None:
-        """Go on from scenes, one for each policy: episodes of their own, which the policies plan for.
+        """Go on from scenes, one for each policy, or from here: episodes of their own, which the policies plan for.
 
         What fails leaves everything as it was.
         """
-        names, terms = names or self._names, terms or self._terms
+        names, terms = names or self.policies, terms or self._terms
+        scenes = [lane.scene for lane in self._lanes] if scenes is None else scenes
         recordings = [None] * len(names) if afresh else [lane.recording for lane in self._lanes]
-        if self._frames:
+        if self.frames:
             self._show("planning")
         try:
             lanes = tuple(
-                Viewport(name, self._driver(name), scene, terms, recording)
+                Viewport(name, self._drivers.policy(name), scene, terms, recording)
                 for name, scene, recording in zip(names, scenes, recordings, strict=True)
             )
         except Exception:
             for lane in self._lanes:  # what drove until now may have forgotten where it was
                 lane.regain()
             raise
-        self._lanes, self._names, self._terms = lanes, names, terms
+        self._lanes, self.policies, self._terms = lanes, names, terms
         if afresh:
             self._status = replace(self._status, generation=self._status.generation + 1, time=0.0)
         self._show(self._state, moved=True)
-
-    def _driver(self, name: str) -> Policy:
-        """The policy of a name, made when it is first needed: some hold threads, so there is one of each."""
-        horizon = self._horizon if HORIZON in setting_names(name) else None
-        if (name, horizon) not in self._policies:
-            settings = {} if horizon is None else {HORIZON: horizon}
-            self._policies[name, horizon] = make_policy(name, **settings)
-        return self._policies[name, horizon]
 
     def _show(self, state: str, message: str | None = None, moved: bool = False) -> None:
         """Make frames of the present; without another message the last one stays."""
@@ -360,7 +284,7 @@ class Session:
             state=state,
             message=self._status.message if message is None else message,
         )
-        self._frames = tuple(lane.frame(self._status) for lane in self._lanes)
+        self.frames = tuple(lane.frame(self._status) for lane in self._lanes)
 
 
 def _told(error: Exception) -> str:

@@ -50,12 +50,7 @@ DIALS = (
 
 
 class Dials:
-    """Sliders that disturb a session from its next step on.
-
-    Args:
-        gui: The page's controls.
-        session: Session that they disturb.
-    """
+    """Sliders that disturb a session from its next step on."""
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
         self._session = session

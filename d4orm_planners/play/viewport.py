@@ -1,8 +1,10 @@
-"""One of the policies that drive the same scene side by side: its team, in an episode that goes on."""
+"""One of the policies that drive the same scene side by side: its team, in an episode that goes on and is recorded."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,27 +14,92 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.robot_faults import pushed
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_env.render.replay import ReplayMotion, motion
+from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.edits import check_robot
-from d4orm_planners.play.episode_buffer import EpisodeBuffer
 from d4orm_planners.play.scene_frame import Frame, Status, closest_approach, guidance, plan
+
+MOST_STEPS = 6000
+"""Ten minutes at the usual time step; what is older is forgotten."""
+
 
 MOST_CYCLES = 10_000_000
 """Steps of an episode that ends only when it is changed."""
+HORIZON = "predict_horizon"
+"""Setting of policies that look ahead."""
+
+
+class EpisodeBuffer:
+    """Steps since team, world or policies last changed; one thread may add while others make replays."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._snapshots: deque[tuple[np.ndarray, ...]] = deque(maxlen=MOST_STEPS)
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._snapshots)
+
+    def add(self, *snapshot: np.ndarray) -> None:
+        """Remember a snapshot.
+
+        Args:
+            *snapshot: States ``(K, n)``, goals ``(K, d)``, ``(K,)`` who has arrived, who has collided and who has come
+                too close, and ``(N, 2 d + 1)`` what moves about and is no robot.
+        """
+        with self._lock:
+            self._snapshots.append(snapshot)
+
+    def motion(self, policy: str) -> ReplayMotion:
+        """Return the motion for a replay."""
+        with self._lock:
+            problem, snapshots = self._problem, list(self._snapshots)
+        *stacked, around = zip(*snapshots, strict=True)
+        states, goals, arrived, collided, violated = map(np.stack, stacked)
+        steps = len(snapshots) - 1
+        trajectory = Trajectory(
+            states=states,
+            positions=states[..., : problem.dimension],
+            controls=np.zeros((steps, problem.num_robots, problem.control_size), np.float32),
+            rewards=np.zeros((steps, problem.num_robots), np.float32),
+            arrived=arrived,
+            collided=collided,
+            margin_violated=violated,
+        )
+        bodies = np.zeros((len(snapshots), max(map(len, around)), 2 * problem.dimension + 1), np.float32)
+        for row, present in zip(bodies, around):
+            row[: len(present)] = present
+        return motion(problem, trajectory, f"{policy}, {steps * problem.dt:.1f} s", goals=goals, bodies=bodies)
+
+
+class Drivers:
+    """Policies by name, made when they are first needed: some hold threads, so there is one of each.
+
+    Attributes:
+        horizon: Steps that policies which predict look ahead, if not their own number.
+    """
+
+    def __init__(self) -> None:
+        self.horizon: int | None = None
+        self._made: dict[tuple[str, int | None], Policy] = {}
+
+    def policy(self, name: str) -> Policy:
+        """The policy of a name."""
+        horizon = self.horizon if HORIZON in setting_names(name) else None
+        if (name, horizon) not in self._made:
+            settings = {} if horizon is None else {HORIZON: horizon}
+            self._made[name, horizon] = make_policy(name, **settings)
+        return self._made[name, horizon]
 
 
 @dataclass(frozen=True)
 class EpisodeOptions:
-    """Common options of all that drive side by side.
-
-    Attributes:
-        seed: Of the policies, of what goes wrong, and of new goals.
-        lifelong: Whether robots go on to new goals.
-        disturbances: Disturbances.
-    """
+    """Common options of all that drive side by side."""
 
     seed: int = 0
     lifelong: bool = False
@@ -41,13 +108,6 @@ class EpisodeOptions:
 
 class Viewport:
     """A policy that drives a scene.
-
-    Args:
-        name: Name of the policy.
-        policy: Policy that drives; others may have used it before.
-        scene: Team and world; where the robots are is where they start.
-        terms: Common options of all.
-        recording: Recording to go on with; a fresh one by default.
 
     Attributes:
         recording: Recording up to now.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import trimesh
@@ -31,6 +31,8 @@ from d4orm_planners.play.meshes import (
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 
+Moved: TypeAlias = Callable[[int, Points, Points, bool], None]
+
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
 INK, BODY = (20, 24, 30), (120, 124, 134)
 TRAIL_STEPS = 30
@@ -53,16 +55,7 @@ LINES_EVERY = 0.1
 
 
 class LaneView:
-    """View of one that drives.
-
-    Args:
-        server: The page.
-        session: Session that is shown, and changed by dragging.
-        index: Its number among those that drive.
-        frame: Its first frame.
-        place: ``(3,)`` where its origin is on the page [m].
-        shown: Layers that are shown, see :class:`~d4orm_planners.play.view.View`.
-    """
+    """View of one that drives."""
 
     def __init__(
         self,
@@ -193,44 +186,43 @@ class LaneView:
     def _drag(self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit]) -> None:
         """Let a shape be dragged: it follows the pointer, and where it is let go the scene is changed."""
         node = self._nodes[name]
+
+        def moved(index: int, at: Points, shift: Points, ended: bool) -> None:
+            if kind not in ("robot", "goal"):
+                node.position = at if ended else at + shift  # until the session has agreed
+            if not ended:
+                self._held[kind, index] = at + shift
+                return
+            self._held.pop((kind, index), None)
+            d = self._frame.problem.dimension
+            self._session.edit(edit(index, (at + shift)[:d], shift[:d]), self._index)
+
+        self._follow_hand(node, kind, moved)
+
+    def _drag_pushes(self) -> None:
+        """Let robots be pushed: the page draws an arrow, and where it is let go the robot gets its velocity."""
+
+        def moved(index: int, at: Points, arrow: Points, ended: bool) -> None:
+            if ended:
+                self._session.push(index, PUSH_PER_METER * arrow[: self._frame.problem.dimension], self._index)
+
+        self._follow_hand(self._nodes["robots"], "robot", moved, "shift")
+
+    def _follow_hand(self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None) -> None:
+        """Call ``moved(number, place, shift so far, ended)`` while one of a node's shapes is dragged."""
         grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 
-        @node.on_drag("left")
+        @node.on_drag("left", modifier=modifier)
         async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:  # one after the other
             index, hand = event.instance_index or 0, (event.client_id, event.instance_index or 0)
             if event.phase == "start":
                 at = self._place_of(kind, index)
                 grips[hand] = (at, self._pointed(event, at))
-            if hand not in grips:
-                return
-            at, grip = grips[hand]
-            moved = at + self._pointed(event, at) - grip
-            if event.phase != "end":
-                self._held[kind, index] = moved
-                if kind not in ("robot", "goal"):
-                    node.position = moved
-                return
-            del grips[hand]
-            self._held.pop((kind, index), None)
-            if kind not in ("robot", "goal"):
-                node.position = at  # until the session has agreed
-            d = self._frame.problem.dimension
-            self._session.edit(edit(index, moved[:d], (moved - at)[:d]), self._index)
-
-    def _drag_pushes(self) -> None:
-        """Let robots be pushed: the page draws an arrow, and where it is let go the robot gets its velocity."""
-        grips: dict[tuple[int, int], tuple[Points, Points]] = {}
-
-        @self._nodes["robots"].on_drag("left", modifier="shift")
-        async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:
-            index, hand = event.instance_index or 0, (event.client_id, event.instance_index or 0)
-            if event.phase == "start":
-                at = self._place_of("robot", index)
-                grips[hand] = (at, self._pointed(event, at))
-            elif event.phase == "end" and hand in grips:
-                at, grip = grips.pop(hand)
-                arrow = (self._pointed(event, at) - grip)[: self._frame.problem.dimension]
-                self._session.push(index, PUSH_PER_METER * arrow, self._index)
+            if hand in grips:
+                (at, grip), ended = grips[hand], event.phase == "end"
+                if ended:
+                    del grips[hand]
+                moved(index, at, self._pointed(event, at) - grip, ended)
 
     @property
     def _frame(self) -> Frame:

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done
-from d4orm_planners.rl.curve import Evaluation
+from d4orm_planners.rl.curve import Evaluation, write_curve
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 
 _KEEP = 2
@@ -28,10 +28,6 @@ _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 class Checkpoints:
     """The checkpoints in a training's folder.
-
-    Args:
-        out: The folder; made if it does not exist.
-        settings: Of the training.
 
     Raises:
         ValueError: If the folder holds a training with other settings.
@@ -66,17 +62,22 @@ class Checkpoints:
         """The policy that did best so far."""
         return load_network(self.policy_path)
 
-    def keep_best(self, network: Network, evaluations: Sequence[Evaluation]) -> None:
-        """Write the policy, if the last of its training's evaluations is as good as any."""
+    def conclude(
+        self, index: int, model: BaseAlgorithm, env: VecNormalize, network: Network, evaluations: Sequence[Evaluation]
+    ) -> Checkpoint:
+        """Write the policy, if the last of the evaluations is as good as any, the curve, and a stage's checkpoint."""
         if evaluations[-1].rank == max(evaluation.rank for evaluation in evaluations):
             network.save(self.policy_path)
+        write_curve(self.policy_path.parent, evaluations)
+        # Last, so that what a stage that was broken off has written is written again.
+        return self._save(index, model, env, evaluations)
 
     def latest(self) -> Checkpoint | None:
         """The last complete checkpoint."""
         complete = self._complete()
         return Checkpoint.read(complete[-1]) if complete else None
 
-    def save(
+    def _save(
         self, index: int, model: BaseAlgorithm, env: VecNormalize, evaluations: Sequence[Evaluation]
     ) -> Checkpoint:
         """Write the checkpoint of stage ``index``, and remove the oldest."""
@@ -100,12 +101,7 @@ class Checkpoints:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A training after some stages.
-
-    Attributes:
-        folder: Its folder.
-        evaluations: One per stage so far.
-    """
+    """A training after some stages."""
 
     folder: Path
     evaluations: list[Evaluation]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.render.style import own_style
-from d4orm_planners.base.escaping import spreadsheet_cell
+from d4orm_planners.evaluation.tables import write_csv
 from d4orm_planners.rl.network import Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
@@ -88,14 +87,7 @@ def run_worlds(network: Network, worlds: RobotVecEnv, seed: int) -> list[tuple[b
 
 def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
     """Write ``curve.csv`` and ``curve.png``."""
-    with (
-        replaced_when_done(folder / "curve.csv") as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.DictWriter(file, [field.name for field in fields(Evaluation)])
-        writer.writeheader()
-        rows = (asdict(evaluation) for evaluation in evaluations)
-        writer.writerows({name: spreadsheet_cell(value) for name, value in row.items()} for row in rows)
+    write_csv(folder / "curve.csv", [vars(evaluation) for evaluation in evaluations])
     with replaced_when_done(folder / "curve.png") as temporary:
         _draw(temporary, evaluations)
 

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
+import torch
 from pydantic import Field
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
@@ -28,11 +30,9 @@ from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.settings import Count, PathText
 from d4orm_planners.rl.algorithms import ALGORITHMS
 from d4orm_planners.rl.checkpoints import Checkpoints
-from d4orm_planners.rl.cloning import clone, imitation_error, normalize
-from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
-from d4orm_planners.rl.dataset_samples import dataset_samples
+from d4orm_planners.rl.curve import Evaluation, evaluate_network
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
-from d4orm_planners.rl.samples import Samples, record_samples
+from d4orm_planners.rl.samples import Samples, dataset_samples, record_samples
 from d4orm_planners.rl.sb3_network import network_of
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
@@ -51,6 +51,11 @@ OTHERS_DRIVE: Mapping[str, object] = MappingProxyType(
 they are late, weak, noisy or stalled."""
 
 
+BATCH = 128
+LEARNING_RATE = 1e-3
+"""At the beginning of a round; it falls linearly to nothing."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImitationSettings(TrainConfig):
     """Settings of imitation: the expert, and how long.
@@ -66,7 +71,6 @@ class ImitationSettings(TrainConfig):
         epochs: Of each round.
 
     Raises:
-        ValueError: If a value makes no sense; the message names it.
         TypeError: For a setting that the expert does not have.
     """
 
@@ -117,8 +121,7 @@ class _ImitationRun:
     """An imitation under way."""
 
     def __init__(self, settings: ImitationSettings, out: Path, progress: Progress, command: str) -> None:
-        self.settings, self._out, self._command = settings, out, command
-        self._progress = progress
+        self.settings, self._progress, self._command = settings, progress, command
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
         self._validation = settings.validation()
         self._given = self._from_dataset()
@@ -167,10 +170,7 @@ class _ImitationRun:
             imitation_error(network, *held),
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
-        self.checkpoints.keep_best(network, self.evaluations)
-        # The checkpoint last: what a round that was broken off has written is written again.
-        write_curve(self._out, self.evaluations)
-        self.checkpoints.save(index, self._model, self._env, self.evaluations)
+        self.checkpoints.conclude(index, self._model, self._env, network, self.evaluations)
 
     @property
     def _so_far(self) -> str:
@@ -217,3 +217,53 @@ class _ImitationRun:
         if len(episodes) < 2:
             raise ValueError(f"dataset {path!r} has {len(episodes)} episodes; at least 2 are needed")
         return episodes
+
+
+def normalize(env: VecNormalize, inputs: FloatArray) -> None:
+    """Have an environment normalise observations as these features ``(N, F)`` want it."""
+    seen: Any = env.obs_rms
+    seen.mean, seen.var = inputs.mean(axis=0, dtype=np.float64), inputs.var(axis=0, dtype=np.float64)
+    seen.count = float(len(inputs))
+
+
+def clone(
+    model: Any,
+    env: VecNormalize,
+    inputs: FloatArray,
+    targets: FloatArray,
+    *,
+    epochs: int,
+    random: np.random.Generator,
+    report: Callable[[int], object],
+) -> None:
+    """Have the mean of a PPO model's actions follow an expert's, by Adam on the mean squared difference.
+
+    Args:
+        model: The model.
+        env: Normalises its observations.
+        inputs: ``(N, F)`` features.
+        targets: ``(N, m)`` the expert's actions in ``[-1, 1]``.
+        epochs: Number of times that each sample is looked at.
+        random: In which order.
+        report: Called with the number of epochs done.
+    """
+    policy = model.policy
+    seen, wanted = torch.as_tensor(env.normalize_obs(inputs)), torch.as_tensor(targets)
+    policy.set_training_mode(True)
+    batches = max(len(inputs) // BATCH, 1)
+    for epoch in range(epochs):
+        report(epoch)
+        for number, part in enumerate(np.array_split(random.permutation(len(inputs)), batches)):
+            left = 1 - (epoch + number / batches) / epochs
+            for group in policy.optimizer.param_groups:
+                group["lr"] = LEARNING_RATE * left
+            loss = torch.nn.functional.mse_loss(policy.get_distribution(seen[part]).distribution.mean, wanted[part])
+            policy.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            policy.optimizer.step()
+    report(epochs)
+
+
+def imitation_error(network: Network, inputs: FloatArray, targets: FloatArray) -> float:
+    """Root mean square of a network's actions ``(N, m)`` less the expert's, in units of the limits."""
+    return float(np.sqrt(np.mean((network(inputs) - targets) ** 2)))

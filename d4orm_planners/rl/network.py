@@ -20,7 +20,6 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.dynamics.models import get_model
 from d4orm_planners.rl.features import Features
-from d4orm_planners.rl.set_network import array_shapes, encode, encoded_size
 
 FORMAT = 1
 EPSILON = 0.1
@@ -31,6 +30,12 @@ CLIP = 10.0
 MAX_BYTES = 64 * 2**20
 SUFFIX = ".safetensors"
 _ACTIVATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}
+
+
+KINDS = ("neighbor", "obstacle")
+"""Kinds of sets, in the order in which features have them."""
+SUM_SCALE = 0.25
+"""Scale of sums, which keeps those of a few of order one."""
 
 
 class Header(BaseModel):
@@ -46,7 +51,7 @@ class Header(BaseModel):
         activation: Between the layers.
         squashed: Whether the output goes through tanh.
         layers: Number of layers; those of sets come before them and are not counted.
-        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.set_network`. Such
+        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.network`. Such
             a policy acts for any number of observed robots.
         frame: Direction of the first axis of a robot's frame; ``None`` is to the goal.
         shortest_paths: Whether it heads along the shortest paths, see :meth:`Features.along`; ``None`` is straight.
@@ -227,3 +232,42 @@ def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[
     if (arrays.get("observation_variance", np.zeros(1)) < 0).any():
         raise ValueError(f"policy file {path}: observation_variance is negative in places; it must not be")
     return arrays
+
+
+def array_shapes(features: Features, arrays: Mapping[str, FloatArray]) -> dict[str, tuple[int | None, ...]]:
+    """Shapes of the arrays that the sets of a network are made of; hidden widths are those of ``arrays``."""
+    shapes: dict[str, tuple[int | None, ...]] = {}
+    for kind, row in zip(KINDS, (features.neighbor_size, features.obstacle_size), strict=True):
+        first, second = (_width(arrays.get(f"{kind}_weight_{layer}")) for layer in (0, 1))
+        shapes |= {
+            f"{kind}_weight_0": (first, row),
+            f"{kind}_own": (first, features.own_size),
+            f"{kind}_bias_0": (first,),
+            f"{kind}_weight_1": (second, first),
+            f"{kind}_bias_1": (second,),
+        }
+    return shapes
+
+
+def encoded_size(features: Features, arrays: Mapping[str, FloatArray]) -> int | None:
+    """Width of what :func:`encode` returns; ``None`` if the arrays do not say."""
+    widths = [_width(arrays.get(f"{kind}_weight_1")) for kind in KINDS]
+    return features.own_size + 2 * sum(width or 0 for width in widths) if None not in widths else None
+
+
+def encode(features: Features, arrays: Mapping[str, FloatArray], seen: FloatArray) -> FloatArray:
+    """``(N, E)`` inputs of the layers that follow, for ``(N, F)`` features of any number of neighbours."""
+    own, *sets = features.of_size(seen.shape[1]).parts(seen)
+    parts = [own]
+    for kind, rows in zip(KINDS, sets, strict=True):
+        hidden = rows @ arrays[f"{kind}_weight_0"].T + (own @ arrays[f"{kind}_own"].T)[:, None]
+        hidden = np.maximum(hidden + arrays[f"{kind}_bias_0"], 0)
+        hidden = np.maximum(hidden @ arrays[f"{kind}_weight_1"].T + arrays[f"{kind}_bias_1"], 0) * rows[..., :1]
+        # None is below zero, which stands for nobody.
+        parts += [hidden.max(axis=1, initial=0), SUM_SCALE * hidden.sum(axis=1)]
+    joined: FloatArray = np.concatenate(parts, axis=1)
+    return joined
+
+
+def _width(weight: FloatArray | None) -> int | None:
+    return len(weight) if weight is not None and weight.ndim == 2 else None

@@ -14,13 +14,37 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, as_float32
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.core.problem import Problem
 from d4orm_env.envs.rewards import RewardFunction
 from d4orm_env.envs.team_step import Info
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_planners.rl.features import Features
 
 
-class RobotVecEnv(VecEnv):
+class SharedVecEnv(VecEnv):
+    """Base of environments whose robots share their worlds, so that none can be had by itself."""
+
+    render_mode = None
+
+    def step_async(self, actions: FloatArray) -> None:
+        self._actions = as_float32(actions)
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
+        raise AttributeError(f"{attr_name!r} cannot be set: the robots of all worlds share one environment")
+
+    def env_method(
+        self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object
+    ) -> list[object]:
+        raise AttributeError(f"{method_name!r} cannot be called: the robots of all worlds share one environment")
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
+
+
+class RobotVecEnv(SharedVecEnv):
     """``B`` worlds of ``K`` robots as ``B * K`` environments that share one policy; one kernel call per step.
 
     Environment ``b * K + k`` is robot ``k`` of world ``b``. Observations are the :class:`Features` ``(B * K, F)``,
@@ -56,8 +80,6 @@ class RobotVecEnv(VecEnv):
         ValueError: For a bad argument, or a team of mixed models.
     """
 
-    render_mode = None
-
     def __init__(
         self,
         num_worlds: int,
@@ -74,19 +96,9 @@ class RobotVecEnv(VecEnv):
         if shortest_paths:
             kwargs["progress"] = "path"
         self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, **kwargs)
-        problem = self.problem = self._env.problem
-        if not problem.docks:
-            raise ValueError(
-                "arrival is 'stay', and one robot's episode ends where it docks; train with arrival='dock'"
-            )
-        if len(set(problem.team.models)) > 1:
-            raise ValueError(
-                f"the team mixes {', '.join(sorted(set(problem.team.models)))}; one policy is learned for robots of "
-                "one model, so give model="
-            )
-        layout = self._env.layout
-        if layout.num_rays:
-            raise ValueError("networks of d4orm train read no rays; leave observed_rays out, or use another library's")
+        problem, layout = self._env.problem, self._env.layout
+        _check_learnable(problem, layout.num_rays)
+        self.problem = problem
         slices = ObservationSlices(layout.dimension, layout.num_neighbors, layout.num_obstacles)
         self.features = Features.of(slices, problem.team.models[0])
         self.shortest_paths = shortest_paths
@@ -111,9 +123,6 @@ class RobotVecEnv(VecEnv):
         features, _ = self.show(*self.encoded(self.begin()))
         self.seconds += time.perf_counter() - begin
         return features
-
-    def step_async(self, actions: FloatArray) -> None:
-        self._actions = as_float32(actions)
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         begin = time.perf_counter()
@@ -233,16 +242,14 @@ class RobotVecEnv(VecEnv):
         self._seed = seed
         return [seed] * self.num_envs
 
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
-        raise AttributeError(f"{attr_name!r} cannot be set: the robots of all worlds share one environment")
-
-    def env_method(
-        self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object
-    ) -> list[object]:
-        raise AttributeError(f"{method_name!r} cannot be called: the robots of all worlds share one environment")
-
-    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        return [False] * len(list(self._get_indices(indices)))
+def _check_learnable(problem: Problem, num_rays: int) -> None:
+    """Refuse teams and observations that no policy is learned for."""
+    if not problem.docks:
+        raise ValueError("arrival is 'stay', and one robot's episode ends where it docks; train with arrival='dock'")
+    if len(models := set(problem.team.models)) > 1:
+        raise ValueError(
+            f"the team mixes {', '.join(sorted(models))}; one policy is learned for robots of one model, so give model="
+        )
+    if num_rays:
+        raise ValueError("networks of d4orm train read no rays; leave observed_rays out, or use another library's")

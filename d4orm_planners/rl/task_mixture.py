@@ -10,17 +10,15 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
+from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.envs.team_step import Info
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import find_scenario, unknown_argument
-from d4orm_planners.rl.robot_vec_env import RobotVecEnv
+from d4orm_planners.rl.robot_vec_env import RobotVecEnv, SharedVecEnv
 
 _PERTURBED = "d4orm_planners.rl.perturbed_scenarios:perturbed"
 _CLUTTER = "d4orm_planners.rl.perturbed_scenarios:clutter"
@@ -225,12 +223,7 @@ def parse_mixture(texts: Sequence[str]) -> tuple[TrainTask, ...]:
 
 
 def gather_parts(tasks: Sequence[TrainTask], counts: Sequence[int]) -> list[tuple[TrainTask, list[int | None]]]:
-    """Parts that differ in ``max_observed`` only as one, since each takes its time to step, with that of its worlds.
-
-    Args:
-        tasks: Parts of a mixture.
-        counts: Number of worlds of each.
-    """
+    """Parts that differ in ``max_observed`` only as one, since each takes its time to step, with that of its worlds."""
     gathered: list[tuple[TrainTask, list[int | None]]] = []
     for task, count in zip(tasks, counts, strict=True):
         own = replace(task, max_observed=None)
@@ -241,23 +234,12 @@ def gather_parts(tasks: Sequence[TrainTask], counts: Sequence[int]) -> list[tupl
     return gathered
 
 
-class MixedVecEnv(VecEnv):
-    """The robots of several :class:`RobotVecEnv` as one, in order; all else as there.
-
-    Args:
-        parts: With the same features and robots of one model.
-
-    Attributes:
-        parts: Them.
-        acted: Robots that acted in the last step.
-        finished: ``(world, success, travel_time)`` of the worlds that ended in the last step, worlds counted through.
-        seconds: Time spent in the environments so far.
+class MixedVecEnv(SharedVecEnv):
+    """The robots of several :class:`RobotVecEnv` as one, in order; all else as there, worlds counted through.
 
     Raises:
         ValueError: If the parts do not go together.
     """
-
-    render_mode = None
 
     def __init__(self, parts: Sequence[RobotVecEnv]) -> None:
         first, self.parts = parts[0], tuple(parts)
@@ -287,9 +269,6 @@ class MixedVecEnv(VecEnv):
         self.seconds += time.perf_counter() - begin
         return features
 
-    def step_async(self, actions: FloatArray) -> None:
-        self._actions = as_float32(actions)
-
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         begin = time.perf_counter()
         frames = np.concatenate([part.frames for part in self.parts])
@@ -314,17 +293,3 @@ class MixedVecEnv(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the worlds of every part at the next reset, alike."""
         return [seed for part in self.parts for seed in part.seed(seed)]
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
-        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
-        self.parts[0].set_attr(attr_name, value, indices)
-
-    def env_method(
-        self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: object
-    ) -> list[object]:
-        return self.parts[0].env_method(method_name, *args, indices=indices, **kwargs)
-
-    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        return [False] * len(list(self._get_indices(indices)))

@@ -1,19 +1,24 @@
-"""Common settings and worlds of all trainings of a policy that all robots share."""
+"""Settings and worlds of trainings of a policy that all robots share: of all, and of reinforcement with its stages."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property, partial
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.envs.rewards import TrainingReward
 from d4orm_env.scenarios.problems import unknown_argument
-from d4orm_planners.base.settings import CheckedSettings, Count, Whole
+from d4orm_planners.base.settings import CheckedSettings, Count, Number, PathText, Positive, Whole, one_of
+from d4orm_planners.rl.algorithms import ALGORITHMS
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
-from d4orm_planners.rl.task_mixture import MixedVecEnv, TrainTask
+from d4orm_planners.rl.task_mixture import Instances, MixedVecEnv, TrainTask, gather_parts, parse_mixture
 
 VALIDATION_SEED = 0
 """Worlds are seeded one by one from here in validation, and in training from numbers of 64 random bits."""
@@ -21,6 +26,16 @@ VALIDATION_SEED = 0
 Many = Annotated[Count, Field(le=100_000)]
 """Robots, worlds or episodes at once: beyond, their observations would fill the memory."""
 Seed = Annotated[Whole, Field(ge=0)]
+
+
+_INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
+"""At most so many of each part are chosen among. All are new in each stage, but where robots look along paths, which
+take long to find: there one is new for so many robot-steps."""
+Drawn = dict[tuple[int, str, int], dict[int, Problem]]
+"""Instances by part, scenario and team size, and by their seeds."""
+NETWORKS = ("flat", "sets")
+MIXTURE = "mixture"
+"""Stands for the scenario of stages that are about several."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +49,6 @@ class TrainConfig(CheckedSettings):
         model: Robot model; ``None`` is the scenario's own.
         validation_worlds: Episodes per evaluation.
         scenario_settings: Arguments of the scenario.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
     """
 
     scenario: str = "random"
@@ -78,9 +90,6 @@ class TrainConfig(CheckedSettings):
     def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
         """Worlds to judge by.
 
-        Args:
-            **options: Further arguments of the environments.
-
         Raises:
             ValueError: If one policy cannot be learned for the team.
         """
@@ -101,3 +110,176 @@ class TrainConfig(CheckedSettings):
             "brakes": bool(np.isfinite(worlds.problem.goal_speed).any()) or None,
             "training": {**training, **asdict(self)},
         }
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One part of a training, at whose end there is a checkpoint."""
+
+    num_robots: int
+    scenario: str
+    steps: int
+
+
+def team_sizes(num_robots: int) -> tuple[int, ...]:
+    """1, 2, 4, ... below ``num_robots``, and ``num_robots``."""
+    return (*(2**i for i in range((num_robots - 1).bit_length())), num_robots)
+
+
+def common_batch(sizes: tuple[int, ...], wanted: int) -> int:
+    """The most robots up to ``wanted`` that make whole worlds of every size; at least one world of each."""
+    unit = math.lcm(*sizes)
+    return max(wanted // unit, 1) * unit
+
+
+def make_stages(num_robots: int, scenario: str, steps: int, unit: int, count: int, gradual: bool) -> tuple[Stage, ...]:
+    """At most ``count`` stages of a training of ``steps`` robot-steps, rounded up to whole updates of ``unit``.
+
+    Where it is gradual, teams grow, and every size gets as many steps of whole worlds as any other. Instances are
+    random ones; where another scenario is asked for, every other stage of the full team is about that.
+    """
+    units = math.ceil(steps / unit)
+    count = min(count, units)
+    sizes = team_sizes(num_robots) if gradual else (num_robots,)
+    turns = np.cumsum(sizes) / sum(sizes)
+    stages = []
+    for index in range(count):
+        size = sizes[int(np.searchsorted(turns, (index + 0.5) / count))]
+        name = scenario if size == num_robots and index % 2 == 0 else "random"
+        length = units * (index + 1) // count - units * index // count
+        stages.append(Stage(size, name, length * unit))
+    return tuple(stages)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingSettings(TrainConfig):
+    """Settings of a training.
+
+    Attributes:
+        algorithm: ``"ppo"`` or ``"sac"``.
+        steps: Robot-steps, rounded up to whole updates.
+        num_envs: Robots that act at once; ``None`` is the algorithm's own number.
+        curriculum: Whether smaller teams come first.
+        stages: Parts of the training, each with a checkpoint and an evaluation at its end.
+        start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
+        network: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and
+            obstacles, see :mod:`d4orm_planners.rl.network`.
+        observed_robots: In observations.
+        shortest_paths: Whether robots see their goals along their shortest paths, as is wanted among walls, see
+            :meth:`~d4orm_planners.rl.features.Features.along`.
+        learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
+        learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
+            those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
+        reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are
+            others.
+        mixture: Scenarios and team sizes to be trained on all at once, in place of ``scenario`` and ``num_robots``:
+            texts as :meth:`~d4orm_planners.rl.task_mixture.TrainTask.parse` takes them, or names of
+            :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow,
+            and as many validation worlds as any other.
+    """
+
+    algorithm: Annotated[str, one_of(ALGORITHMS)] = "ppo"
+    steps: Annotated[Count, Field(le=10**15)] = 5_000_000
+    num_envs: Many | None = None
+    curriculum: bool = False
+    stages: Annotated[Count, Field(le=1000)] = 50
+    start_from: PathText | None = None
+    network: Annotated[str, one_of(NETWORKS)] = "flat"
+    observed_robots: Annotated[Whole, Field(ge=0, le=1000)] = 4
+    shortest_paths: bool = False
+    learning_rate: Annotated[Positive, Field(le=1)] | None = None
+    learner_settings: Mapping[str, Number] = field(default_factory=dict)
+    reward_settings: Mapping[str, Number] = field(default_factory=dict)
+    mixture: Annotated[
+        tuple[str, ...], BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+    ] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        tuned = ALGORITHMS[self.algorithm].checked(self.learner_settings, "learner_settings")
+        object.__setattr__(self, "learner_settings", tuned)
+        known = TrainingReward.term_names
+        for name in self.reward_settings:
+            if name not in known:
+                raise ValueError(f"reward_settings has {name!r}; the reward takes {', '.join(known)}")
+        if not self.mixture:
+            return
+        for name in ("scenario", "num_robots", "curriculum", "scenario_settings"):
+            given = getattr(self, name)
+            if given != getattr(TrainingSettings, name, {}):
+                raise ValueError(f"{name} is {given!r} beside a mixture, whose parts say all that; leave one out")
+        self.tasks  # noqa: B018 - refuses what is none
+
+    @cached_property
+    def tasks(self) -> tuple[TrainTask, ...]:
+        """The parts of the mixture."""
+        return parse_mixture(self.mixture)
+
+    @property
+    def reward(self) -> TrainingReward:
+        """Reward to learn from."""
+        return TrainingReward(**self.reward_settings)
+
+    @property
+    def worlds_per_task(self) -> tuple[int, ...]:
+        """Number of worlds of each part of the mixture."""
+        share = (self.num_envs or ALGORITHMS[self.algorithm].num_envs) / max(len(self.tasks), 1)
+        return tuple(max(round(share / task.num_robots), 1) for task in self.tasks)
+
+    @property
+    def batch(self) -> int:
+        """Robots that act at once."""
+        if self.mixture:
+            return sum(worlds * part.num_robots for worlds, part in zip(self.worlds_per_task, self.tasks))
+        sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
+        return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
+
+    def parts(self, stage: Stage) -> list[tuple[TrainTask, list[int | None], str | None]]:
+        """Return the tasks of a stage, with the observed robots of each of their worlds and the robots' model."""
+        if self.mixture:
+            return [(*part, self.model) for part in gather_parts(self.tasks, self.worlds_per_task)]
+        task = self.task(stage.scenario, stage.num_robots)
+        return [(task, [None] * (self.batch // stage.num_robots), self.model_in(stage.scenario))]
+
+    def worlds(
+        self, stage: Stage, number: int = 0, done: int = 0, drawn: Drawn | None = None
+    ) -> RobotVecEnv | MixedVecEnv:
+        """Worlds for a stage.
+
+        Args:
+            stage: Stage of the training.
+            number: Of the stage.
+            done: Robot-steps in the stages before.
+            drawn: Instances of earlier stages, from which those that are used again are taken; others are left out,
+                and new ones added when they are drawn.
+        """
+        seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
+        for part, (task, max_observed, model) in enumerate(self.parts(stage)):
+            count = len(max_observed)
+            size = min(_INSTANCES, 2 * count)
+            own_steps = done * count * task.num_robots // self.batch
+            first = own_steps // _STEPS_PER_INSTANCE if self.shortest_paths else number * size
+            seeds = [derived_seed(self.seed, Stream.TRAINING_INSTANCES, part, first + index) for index in range(size)]
+            key = part, task.scenario, task.num_robots
+            drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
+            instances = Instances(partial(task.problem, model=model), seeds, drawn[key])
+            own_seed = derived_seed(seed, Stream.TRAINING_WORLDS, part)
+            parts.append(task.worlds(max_observed, own_seed, instances, model, **self._options))
+        return MixedVecEnv(parts) if self.mixture else parts[0]
+
+    def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
+        """Worlds to judge by.
+
+        Raises:
+            ValueError: If one policy cannot be learned for the team.
+        """
+        options = {**self._options, **options}
+        if not self.mixture:
+            return super().validation(**options)
+        count = -(-self.validation_worlds // len(self.tasks))
+        return MixedVecEnv([part.validation(count, VALIDATION_SEED, self.model, **options) for part in self.tasks])
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        """Options of the environments."""
+        return {"observed_robots": self.observed_robots, "reward": self.reward, "shortest_paths": self.shortest_paths}

@@ -9,184 +9,27 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.envs.rewards import TrainingReward
-from d4orm_planners.base.settings import Count, Number, PathText, Positive, Whole, one_of
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
-from d4orm_planners.rl.curriculum import Stage, common_batch, make_stages, team_sizes
-from d4orm_planners.rl.curve import Evaluation, evaluate_network, write_curve
+from d4orm_planners.rl.curve import Evaluation, evaluate_network
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
-from d4orm_planners.rl.robot_vec_env import RobotVecEnv
-from d4orm_planners.rl.sb3_network import network_of, set_network
-from d4orm_planners.rl.sb3_sets import leave_as_they_are
-from d4orm_planners.rl.task_mixture import Instances, MixedVecEnv, TrainTask, gather_parts, parse_mixture
-from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
+from d4orm_planners.rl.sb3_network import leave_as_they_are, network_of, set_network
+from d4orm_planners.rl.train_config import MIXTURE, VALIDATION_SEED, Drawn, Stage, TrainingSettings, make_stages
 
 __all__ = ["TrainingResult", "TrainingSettings", "train"]
 
 Progress = Callable[[str, int, int], object]
-_INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
-"""At most so many of each part are chosen among. All are new in each stage, but where robots look along paths, which
-take long to find: there one is new for so many robot-steps."""
-Drawn = dict[tuple[int, str, int], dict[int, Problem]]
-"""Instances by part, scenario and team size, and by their seeds."""
-NETWORKS = ("flat", "sets")
-MIXTURE = "mixture"
-"""Stands for the scenario of stages that are about several."""
-
-
-def _as_tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingSettings(TrainConfig):
-    """Settings of a training.
-
-    Attributes:
-        algorithm: ``"ppo"`` or ``"sac"``.
-        steps: Robot-steps, rounded up to whole updates.
-        num_envs: Robots that act at once; ``None`` is the algorithm's own number.
-        curriculum: Whether smaller teams come first.
-        stages: Parts of the training, each with a checkpoint and an evaluation at its end.
-        start_from: A policy file of the same algorithm, whose network learns on; ``None`` begins with nothing.
-        network: ``"flat"``, fully connected from all that is observed; or ``"sets"``, which pools neighbours and
-            obstacles, see :mod:`d4orm_planners.rl.set_network`.
-        observed_robots: In observations.
-        shortest_paths: Whether robots see their goals along their shortest paths, as is wanted among walls, see
-            :meth:`~d4orm_planners.rl.features.Features.along`.
-        learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
-        learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
-            those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.
-        reward_settings: Weights of the :class:`~d4orm_env.envs.rewards.TrainingReward` to learn from, where they are
-            others.
-        mixture: Scenarios and team sizes to be trained on all at once, in place of ``scenario`` and ``num_robots``:
-            texts as :meth:`~d4orm_planners.rl.task_mixture.TrainTask.parse` takes them, or names of
-            :data:`~d4orm_planners.rl.task_mixture.MIXTURES`. Each has as many robots, as nearly as whole worlds allow,
-            and as many validation worlds as any other.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
-    """
-
-    algorithm: Annotated[str, one_of(ALGORITHMS)] = "ppo"
-    steps: Annotated[Count, Field(le=10**15)] = 5_000_000
-    num_envs: Many | None = None
-    curriculum: bool = False
-    stages: Annotated[Count, Field(le=1000)] = 50
-    start_from: PathText | None = None
-    network: Annotated[str, one_of(NETWORKS)] = "flat"
-    observed_robots: Annotated[Whole, Field(ge=0, le=1000)] = 4
-    shortest_paths: bool = False
-    learning_rate: Annotated[Positive, Field(le=1)] | None = None
-    learner_settings: Mapping[str, Number] = field(default_factory=dict)
-    reward_settings: Mapping[str, Number] = field(default_factory=dict)
-    mixture: Annotated[tuple[str, ...], BeforeValidator(_as_tuple)] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        tuned = ALGORITHMS[self.algorithm].checked(self.learner_settings, "learner_settings")
-        object.__setattr__(self, "learner_settings", tuned)
-        known = TrainingReward.term_names
-        for name in self.reward_settings:
-            if name not in known:
-                raise ValueError(f"reward_settings has {name!r}; the reward takes {', '.join(known)}")
-        if not self.mixture:
-            return
-        for name in ("scenario", "num_robots", "curriculum", "scenario_settings"):
-            given = getattr(self, name)
-            if given != getattr(TrainingSettings, name, {}):
-                raise ValueError(f"{name} is {given!r} beside a mixture, whose parts say all that; leave one out")
-        self.tasks  # noqa: B018 - refuses what is none
-
-    @cached_property
-    def tasks(self) -> tuple[TrainTask, ...]:
-        """The parts of the mixture."""
-        return parse_mixture(self.mixture)
-
-    @property
-    def reward(self) -> TrainingReward:
-        """Reward to learn from."""
-        return TrainingReward(**self.reward_settings)
-
-    @property
-    def worlds_per_task(self) -> tuple[int, ...]:
-        """Number of worlds of each part of the mixture."""
-        share = (self.num_envs or ALGORITHMS[self.algorithm].num_envs) / max(len(self.tasks), 1)
-        return tuple(max(round(share / task.num_robots), 1) for task in self.tasks)
-
-    @property
-    def batch(self) -> int:
-        """Robots that act at once."""
-        if self.mixture:
-            return sum(worlds * part.num_robots for worlds, part in zip(self.worlds_per_task, self.tasks))
-        sizes = team_sizes(self.num_robots) if self.curriculum else (self.num_robots,)
-        return common_batch(sizes, self.num_envs or ALGORITHMS[self.algorithm].num_envs)
-
-    def parts(self, stage: Stage) -> list[tuple[TrainTask, list[int | None], str | None]]:
-        """Return the tasks of a stage, with the observed robots of each of their worlds and the robots' model."""
-        if self.mixture:
-            return [(*part, self.model) for part in gather_parts(self.tasks, self.worlds_per_task)]
-        task = self.task(stage.scenario, stage.num_robots)
-        return [(task, [None] * (self.batch // stage.num_robots), self.model_in(stage.scenario))]
-
-    def worlds(
-        self, stage: Stage, number: int = 0, done: int = 0, drawn: Drawn | None = None
-    ) -> RobotVecEnv | MixedVecEnv:
-        """Worlds for a stage.
-
-        Args:
-            stage: Stage of the training.
-            number: Of the stage.
-            done: Robot-steps in the stages before.
-            drawn: Instances of earlier stages, from which those that are used again are taken; others are left out,
-                and new ones added when they are drawn.
-        """
-        seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
-        for part, (task, max_observed, model) in enumerate(self.parts(stage)):
-            count = len(max_observed)
-            size = min(_INSTANCES, 2 * count)
-            own_steps = done * count * task.num_robots // self.batch
-            first = own_steps // _STEPS_PER_INSTANCE if self.shortest_paths else number * size
-            seeds = [derived_seed(self.seed, Stream.TRAINING_INSTANCES, part, first + index) for index in range(size)]
-            key = part, task.scenario, task.num_robots
-            drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
-            instances = Instances(partial(task.problem, model=model), seeds, drawn[key])
-            own_seed = derived_seed(seed, Stream.TRAINING_WORLDS, part)
-            parts.append(task.worlds(max_observed, own_seed, instances, model, **self._options))
-        return MixedVecEnv(parts) if self.mixture else parts[0]
-
-    def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
-        """Worlds to judge by.
-
-        Raises:
-            ValueError: If one policy cannot be learned for the team.
-        """
-        options = {**self._options, **options}
-        if not self.mixture:
-            return super().validation(**options)
-        count = -(-self.validation_worlds // len(self.tasks))
-        return MixedVecEnv([part.validation(count, VALIDATION_SEED, self.model, **options) for part in self.tasks])
-
-    @property
-    def _options(self) -> dict[str, Any]:
-        """Options of the environments."""
-        return {"observed_robots": self.observed_robots, "reward": self.reward, "shortest_paths": self.shortest_paths}
 
 
 @dataclass(frozen=True)
@@ -294,10 +137,7 @@ class _TrainingRun:
             seconds, (making + robots.seconds) / seconds, parts=outcome.parts if settings.mixture else None,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
-        self.checkpoints.keep_best(network, self.evaluations)
-        # The checkpoint last: what a stage that was broken off has written is written again.
-        write_curve(self._out, self.evaluations)
-        self._checkpoint = self.checkpoints.save(index, model, normalized, self.evaluations)
+        self._checkpoint = self.checkpoints.conclude(index, model, normalized, network, self.evaluations)
         robots.close()
 
     def _restored(self, env: VecNormalize) -> BaseAlgorithm:

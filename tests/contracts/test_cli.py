@@ -443,7 +443,7 @@ def test_a_link_that_leads_to_no_file_is_refused_before_planning(
 def test_warmup_says_beforehand_that_nothing_can_be_kept(
     d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("d4orm_planners.cli.warmup_command.warm_up", lambda: pytest.fail("it compiles"))
+    monkeypatch.setattr("d4orm_planners.cli.warmup.warm_up", lambda: pytest.fail("it compiles"))
     monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
 
     def full(**options: object) -> None:

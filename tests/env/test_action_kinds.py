@@ -18,7 +18,7 @@ from d4orm_env.envs.wrappers import GaussianControlNoise
 from d4orm_planners import make_policy
 from d4orm_planners.base.adapters import SharedPolicy
 from d4orm_planners.base.episode import run_episode
-from d4orm_planners.rl.dataset.recorded_episode import record_episode
+from d4orm_planners.rl.dataset.demonstrations import record_episode
 
 torch = pytest.importorskip("torch")
 

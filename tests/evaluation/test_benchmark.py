@@ -160,6 +160,14 @@ def test_the_record_tells_processors_of_one_name_apart(monkeypatch: pytest.Monke
     assert str(describe_machine()["processor"]).endswith(" (generic)")
 
 
+def test_the_commit_is_that_of_the_checkout() -> None:
+    git = ["git", "-C", str(Path(__file__).parents[2]), "rev-parse", "--short=12", "HEAD"]
+    found = subprocess.run(git, capture_output=True, text=True)
+    if found.returncode:
+        pytest.skip("the tests are in no checkout")
+    assert commit().removesuffix("+") == found.stdout.strip()
+
+
 def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
     settings = BenchmarkSettings(**TINY)
     bench_report.write_report(tmp_path, settings, bench_report.circumstances("d4orm bench"), results)

@@ -21,10 +21,10 @@ from d4orm_planners import evaluate, run_episode
 from d4orm_planners.evaluation.comparison import compare_pairs
 from d4orm_planners.evaluation.evaluate import run_shard, run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.robustness import write_disturbances
+from d4orm_planners.evaluation.robustness import tolerances, write_disturbances
 from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.evaluation.study import Study, conditions
-from d4orm_planners.evaluation.summary import TrialGroup, success_rates, tolerances
+from d4orm_planners.evaluation.summary import TrialGroup, success_rates
 from d4orm_planners.evaluation.tables import markdown
 from d4orm_planners.evaluation.trials import Condition
 

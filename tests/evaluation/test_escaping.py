@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from d4orm_env import make_problem, save_problem
 from d4orm_planners import evaluate
-from d4orm_planners.base.escaping import markdown_text, one_line, spreadsheet_cell
+from d4orm_planners.base.display import markdown_text, one_line, spreadsheet_cell
 from d4orm_planners.cli import app as cli
 from d4orm_planners.cli.outputs import print_table
 from d4orm_planners.evaluation.leaderboard import leaderboard

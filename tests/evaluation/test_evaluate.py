@@ -12,7 +12,9 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, fields, replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -199,7 +201,7 @@ def test_success_within_deadlines() -> None:
 TROUBLE = """
 import os, signal, time
 from d4orm_planners.evaluation import trials
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.policy import GoToGoal
 
 
 class Trouble(GoToGoal):
@@ -251,8 +253,8 @@ def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs signal masks")
 def test_ctrl_c_does_not_end_a_worker_that_starts() -> None:
-    pool = ProcessPool(1, run=iter)
-    pool.start("ab")
+    pool = ProcessPool(1)
+    pool.start(SimpleNamespace(run=partial(iter, "ab")))
     os.kill(pool._workers[0].process.pid or 0, signal.SIGINT)
     said = [message.content for _ in range(4) for message in pool.wait(None)]
     pool.close()
@@ -350,7 +352,7 @@ def test_a_full_disk_is_one_line_and_the_store_stays_whole(
         connection.execute("PRAGMA max_page_count = 4")
         return connection
 
-    monkeypatch.setattr("d4orm_planners.evaluation.store.sqlite3.connect", full)
+    monkeypatch.setattr("d4orm_planners.evaluation.sqlite_file.sqlite3.connect", full)
     arguments = ("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "40", "-j", "1", "-o", "out")
     status, _, err = d4orm(*arguments)
     assert status == 2

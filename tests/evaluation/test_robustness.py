@@ -23,14 +23,14 @@ from typing import Any
 import pytest
 
 from d4orm_planners import make_policy
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.cli import evaluate_command
-from d4orm_planners.evaluation import pool as pool_module
-from d4orm_planners.evaluation import store as store_module
+from d4orm_planners.evaluation import sqlite_file
 from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.robustness import write_robustness
-from d4orm_planners.evaluation.store import APPLICATION_ID, STORE, Trial, TrialStore
+from d4orm_planners.evaluation.sqlite_file import APPLICATION_ID
+from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
 from d4orm_planners.evaluation.tables import HEADER, markdown
@@ -193,10 +193,10 @@ def test_who_never_has_the_store_alone_gives_up_in_the_end(monkeypatch: pytest.M
         nonlocal now
         now += 1
 
-    monkeypatch.setattr(store_module, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
+    monkeypatch.setattr(sqlite_file, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
     with pytest.raises(sqlite3.OperationalError, match="locked"):
-        store_module._use_wal(Busy())  # type: ignore[arg-type]
-    assert store_module.TIMEOUT < now - 1000 <= store_module.TIMEOUT + 1
+        sqlite_file.use_wal(Busy())  # type: ignore[arg-type]
+    assert sqlite_file.TIMEOUT < now - 1000 <= sqlite_file.TIMEOUT + 1
 
 
 READ = """
@@ -335,8 +335,8 @@ def test_resuming_runs_only_what_is_missing(tmp_path: Path, monkeypatch: pytest.
     def levels(job: Job) -> tuple[float, ...]:
         return tuple(condition.control_noise_std for condition in job.conditions)
 
-    run_job = pool_module.run_job
-    monkeypatch.setattr(pool_module, "run_job", lambda job: (ran.append((job.seed, levels(job))), run_job(job))[1])
+    run = Job.run
+    monkeypatch.setattr(Job, "run", lambda job: (ran.append((job.seed, levels(job))), run(job))[1])
     before = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert ran == []
     counts: list[tuple[int, int]] = []
@@ -374,14 +374,14 @@ def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytes
 
 
 def test_ctrl_c_keeps_what_was_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, d4orm) -> None:
-    run_job = pool_module.run_job
+    run = Job.run
 
     def interrupted(job: Any) -> Any:
         if job.seed == 1:
             raise KeyboardInterrupt
-        return run_job(job)
+        return run(job)
 
-    monkeypatch.setattr(pool_module, "run_job", interrupted)
+    monkeypatch.setattr(Job, "run", interrupted)
     arguments = [
         "--policies",
         "go-to-goal",

@@ -21,7 +21,7 @@ from planner_support import hop_problem
 from d4orm_env import load_map, load_problem, make_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.cli.node_file import load_node
+from d4orm_planners.cli.node_command import load_node
 from d4orm_planners.d_d4orm.messages import Message, decode, encode
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.evaluation.store import Trial, TrialStore

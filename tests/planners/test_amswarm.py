@@ -16,8 +16,8 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.baselines.amswarm.alternation import Guess, Neighbourhood, alternate
-from d4orm_planners.baselines.amswarm.bernstein import first_coefficients, sample_basis
+from d4orm_planners.baselines.amswarm.alternation import Neighbourhood, alternate
+from d4orm_planners.baselines.amswarm.bernstein import Guess, first_coefficients, sample_basis
 from d4orm_planners.baselines.amswarm.planner import AMSwarmConfig
 from d4orm_planners.baselines.amswarm.swarm import make_method
 

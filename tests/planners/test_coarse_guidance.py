@@ -12,7 +12,7 @@ from planner_support import hop_problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.base.plan import failed_robots
+from d4orm_planners.base.candidate import failed_robots
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.d4orm_c2f.coarse_plan import (

@@ -17,7 +17,7 @@ from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import Controller, make_policy, run_episode
 from d4orm_planners.base.controller import ControlSetpoint
 from d4orm_planners.base.disturbance_observer import MOST, DisturbanceObserver
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.policy import GoToGoal
 
 MODELS = ("holonomic2d", "velocity2d", "differential_drive", "unicycle", "holonomic3d")
 

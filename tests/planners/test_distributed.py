@@ -29,14 +29,12 @@ from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm import evaluator as evaluator_module
+from d4orm_planners.d_d4orm import inbox as inbox_module
 from d4orm_planners.d_d4orm import messages, node
-from d4orm_planners.d_d4orm.evaluator import Evaluator, Stopped
-from d4orm_planners.d_d4orm.inbox import Inbox
+from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox, Stopped
 from d4orm_planners.d_d4orm.messages import KINDS, MAGIC, Message, MessageError, decode, encode
-from d4orm_planners.d_d4orm.node import Node, Task, node_seed
-from d4orm_planners.d_d4orm.node_events import KINDS as KINDS_OF_EVENTS
-from d4orm_planners.d_d4orm.node_events import Event
+from d4orm_planners.d_d4orm.node import KINDS as KINDS_OF_EVENTS
+from d4orm_planners.d_d4orm.node import Event, Node, Task, node_seed
 from d4orm_planners.d_d4orm.selection import choose, diverse, k_means, merge, shares, top_k
 from d4orm_planners.d_d4orm.transport import WAITING, LocalNetwork
 from d4orm_planners.engine.select import get_sampling_engine
@@ -331,7 +329,7 @@ def test_what_is_told_again_is_not_judged_again(monkeypatch: pytest.MonkeyPatch)
         calls.append(arguments)
         return evaluate_controls(*arguments)
 
-    monkeypatch.setattr(evaluator_module, "evaluate_controls", evaluator)
+    monkeypatch.setattr(inbox_module, "evaluate_controls", evaluator)
     other.publish(encode(message(), PROBLEM))
     (first,) = box.receive()
     told, executed = first.candidate.planned, first.candidate.controls

@@ -18,8 +18,7 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
-from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
-from d4orm_planners.baselines.mmd.constraint_tree import Constraint, Planning
+from d4orm_planners.baselines.mmd.constraint_tree import Constraint, Planning, count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.guiding import Surroundings, guide
 from d4orm_planners.baselines.mmd.path_frame import (
     FEATURES,
@@ -42,9 +41,9 @@ from d4orm_planners.baselines.mmd.prior import (
     posterior,
     predict,
 )
+from d4orm_planners.baselines.mmd.prior_training import draw_examples, modes_of
 from d4orm_planners.baselines.mmd.reverse_process import Denoiser
 from d4orm_planners.baselines.mmd.tracking import drive_motions
-from d4orm_planners.baselines.mmd.training_set import draw_examples, modes_of
 
 # The network.
 
@@ -69,8 +68,7 @@ def test_the_network_is_a_residual_perceptron() -> None:
 @pytest.mark.slow
 def test_training_writes_what_the_planner_reads(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from d4orm_planners.baselines.mmd.prior_training import save_prior, train
-    from d4orm_planners.baselines.mmd.training_set import Examples
+    from d4orm_planners.baselines.mmd.prior_training import Examples, save_prior, train
 
     random = np.random.default_rng(0)
     # Motions that follow from what the network is told: only one that has learned comes near to them.

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from network_support import free_endpoint, port_of, wait_until
 
-from d4orm_planners.cli.node_file import load_node
+from d4orm_planners.cli.node_command import load_node
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 
 NODE = Path(__file__).resolve().parents[2] / "examples" / "node"

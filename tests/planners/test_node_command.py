@@ -23,7 +23,7 @@ from d4orm_env.scenarios import make_problem, save_problem
 from d4orm_env.verify import verify
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.cli import app as cli
-from d4orm_planners.cli.node_file import load_node
+from d4orm_planners.cli.node_command import load_node
 
 GOOD: dict[str, Any] = {
     "node": 1,

@@ -12,10 +12,9 @@ from planner_support import cheap_planner, hop_problem, walled_in_problem
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS
-from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.base.stopwatch import Stopwatch
-from d4orm_planners.baselines.collocation import ABANDONED
+from d4orm_planners.base.solve import SolveRun, Stopwatch
 from d4orm_planners.baselines.ipopt import OUT_OF_TIME
+from d4orm_planners.baselines.ipopt_run import ABANDONED
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights

@@ -16,7 +16,7 @@ from browser_support import TIMEOUT, Page, browser, missing
 
 from d4orm_env import Problem, World, load_problem, make_problem
 from d4orm_planners import make_planner, register_policy
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.policy import GoToGoal
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
 

@@ -21,8 +21,8 @@ from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance_registry import DISTURBANCES
 from d4orm_env.scenarios.problem_files import scenario_text
-from d4orm_planners.base.escaping import markdown_text
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.display import markdown_text
+from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits
 from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.scene_frame import closest_approach
@@ -239,7 +239,7 @@ def test_everybody_arrives_and_is_sent_on(session: Session) -> None:
 
 
 def test_what_happened_becomes_a_replay(session: Session) -> None:
-    until(lambda: session.recorded_steps > 2)
+    until(lambda: len(session._lanes[0].recording) > 3)
     assert "circle, 4 robots by go-to-goal" in session.replay().html
     session.edit(edits.remove_robot)
     until(lambda: session.frame.problem.num_robots == 3)
@@ -247,12 +247,12 @@ def test_what_happened_becomes_a_replay(session: Session) -> None:
 
 
 def test_a_replay_shows_intruders_while_they_were_there(session: Session) -> None:
-    until(lambda: session.recorded_steps > 2)
+    until(lambda: len(session._lanes[0].recording) > 3)
     assert "bodies" not in session.replay().motions[0].content
     session.disturb({"intruder": 2})
     until(lambda: session.levels)
-    steps = session.recorded_steps
-    until(lambda: session.recorded_steps > steps + 2)
+    steps = len(session._lanes[0].recording) - 1
+    until(lambda: len(session._lanes[0].recording) > steps + 2)
     bodies = session.replay().motions[0].content["bodies"]
     assert bodies["count"] == 2
     assert bodies["low"][-1] == 0, "at first there were none"
@@ -288,7 +288,7 @@ def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene:
     until(lambda: session.frame.status.time > 0.3)
     session.choose("go-to-goal", "random")
     session.reset()
-    until(lambda: len(session.frames) == 2 and session.recorded_steps > 3)
+    until(lambda: len(session.frames) == 2 and len(session._lanes[0].recording) > 4)
     session.pause(True)
     until(lambda: session.frame.status.state == "paused")
     first, second = session.frames
@@ -309,7 +309,7 @@ def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene:
 def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
     session.choose("go-to-goal", "random")
     session.set_speed(5)
-    until(lambda: len(session.frames) == 2 and session.recorded_steps > 25)
+    until(lambda: len(session.frames) == 2 and len(session._lanes[0].recording) > 26)
     session.pause(True)
     until(lambda: session.frame.status.state == "paused")
     before = session.frames

@@ -35,13 +35,13 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 from d4orm_env import make_problem
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits, panel
 from d4orm_planners.play.command_queue import MOST_WAITING
+from d4orm_planners.play.origin_check import LARGEST_UPLOAD
 from d4orm_planners.play.playground import Playground
 from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.validation import LARGEST_UPLOAD
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
 
@@ -311,7 +311,7 @@ def test_a_flood_of_edits_does_not_stop_the_clock(monkeypatch: pytest.MonkeyPatc
     for number in range(3000):
         session.edit(lambda scene, number=number: edits.move_goal(scene, 0, [0.1 + 1e-4 * number, 0.3]))
     until(lambda: times.add(session.frame.status.number) or session.frame.status.refused)  # type: ignore[func-returns-value]
-    until(lambda: not session._commands._waiting)
+    until(lambda: not session.commands._waiting)
     status = session.frame.status
     session.close()
     assert session.failure is None
@@ -440,7 +440,7 @@ def test_closing_does_not_wait_for_a_plan(monkeypatch: pytest.MonkeyPatch) -> No
 
 STUCK = """
 import concurrent.futures, threading
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.policy import GoToGoal
 
 class Stuck(GoToGoal):
     def act(self, observations, state):

@@ -17,9 +17,9 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.disturbances import Delay, Push, StateNoise
 from d4orm_planners import make_policy
-from d4orm_planners.baselines.go_to_goal import GoToGoal
+from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.rl.dataset import Demonstrations, RecordedEpisode, record_episode, write_dataset
-from d4orm_planners.rl.dataset import recording as recording_module
+from d4orm_planners.rl.dataset import write as write_module
 
 minari = pytest.importorskip("minari")
 
@@ -157,7 +157,7 @@ def test_more_seeds_are_added_and_none_is_recorded_twice(tmp_path: Path, monkeyp
 
 
 def test_what_was_packed_just_before_a_crash_is_there_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_module.Recording, "forget", lambda self, seed: 1 / 0)
+    monkeypatch.setattr(write_module.Recording, "forget", lambda self, seed: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         written(tmp_path / "one", shard_size=2)
     monkeypatch.undo()

@@ -19,8 +19,8 @@ import pytest
 from d4orm_env import make_problem, navigation_v0
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
-from d4orm_planners.rl.curriculum import Stage, common_batch, make_stages, team_sizes
 from d4orm_planners.rl.network import MAX_BYTES, load_network
+from d4orm_planners.rl.train_config import Stage, common_batch, make_stages, team_sizes
 
 
 def test_team_sizes_double_up_to_the_full_team() -> None:

@@ -1,4 +1,4 @@
-"""Motions as Bernstein polynomials of the time, sampled at every step of a horizon.
+"""Motions as Bernstein polynomials of the time, sampled at every step of a horizon, and systems for their coefficients.
 
 R. T. Farouki, *The Bernstein polynomial basis: a centennial retrospective* (Computer Aided Geometric Design, 2012).
 """
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import Floats
+from d4orm_env.engine.compiling import compiled
 
 
 class Basis(NamedTuple):
@@ -64,3 +65,118 @@ def _power(base: Floats, exponent: int) -> Floats:
     for _ in range(exponent):
         result = result * base
     return result
+
+
+class Method(NamedTuple):
+    """Weights and limits of the alternation, with its basis.
+
+    Attributes:
+        place: ``(T, n+1)`` see :class:`Basis`.
+        velocity: ``(T, n+1)``.
+        acceleration: ``(T, n+1)``.
+        squares: ``(4, n+1, n+1)`` of the constraints on places, velocities and accelerations the sums of squares over
+            all steps, and the objective's.
+        goal: ``(n+1,)`` what the objective wants of the coefficients, per metre of goal.
+        barrier: Share ``gamma`` of its distance to a body's reach that a robot may use up in a step.
+        lookout: Bodies are minded that come this near to the reach [m].
+        penalty: First weight ``rho`` of the constraints.
+        growth: Factor by which it grows from one alternation to the next.
+        alternations: At most.
+        tolerance: Largest violation, and change of a place, at which it ends, in SI units.
+    """
+
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
+    squares: Floats
+    goal: Floats
+    barrier: float
+    lookout: float
+    penalty: float
+    growth: float
+    alternations: int
+    tolerance: float
+
+
+class Guess(NamedTuple):
+    """Samples of a motion at steps 1 to T, each ``(T, d)``: places [m], velocities [m/s], accelerations [m/s^2]."""
+
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
+
+
+class Targets(NamedTuple):
+    """Sums over all constraints that directions and lengths make of a :class:`Guess`, each ``(T, d)``."""
+
+    place: Floats
+    velocity: Floats
+    acceleration: Floats
+
+
+@compiled
+def raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: float, multiplier: Floats) -> None:
+    """Add to the multiplier ``(n+1, d)`` what the constraints are violated by."""
+    size, d = motion.shape
+    for i in range(size):
+        for axis in range(d):
+            now = 0.0
+            for j in range(size):
+                now += squares[i, j] * motion[j, axis]
+            multiplier[i, axis] -= penalty * (now - right[i, axis])
+
+
+@compiled
+def accumulate(method: Method, targets: Targets, bends: float, right: Floats) -> None:
+    """Add up the targets' share of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
+    (steps, size), d = method.place.shape, right.shape[1]
+    for i in range(size):
+        for axis in range(d):
+            total = 0.0
+            for step in range(steps):
+                total += method.place[step, i] * targets.place[step, axis]
+                total += method.velocity[step, i] * targets.velocity[step, axis]
+                total += bends * method.acceleration[step, i] * targets.acceleration[step, axis]
+            right[i, axis] = total
+
+
+@compiled
+def solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
+    """The free coefficients of a positive definite system, by Cholesky's method; overwrites its arguments."""
+    size, d = motion.shape
+    for i in range(fixed, size):
+        for axis in range(d):
+            for j in range(fixed):
+                right[i, axis] -= matrix[i, j] * motion[j, axis]
+        for j in range(fixed, i + 1):
+            for k in range(fixed, j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(matrix[i, i]) if i == j else matrix[i, j] / matrix[j, j]
+    for axis in range(d):
+        for i in range(fixed, size):
+            for k in range(fixed, i):
+                right[i, axis] -= matrix[i, k] * right[k, axis]
+            right[i, axis] /= matrix[i, i]
+        for i in range(size - 1, fixed - 1, -1):
+            for k in range(i + 1, size):
+                right[i, axis] -= matrix[k, i] * right[k, axis]
+            right[i, axis] /= matrix[i, i]
+            motion[i, axis] = right[i, axis]
+
+
+@compiled
+def sample(method: Method, motion: Floats, guess: Guess) -> float:
+    """Make the guess the samples of a motion; return how far a place moved at most along an axis [m]."""
+    (steps, size), d, change = method.place.shape, motion.shape[1], 0.0
+    for step in range(steps):
+        for axis in range(d):
+            place = velocity = acceleration = 0.0
+            for i in range(size):
+                place += method.place[step, i] * motion[i, axis]
+                velocity += method.velocity[step, i] * motion[i, axis]
+                acceleration += method.acceleration[step, i] * motion[i, axis]
+            change = max(change, abs(place - guess.place[step, axis]))
+            guess.place[step, axis] = place
+            guess.velocity[step, axis] = velocity
+            guess.acceleration[step, axis] = acceleration
+    return change

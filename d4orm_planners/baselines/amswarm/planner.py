@@ -40,9 +40,6 @@ class AMSwarmConfig(PlannerConfig):
         growth: Factor by which it grows from one alternation to the next.
         alternations: Of a replanning, at most.
         tolerance: Largest violation, and change of a place, at which a replanning ends.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
     """
 
     max_iterations: Count = 20

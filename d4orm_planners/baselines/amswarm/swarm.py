@@ -11,8 +11,8 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
-from d4orm_planners.baselines.amswarm.alternation import Guess, Method, Neighbourhood, alternate
-from d4orm_planners.baselines.amswarm.bernstein import first_coefficients, sample_basis
+from d4orm_planners.baselines.amswarm.alternation import Neighbourhood, alternate
+from d4orm_planners.baselines.amswarm.bernstein import Guess, Method, first_coefficients, sample_basis
 from d4orm_planners.tracking.steering import present_velocities, track_velocities
 
 if TYPE_CHECKING:
@@ -21,11 +21,6 @@ if TYPE_CHECKING:
 
 class Swarm:
     """The robots with their motions of the moment.
-
-    Args:
-        problem: The problem.
-        config: The method's settings.
-        random: Draws what the guesses are moved by.
 
     Attributes:
         violation: The largest violation of a constraint that a motion was left with, in SI units.

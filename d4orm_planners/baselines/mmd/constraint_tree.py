@@ -1,4 +1,4 @@
-"""The search over constraints: which robot plans again, and what it must keep clear of (CBS, ECBS, xECBS)."""
+"""The search over conflicts: which robot plans again, and what it must keep clear of (CBS, ECBS, xECBS)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.core.problem import Problem
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths.spaces import Space
-from d4orm_planners.baselines.mmd.conflicts import count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.guiding import Surroundings
 from d4orm_planners.baselines.mmd.path_frame import PathFrame
 from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
@@ -20,10 +21,62 @@ from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig
 
+
 SLACK = 1 / 75
 """Added to distances when conflicts are sought, for rounding, in radii of the largest robot."""
 PADDING = 2
 """Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published."""
+
+
+@cached_kernel(variant="count", **OPTIONS)
+def count_conflicts(places: Floats, others: Floats, distances: Floats, counts: IntArray) -> None:
+    """Fill ``counts`` ``(B, 2)`` int64 with how many others each of some paths conflicts with, and at how many steps.
+
+    Args:
+        places: ``(B, T, 3)`` the paths [m].
+        others: ``(S, T, 3)`` where the others are [m].
+        distances: ``(S,)`` to keep from each [m].
+        counts: Output.
+    """
+    counts[:] = 0
+    for b in range(places.shape[0]):
+        for other in range(others.shape[0]):
+            steps = 0
+            square = distances[other] * distances[other]
+            for t in range(places.shape[1]):
+                dx = places[b, t, 0] - others[other, t, 0]
+                dy = places[b, t, 1] - others[other, t, 1]
+                dz = places[b, t, 2] - others[other, t, 2]
+                if dx * dx + dy * dy + dz * dz <= square:
+                    steps += 1
+            if steps > 0:
+                counts[b, 0] += 1
+                counts[b, 1] += steps
+
+
+@cached_kernel(variant="first", **OPTIONS)
+def first_conflict(places: Floats, distances: Floats) -> tuple[Whole, Whole, Whole, Whole]:
+    """``(pairs, step, robot, robot)``: how many pairs conflict, and the earliest conflict; robots are -1 if none does.
+
+    Args:
+        places: ``(K, T, 3)`` [m].
+        distances: ``(K, K)`` to keep [m].
+    """
+    robots, steps = places.shape[0], places.shape[1]
+    pairs, earliest, one, another = 0, steps, -1, -1
+    for k in range(1, robots):
+        for other in range(k):
+            square = distances[k, other] * distances[k, other]
+            for t in range(steps):
+                dx = places[k, t, 0] - places[other, t, 0]
+                dy = places[k, t, 1] - places[other, t, 1]
+                dz = places[k, t, 2] - places[other, t, 2]
+                if dx * dx + dy * dy + dz * dz <= square:
+                    pairs += 1
+                    if t < earliest:
+                        earliest, one, another = t, k, other
+                    break
+    return np.int64(pairs), np.int64(earliest), np.int64(one), np.int64(another)
 
 
 class Constraint(NamedTuple):
@@ -87,14 +140,7 @@ class TreeNode:
 
 @dataclass(frozen=True, eq=False)
 class Tree:
-    """The state of the search.
-
-    Attributes:
-        frames: Of the robots.
-        space: The world.
-        nodes: That are not expanded yet, best first.
-        made: Number of nodes made so far.
-    """
+    """The state of the search: nodes that are not expanded yet, best first, and how many were made."""
 
     frames: tuple[PathFrame, ...]
     space: Space
@@ -110,18 +156,7 @@ class Tree:
 
 
 class Planning:
-    """Planner of one robot around the others of a problem; all that changes is in nodes.
-
-    Args:
-        problem: The team.
-        config: The method's settings.
-        denoiser: Denoiser of motions.
-        frames: Of the robots.
-        space: The world.
-
-    Attributes:
-        steps: Denoising steps so far.
-    """
+    """Planner of one robot around the others of a problem; all that changes is in nodes."""
 
     def __init__(
         self, problem: Problem, config: MMDConfig, denoiser: Denoiser, frames: tuple[PathFrame, ...], space: Space

@@ -16,8 +16,8 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.spaces import Space, clearance_at
-from d4orm_planners.baselines.mmd.clock import fill_clock
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, locate, trace
+from d4orm_planners.baselines.mmd.tracking import fill_clock
 
 _PROBE, _WITHIN = 1 / 150, 2.0**-27
 """Distance over which the slope of the clearance is measured, in radii of the largest robot, and share of a sphere's

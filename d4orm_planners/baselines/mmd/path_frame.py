@@ -157,14 +157,14 @@ def resample(path: Floats, reference: Floats) -> float:
     last = reference.shape[0] - 1
     total = 0.0
     for corner in range(1, path.shape[0]):
-        total += _gap(path, corner)
+        total += segment_length(path, corner)
     corner, passed, own = 0, 0.0, 0.0
     for i in range(last + 1):
         arc = total * i / last
         while corner < path.shape[0] - 1 and (corner == 0 or passed + own < arc):
             passed += own
             corner += 1
-            own = _gap(path, corner)
+            own = segment_length(path, corner)
         share = min((arc - passed) / own, 1.0) if own > 0.0 else 1.0
         for axis in range(3):
             before = path[max(corner - 1, 0), axis]
@@ -181,7 +181,7 @@ def round_tangents(reference: Floats, tangents: Floats) -> None:
         # Its length is of the chord: shorter in corners, zero where the path turns back on itself.
         arc = 0.0
         for k in range(before, after):
-            arc += _gap(reference, k + 1)
+            arc += segment_length(reference, k + 1)
         for axis in range(3):
             tangents[i, axis] = (reference[after, axis] - reference[before, axis]) / arc if arc > 0.0 else 0.0
 
@@ -230,12 +230,10 @@ def trace(
 
 
 @compiled
-def _gap(path: Floats, corner: int) -> float:
-    dx, dy, dz = (
-        path[corner, 0] - path[corner - 1, 0],
-        path[corner, 1] - path[corner - 1, 1],
-        path[corner, 2] - path[corner - 1, 2],
-    )
+def segment_length(path: Floats, end: int) -> float:
+    """Return the length of the segment that ends at this point of a path [m]."""
+    a, b = path[end - 1], path[end]
+    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 

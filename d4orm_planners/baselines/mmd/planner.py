@@ -44,9 +44,6 @@ class MMDConfig(PlannerConfig):
             robot at full speed.
         quickest: Times the shortest time of its path that a motion takes at least.
         slowest: And at most; between the two it is drawn.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
     """
 
     max_iterations: Count = 300

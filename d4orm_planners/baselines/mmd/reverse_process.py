@@ -47,13 +47,7 @@ class Batch:
 
 
 class Denoiser:
-    """Denoiser of the motions of a team's robots, one robot at a time.
-
-    Args:
-        problem: The team.
-        config: The method's settings.
-        should_stop: Asked between denoising steps whether to leave motions as noisy as they are.
-    """
+    """Denoiser of the motions of a team's robots, one robot at a time."""
 
     def __init__(self, problem: Problem, config: MMDConfig, should_stop: Callable[[], bool]) -> None:
         self._problem, self._config, self._should_stop = problem, config, should_stop

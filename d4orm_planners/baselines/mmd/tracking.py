@@ -14,17 +14,57 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_env.paths.spaces import Space, clearance_at
-from d4orm_planners.baselines.mmd.clock import fill_clock
-from d4orm_planners.baselines.mmd.path_frame import PathFrame, trace
+from d4orm_planners.baselines.mmd.path_frame import PathFrame, segment_length, trace
 from d4orm_planners.tracking.tracker import tracker
+
+SHARE = 0.7
+"""Share of its acceleration that a robot counts on, so that it can make up for what it is off."""
+
 
 GAIN = np.float32(1.5)
 """Share of its distance from the motion that a robot makes up for in a second [1/s]."""
+
+
+@compiled
+def fill_clock(
+    points: Floats, duration: float, speed: float, acceleration: float, paces: Floats, times: Floats
+) -> None:
+    """Fill ``times`` ``(N + 1,)`` with when a robot that starts from rest is at each point [s].
+
+    Points follow each other at equal times, but for bends that are driven slower than that, and braking before them.
+
+    Args:
+        points: ``(N + 1, 3)`` [m].
+        duration: Of the motion [s]; it takes no less.
+        speed: Limit [m/s].
+        acceleration: Limit [m/s^2].
+        paces: ``(N + 1,)`` scratch [m/s].
+        times: Output.
+    """
+    last, usable = points.shape[0] - 1, SHARE * acceleration
+    paces[0], paces[last] = 0.0, speed
+    for i in range(1, last):
+        before, after = segment_length(points, i), segment_length(points, i + 1)
+        square = 0.0
+        for axis in range(3):
+            turn = (points[i + 1, axis] - points[i, axis]) / after - (points[i, axis] - points[i - 1, axis]) / before
+            square += turn * turn
+        # A point that is waited at has no direction.
+        bends = before > 0.0 and after > 0.0 and square > 0.0
+        paces[i] = min(speed, np.sqrt(usable * (before + after) / (2 * np.sqrt(square)))) if bends else speed
+    for i in range(last - 1, 0, -1):
+        paces[i] = min(paces[i], np.sqrt(paces[i + 1] * paces[i + 1] + 2 * usable * segment_length(points, i + 1)))
+    times[0] = 0.0
+    for i in range(last):
+        length = segment_length(points, i + 1)
+        paces[i + 1] = min(paces[i + 1], np.sqrt(paces[i] * paces[i] + 2 * usable * length))
+        pace = (paces[i] + paces[i + 1]) / 2
+        times[i + 1] = times[i] + max(duration / last, length / pace if pace > 0.0 else 0.0)
 
 
 class TrackedMotions(NamedTuple):

@@ -1,23 +1,33 @@
-"""Demonstrations that a dataset is made of: a policy in an environment, seed by seed."""
+"""Demonstrations that a dataset is made of: recorded episodes of a policy in an environment, seed by seed."""
 
 from __future__ import annotations
 
+import copy
 import json
 import re
+import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from d4orm_env import __version__, navigation_v0
-from d4orm_env.core.arrays import shown, whole_number
+from d4orm_env.core.archives import ArrayArchive
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, shown, whole_number
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import source_digest
 from d4orm_env.disturbances.disturbance import Disturbance
+from d4orm_env.envs.team_step import TeamStep
+from d4orm_planners.base.episode import run_episode
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, origin, policy_settings
+from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
 from d4orm_planners.evaluation.trials import Condition
-from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode, record_episode
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -25,6 +35,13 @@ if TYPE_CHECKING:
 LARGEST_SEED = 2**63 - 1
 AGENTS = ("team", "robot")
 """Owner of an episode of a dataset."""
+
+
+MAX_BYTES = 2**31
+"""Largest array of an episode that is read."""
+_FLAGS = ("acting", "terminations", "arrived", "collided", "margin_violated")
+_OF_STEPS = ("actions", "acting", "rewards", "terminations")
+"""Arrays of ``T`` moments; the others have one more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,3 +145,141 @@ def _described(thing: object) -> object:
     if callable(thing):
         return {"source": source_digest(thing), "name": getattr(thing, "__qualname__", type(thing).__qualname__)}
     raise TypeError(f"{type(thing).__name__} is none of these")
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedEpisode:
+    """One episode of a team, ``T`` steps long: every robot at every time, those that have docked included.
+
+    Attributes:
+        observations: ``(T+1, K, D)`` float32.
+        actions: ``(T, K, m)`` float32 as the policy gave them, in physical units, before anything disturbed or clipped
+            them; zero for robots that have left.
+        acting: ``(T, K)`` bool: whose action counted.
+        rewards: ``(T, K)`` float32 of every robot.
+        terminations: ``(T, K)`` bool: which robots the step ended for, because they had arrived.
+        arrived: ``(T+1, K)`` bool, likewise ``collided`` and ``margin_violated``.
+        distance_to_goal: ``(T+1, K)`` float32 [m].
+        state: ``(T+1, S)`` float32, ``env.state()``.
+        metadata: Seed, digest of the problem, and the episode's metrics.
+    """
+
+    observations: FloatArray
+    actions: FloatArray
+    acting: BoolArray
+    rewards: FloatArray
+    terminations: BoolArray
+    arrived: BoolArray
+    collided: BoolArray
+    margin_violated: BoolArray
+    distance_to_goal: FloatArray
+    state: FloatArray
+    metadata: Mapping[str, Any]
+
+    @property
+    def success(self) -> bool:
+        """True if all arrived in time and none was ever in contact; never in lifelong mode."""
+        return bool(self.metadata.get("success", False))
+
+    def save(self, path: Path) -> None:
+        """Write it into an ``.npz`` file, which is whole or not there."""
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        text = np.frombuffer(json.dumps(dict(self.metadata)).encode(), np.uint8)
+        with replaced_when_done(path, (".npz",)) as temporary, temporary.open("wb") as stream:
+            np.savez_compressed(stream, metadata=text, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> RecordedEpisode:
+        """Read what :meth:`save` has written.
+
+        Raises:
+            ValueError: If it is something else.
+        """
+        try:
+            with path.open("rb") as stream, ArrayArchive(stream, (*_ARRAYS, "metadata")) as archive:
+                arrays = {name: archive.array(name, MAX_BYTES) for name in _ARRAYS}
+                metadata = json.loads(archive.array("metadata", MAX_BYTES).tobytes())
+            _check(arrays, metadata)
+        except (ValueError, KeyError, EOFError, RecursionError, zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(f"{path} is no recorded episode ({error}); remove it to record it anew") from None
+        return cls(**arrays, metadata=metadata)
+
+
+_ARRAYS = tuple(field.name for field in fields(RecordedEpisode) if field.name != "metadata")
+
+
+def _check(arrays: Mapping[str, np.ndarray], metadata: object) -> None:
+    """Refuse what is no episode, in types or shapes."""
+    actions = arrays["actions"]
+    if actions.ndim != 3 or not isinstance(metadata, dict) or not isinstance(metadata.get("seed"), int):
+        raise ValueError("it lacks a seed, or actions of every robot at every step")
+    steps, robots = actions.shape[:2]
+    axes = {"observations": 3, "actions": 3}
+    for name, array in arrays.items():
+        kind = np.dtype(np.bool_ if name in _FLAGS else np.float32)
+        lengths = (steps + (name not in _OF_STEPS), *(() if name == "state" else (robots,)))
+        if array.dtype != kind or array.ndim != axes.get(name, 2) or array.shape[: len(lengths)] != lengths:
+            raise ValueError(f"{name} is of type {array.dtype} and shape {array.shape}")
+
+
+def record_episode(env: ParallelEnv, policy: Policy, seed: int = 0) -> RecordedEpisode:
+    """Run an episode of an environment that is not wrapped, and keep all that there is to learn from."""
+    recorder = _Recorder(policy)
+    episode = run_episode(env, recorder, seed=seed)
+    world = env.unwrapped
+    steps = (*recorder.steps, world.last_step)
+    flags = {
+        name: np.stack([getattr(step, name) for step in steps]) for name in ("arrived", "collided", "margin_violated")
+    }
+    acting, actions = recorder.team_actions()
+    there = flags["arrived"][1:]
+    finished = there if world.problem.docks else there & there.all(axis=1, keepdims=True)
+    return RecordedEpisode(
+        observations=np.stack([step.observations for step in steps]),
+        actions=actions,
+        acting=acting,
+        rewards=np.stack([step.rewards for step in steps[1:]]),
+        terminations=acting & finished & (not world.lifelong),
+        **flags,
+        distance_to_goal=np.stack([step.distances for step in steps]),
+        state=np.stack([*recorder.states, world.state()]),
+        metadata={"seed": seed, "problem": episode.problem.digest, **_plain(episode.metrics)},
+    )
+
+
+def _plain(metrics: Mapping[str, float]) -> dict[str, float | bool]:
+    numbers = {name: float(value) for name, value in metrics.items()}
+    return numbers | ({"success": bool(metrics["success"])} if "success" in metrics else {})
+
+
+class _Recorder(Policy):
+    """A policy that notes what the team saw and did."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = copy.copy(policy)
+        self.steps: list[TeamStep] = []
+        self.states: list[FloatArray] = []
+        self._actions: list[Actions] = []
+
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
+        super().reset(env, seed)
+        self._env = env
+        self._policy.reset(env, seed)
+
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
+        actions = self._policy.act(observations, state)
+        self.steps.append(self._env.unwrapped.last_step)
+        self.states.append(state.copy())
+        # The environment says what is wrong with them, if anything is.
+        self._actions.append({agent: actions[agent] for agent in observations if agent in actions})
+        return actions
+
+    def team_actions(self) -> tuple[BoolArray, FloatArray]:
+        """``(T, K)`` bool: acted, and the actions ``(T, K, m)``."""
+        shape = (len(self._actions), self.problem.num_robots)
+        acting, controls = np.zeros(shape, np.bool_), np.zeros((*shape, self.problem.control_size), np.float32)
+        for step, actions in enumerate(self._actions):
+            robots = robot_indices(actions)
+            acting[step, robots] = True
+            controls[step, robots] = as_float32(list(actions.values()))
+        return acting, controls

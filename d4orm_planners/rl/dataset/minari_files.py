@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import BoolArray
 from d4orm_env.core.lazy import LazyModule
-from d4orm_planners.rl.dataset.recorded_episode import RecordedEpisode
+from d4orm_planners.rl.dataset.demonstrations import RecordedEpisode
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
@@ -67,10 +67,11 @@ class DatasetFiles:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         storage = self._storage(partial)
-        parts = [(episode, part) for episode in episodes for part in _PARTS[self.agents](episode)]
-        storage.update_episodes(_buffer(episode, part) for episode, part in parts)
+        parts = [(episode, *part) for episode in episodes for part in _parts(episode, self.agents)]
+        storage.update_episodes(_buffer(episode, steps, who) for episode, steps, who, _ in parts)
         storage.update_episode_metadata(
-            {**episode.metadata, **part.extra, "id": sum(before) + place} for place, (episode, part) in enumerate(parts)
+            {**episode.metadata, **extra, "id": sum(before) + place}
+            for place, (episode, _, _, extra) in enumerate(parts)
         )
         storage.update_metadata({"recorded_seeds": [int(episode.metadata["seed"]) for episode in episodes]})
         partial.rename(final)
@@ -122,51 +123,30 @@ def _metadata(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{path} cannot be read ({error}); remove {folder} to record its episodes anew") from None
 
 
-@dataclass(frozen=True)
-class _Shard:
-    """Part of a recorded episode that one episode of the dataset takes.
-
-    Attributes:
-        steps: Steps ``T'`` from the beginning.
-        pick: Takes what is of ``(T, K, ...)`` into the episode: all, or one robot.
-        extra: Further metadata.
-        together: Whether it is the team's.
-    """
-
-    steps: int
-    pick: Callable[[np.ndarray], np.ndarray]
-    extra: Mapping[str, object]
-    together: bool
-
-
-def _team(episode: RecordedEpisode) -> Iterator[_Shard]:
-    yield _Shard(len(episode.actions), lambda values: values, {}, True)
-
-
-def _robots(episode: RecordedEpisode) -> Iterator[_Shard]:
+def _parts(episode: RecordedEpisode, agents: str) -> Iterator[tuple[int, slice | int, Mapping[str, object]]]:
+    """The episodes of a dataset that one makes, the team's or each robot's: steps, robots, and further metadata."""
+    if agents == "team":
+        yield len(episode.actions), slice(None), {}
+        return
     for robot, steps in enumerate(episode.acting.sum(axis=0).tolist()):
-        yield _Shard(steps, lambda values, robot=robot: values[:, robot], {"robot": robot}, False)  # type: ignore[misc]
+        yield steps, robot, {"robot": robot}
 
 
-_PARTS: Mapping[str, Callable[[RecordedEpisode], Iterable[_Shard]]] = {"team": _team, "robot": _robots}
-
-
-def _buffer(episode: RecordedEpisode, part: _Shard) -> EpisodeBuffer:
-    """An episode as Minari takes it."""
-    steps, pick = part.steps, part.pick
+def _buffer(episode: RecordedEpisode, steps: int, who: slice | int) -> EpisodeBuffer:
+    """The first steps of an episode, of the team or of one robot, as Minari takes it."""
     names = ("arrived", "collided", "margin_violated", "distance_to_goal")
-    infos = {name: pick(getattr(episode, name))[: steps + 1] for name in names}
-    ended: BoolArray = pick(episode.terminations)[:steps]
-    rewards = pick(episode.rewards)[:steps]
-    if part.together:
+    infos = {name: getattr(episode, name)[: steps + 1, who] for name in names}
+    ended: BoolArray = episode.terminations[:steps, who]
+    rewards = episode.rewards[:steps, who]
+    if isinstance(who, slice):
         at_reset = np.zeros_like(rewards[:1])
         infos |= {"robot_rewards": np.concatenate([at_reset, rewards]), "state": episode.state}
         ended, rewards = np.all(np.maximum.accumulate(ended), axis=1), rewards.mean(axis=1)
     last = np.arange(steps) == steps - 1
     return data_collector.EpisodeBuffer(
         seed=int(episode.metadata["seed"]),
-        observations=_flat(pick(episode.observations)[: steps + 1]),
-        actions=_flat(pick(episode.actions)[:steps]),
+        observations=_flat(episode.observations[: steps + 1, who]),
+        actions=_flat(episode.actions[:steps, who]),
         rewards=rewards.astype(np.float64),
         terminations=ended,
         truncations=last & ~ended,

@@ -1,4 +1,7 @@
-"""Writing a dataset: episodes are recorded one by one, then packed into shards."""
+"""Writing a dataset: episodes are recorded one by one into a folder, by several processes, then packed into shards.
+
+What is there already is not recorded again.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,10 @@ import copy
 import importlib.metadata
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,22 +20,145 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import whole_number
+from d4orm_env.core.errors import describe
+from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
+from d4orm_env.core.registry import check_sendable
+from d4orm_env.engine.threads import available_cores
 from d4orm_env.envs.joint_env import ENV_ID, JointNavigationEnv
 from d4orm_planners.base.machine import commit, versions
-from d4orm_planners.rl.dataset.demonstrations import Demonstrations
+from d4orm_planners.evaluation.pool import run_here, run_jobs
+from d4orm_planners.evaluation.process_pool import ProcessPool
+from d4orm_planners.rl.dataset.demonstrations import Demonstrations, RecordedEpisode
 from d4orm_planners.rl.dataset.minari_files import DatasetFiles
-from d4orm_planners.rl.dataset.recording import Recording, record_all
 
 if TYPE_CHECKING:
     from minari import MinariDataset
 
+IDENTITY = "demonstrations.json"
+
+
 minari: Any = LazyModule("minari", "a dataset", "dataset")
 minari_dataset: Any = LazyModule("minari.dataset.minari_dataset", "a dataset", "dataset")
 datasets_root_dir: Any = LazyModule("minari.storage.datasets_root_dir", "a dataset", "dataset")
-
 LIBRARIES = ("d4orm-env", "minari", "gymnasium", "numpy", "numba")
 Progress = Callable[[str, int, int], object]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Episodes in a folder, a file each, from when they end until they are in a dataset."""
+
+    folder: Path
+
+    def claim(self, demonstrations: Demonstrations) -> None:
+        """Make the folder, or find out whether it is one for the same demonstrations.
+
+        Raises:
+            ValueError: If it is not.
+            OSError: If it cannot be made.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path, identity = self.folder / IDENTITY, demonstrations.identity
+        if not path.exists():
+            with replaced_when_done(path) as temporary:
+                temporary.write_text(json.dumps(identity, indent=1) + "\n", encoding="utf-8")
+            return
+        try:
+            before = dict(json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError, RecursionError):
+            raise ValueError(f"{path} cannot be read; remove the folder, or choose another") from None
+        for name, value in identity.items():
+            if before.get(name) != value:
+                raise ValueError(
+                    f"folder {self.folder.parent} holds a dataset with {name} {before.get(name)!r}, not {value!r}; go "
+                    "on with the same, or choose another folder"
+                )
+
+    def seeds(self) -> set[int]:
+        """Seeds of the episodes that are there."""
+        return self._numbers("npz")
+
+    def dropped(self) -> set[int]:
+        """Seeds of the episodes that have been left out."""
+        return self._numbers("dropped")
+
+    def load(self, seed: int) -> RecordedEpisode:
+        """The episode of a seed.
+
+        Raises:
+            ValueError: If the file is damaged.
+        """
+        return RecordedEpisode.load(self._path(seed, "npz"))
+
+    def forget(self, seed: int) -> None:
+        """Remove the episode of a seed."""
+        self._path(seed, "npz").unlink(missing_ok=True)
+
+    def keep(self, seed: int, episode: RecordedEpisode | None) -> None:
+        """Write down an episode, or that it is left out."""
+        if episode is None:
+            self._path(seed, "dropped").touch()
+        else:
+            episode.save(self._path(seed, "npz"))
+
+    def _path(self, seed: int, kind: str) -> Path:
+        return self.folder / f"{seed}.{kind}"
+
+    def _numbers(self, kind: str) -> set[int]:
+        return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
+
+
+@dataclass(frozen=True)
+class _Task:
+    """An episode to be recorded: a job with its seed, and what went wrong if anything did, as the only result."""
+
+    demonstrations: Demonstrations
+    recording: Recording
+    seed: int
+    num_parts: int = 1
+
+    def run(self) -> Iterator[tuple[int, str]]:
+        """Record it."""
+        try:
+            episode = self.demonstrations.record(self.seed)
+        except Exception as error:  # whatever a policy raises
+            yield self.seed, describe(error)
+            return
+        dropped = self.demonstrations.only_success and not episode.success
+        self.recording.keep(self.seed, None if dropped else episode)
+        yield self.seed, ""
+
+    def lost(self, done: int, reason: str) -> tuple[list[tuple[int, str]], None]:
+        return [] if done else [(self.seed, reason)], None
+
+
+def record_all(
+    demonstrations: Demonstrations, recording: Recording, seeds: list[int], workers: int | None
+) -> Generator[int]:
+    """Record episodes of these seeds by so many workers, see :func:`write_dataset`; yields a seed when it is on disk.
+
+    Raises:
+        ValueError: At the end if episodes have failed, or if the policy cannot be handed to worker processes.
+        ChildProcessError: If processes do not start.
+    """
+    tasks = [_Task(demonstrations, recording, seed) for seed in seeds]
+    size = min(workers or available_cores(), len(tasks))
+    if size > 1:
+        check_sendable(demonstrations, f"policy {demonstrations.policy_name!r}")
+    failures: dict[int, str] = {}
+    with closing(run_jobs(tasks, ProcessPool(size)) if size > 1 else run_here(tasks)) as outcomes:
+        for seed, failure in chain.from_iterable(outcomes):
+            if failure:
+                failures[seed] = failure
+            else:
+                yield seed
+    if failures:
+        seed, failure = min(failures.items())
+        raise ValueError(
+            f"the episode of seed {seed} failed ({failure}), {len(failures)} of {len(tasks)} in all; leave such seeds "
+            "out, or change the policy; the others are kept"
+        )
 
 
 def write_dataset(

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from examples.studies.onboard.course import reward
 
-from d4orm_planners.d_d4orm.node_events import Event
+from d4orm_planners.d_d4orm.node import Event
 
 COLUMNS = (
     "time", "until", "tick", "round", "robot", "event", "of", "message", "bytes", "plan", "reward", "solved"

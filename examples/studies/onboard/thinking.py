@@ -14,9 +14,8 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import Engine
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.d_d4orm.evaluator import Evaluator
-from d4orm_planners.d_d4orm.node import Node, Task
-from d4orm_planners.d_d4orm.node_events import Event
+from d4orm_planners.d_d4orm.inbox import Evaluator
+from d4orm_planners.d_d4orm.node import Event, Node, Task
 from d4orm_planners.d_d4orm.transport import Transport
 
 TIMEOUT = 0.25

@@ -1,0 +1,23 @@
+"""Signals while a command is under way."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+@contextmanager
+def on_signals(handle: Callable[[int, Any], Any], *numbers: int) -> Iterator[None]:
+    """Have SIGINT and SIGTERM, or these, call a function meanwhile; in other threads than the main one nothing is."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = {number: signal.signal(number, handle) for number in numbers or (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
