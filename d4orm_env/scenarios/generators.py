@@ -181,11 +181,7 @@ def fibonacci_sphere(count: int) -> Points:
 
 
 def mixed_team(settings: Settings, first: tuple[str, float], second: tuple[str, float]) -> Settings:
-    """The settings with two models in turn, each with its limit of acceleration [m/s^2] unless one is given.
-
-    Raises:
-        ValueError: If a model is given.
-    """
+    """The settings with two models in turn, each with its limit of acceleration [m/s^2] unless one is given."""
     if settings.model is not None:
         raise ValueError(
             f"scenario {settings.scenario!r} mixes {first[0]} and {second[0]} itself and takes no model, "
@@ -197,14 +193,11 @@ def mixed_team(settings: Settings, first: tuple[str, float], second: tuple[str, 
 
 
 def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
-    """Robots on the Fibonacci points of a sphere, goals at the antipodes.
-
-    Raises:
-        ValueError: If the models are planar, or the robots do not fit.
-    """
+    """Robots on the Fibonacci points of a sphere, goals at the antipodes."""
     _require_space(settings)
     points = fibonacci_sphere(settings.num_robots)
-    needed = 2 * settings.spacing / _smallest_distance(points)
+    gaps = (np.linalg.norm(points[:index] - points[index], axis=1).min() for index in range(1, len(points)))
+    needed = 2 * settings.spacing / float(min(gaps, default=np.inf))
     if needed >= diameter:
         raise _too_small(settings, "diameter", diameter, needed)
     starts, goals = _antipodal(points * (diameter / 2))
@@ -213,11 +206,7 @@ def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
 
 
 def antipodal_circle(settings: Settings, diameter: float) -> Layout:
-    """Robots evenly on a circle, goals at the antipodes.
-
-    Raises:
-        ValueError: If the robots do not fit.
-    """
+    """Robots evenly on a circle, goals at the antipodes."""
     count, dimension = settings.num_robots, settings.team.dimension
     needed = settings.spacing / float(sin(math.pi / count)) if count > 1 else 0.0
     if needed >= diameter:
@@ -255,12 +244,6 @@ def _require_space(settings: Settings) -> None:
             f"scenario {settings.scenario!r} is three-dimensional and model {settings.model!r} is not; "
             f"use model='holonomic3d', or scenario 'circle'"
         )
-
-
-def _smallest_distance(points: Points) -> float:
-    """Between any two of at least two points; infinite for one."""
-    gaps = (np.linalg.norm(points[:index] - points[index], axis=1).min() for index in range(1, len(points)))
-    return float(min(gaps, default=np.inf))
 
 
 def _too_small(settings: Settings, name: str, value: float, needed: float) -> ValueError:

@@ -20,7 +20,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
-from d4orm_env.scenarios.schema import describe, parse
+from d4orm_env.scenarios.problem_files import describe
+from d4orm_env.scenarios.schema import parse
 from d4orm_env.verify import verify
 from d4orm_planners.base.plan import IterationRecord, Plan, failed_robots
 from d4orm_planners.base.provenance import Provenance

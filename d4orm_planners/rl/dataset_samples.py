@@ -12,8 +12,7 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.team import Team
-from d4orm_env.scenarios.problems import is_scenario_file
-from d4orm_env.scenarios.scenario_registry import SCENARIOS
+from d4orm_env.scenarios.problems import SCENARIOS, is_scenario_file
 from d4orm_planners.rl.samples import MAX_BYTES, Samples
 
 if TYPE_CHECKING:
