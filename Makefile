@@ -69,7 +69,7 @@ bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 	$(BIN)/d4orm bench --out bench
 
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in examples/studies/data/
-	$(BIN)/python -m examples.studies --out docs/tables
+	$(BIN)/python -m examples.studies all --out docs/tables
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .

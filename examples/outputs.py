@@ -114,6 +114,13 @@ def tell(what: str, done: int, total: int) -> None:
     print(f"{done} of {total}: {what}", flush=True)
 
 
+def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:
+    """How many trials are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
+    solved = sum(map(counts, trials))
+    lower, upper = wilson_interval(solved, len(trials))
+    return {"solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}"}
+
+
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
     """A row for each label of ``groups``, in ``column``: success, denoising steps, travel time, and tests.
 
@@ -122,13 +129,10 @@ def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], refe
     """
     rows = []
     for label, trials in groups.items():
-        solved = [trial for trial in trials if is_solved(trial)]
-        lower, upper = wilson_interval(len(solved), len(trials))
-        travel = [trial.travel_time for trial in solved if trial.travel_time is not None]
+        travel = [trial.travel_time for trial in trials if is_solved(trial) and trial.travel_time is not None]
         test = paired(trials, groups[reference], penalised_steps, is_solved)
         rows.append(
-            {"team": team, column: label, "solved": f"{len(solved)} of {len(trials)}",
-             "interval": f"{lower:.0%} to {upper:.0%}",
+            {"team": team, column: label, **solved_columns(trials),
              "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
              "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
              "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}

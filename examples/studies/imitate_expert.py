@@ -1,7 +1,7 @@
 """Imitation of a planner: a network learns what D4orm-C2F does, first by cloning, then by DAgger, then by PPO.
 
-    python -m examples.studies.imitate_expert --seeds 3
-    python -m examples.studies.imitate_expert --trials examples/studies/data/imitate_expert.parquet
+    python -m examples.studies imitate_expert --seeds 3
+    python -m examples.studies imitate_expert --trials examples/studies/data/imitate_expert.parquet
 
 The clone sees what the expert's own drives led to, and on its own comes into places where the expert never was. DAgger
 lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
@@ -13,7 +13,6 @@ file that it wrote before. The same from the command line: ``d4orm train imitati
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -99,14 +98,9 @@ def _point(way: str, point: Rows) -> dict[str, object]:
     }
 
 
-def main() -> int:
+def main() -> None:
     """Learn, or read curves, and write what came of it."""
     arguments = study_parser(__doc__, seeds=3).parse_args()
     seeds, quick, out = (1 if arguments.quick else arguments.seeds), arguments.quick, arguments.out / "imitation"
     rows = study_rows(arguments, "imitate_expert", lambda: measure(seeds, out, quick))
     save_table(summary(rows), arguments.out / "imitate_expert.csv")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

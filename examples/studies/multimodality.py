@@ -1,6 +1,6 @@
 """Kinds of solution that a planner finds: two robots swap places around an obstacle (the paper's appendix A).
 
-    python -m examples.studies.multimodality --seeds 100
+    python -m examples.studies multimodality --seeds 100
 
 One solve per planner and seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of
 robot 1 about the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in
@@ -177,7 +177,3 @@ def main() -> None:
     paths = [path_of(row) for row in solutions(rows, "d4orm")]
     found = {signs: [path for path in paths if signature(path) == signs] for signs in CLASSES}
     draw(problem, {signs: members for signs, members in found.items() if members}, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

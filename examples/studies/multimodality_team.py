@@ -1,6 +1,6 @@
 """Kinds of solution that planners find for a whole team on a circle (the paper's appendix A, its harder problem).
 
-    python -m examples.studies.multimodality_team --seeds 30
+    python -m examples.studies multimodality_team --seeds 30
 
 One solve per seed and planner. Robots that change places on a circle meet pairwise, and pass each other on one side or
 the other: a plan's class is the sign of the angle that each robot sweeps around each other one, 28 signs with eight
@@ -76,7 +76,3 @@ def main() -> None:
     rows = study_rows(arguments, "multimodality_team", plans)
     save_table([row_of(label, rows) for label in PLANNERS], arguments.out / "multimodality_team.csv")
     draw(rows, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

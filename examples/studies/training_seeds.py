@@ -1,7 +1,7 @@
 """Reinforcement learning with several seeds: curves of PPO and SAC with 95% intervals of the mean (Student's t).
 
-    python -m examples.studies.training_seeds --seeds 3
-    python -m examples.studies.training_seeds --curves examples/studies/data/training_curves.csv
+    python -m examples.studies training_seeds --seeds 3
+    python -m examples.studies training_seeds --curves examples/studies/data/training_curves.csv
 
 Trains every learner with every seed, one after another: about three hours of one core. Broken off, it goes on where it
 was. With ``--curves`` it trains nothing, and makes table and picture of a file that it wrote before.
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -131,7 +130,7 @@ def draw(rows: Rows, path: Path) -> None:
     save_figure(figure, path)
 
 
-def main() -> int:
+def main() -> None:
     """Train, or read curves; write the curves, a table of their ends and the picture."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=3, help="trainings per learner")
@@ -150,8 +149,3 @@ def main() -> int:
             rows = list(csv.DictReader(file))
     save_table(summary(rows), arguments.out / "training_seeds.csv")
     draw(rows, arguments.out / "training_seeds.png")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """PPO and SAC tuned with the same budget: how good the settings are that the package trains with.
 
-    python -m examples.studies.tune_learners --candidates 7
+    python -m examples.studies tune_learners --candidates 7
 
 Both have the settings of `training_seeds.py` in crowds and so many drawn at random from a space of their own. Each is
 trained for a first look, and the better third twice as long, from nothing and with another seed (successive halving:
@@ -13,7 +13,6 @@ and makes the table of a file that it wrote before.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -98,7 +97,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, object]]:
     return table
 
 
-def main() -> int:
+def main() -> None:
     """Tune both, or one, and write what was tried."""
     parser = study_parser(__doc__)
     parser.add_argument("--candidates", type=count, default=7, help="settings tried per learner, its own included")
@@ -115,8 +114,3 @@ def main() -> int:
         ],
     )
     save_table(summary(rows), arguments.out / "tune_learners.csv")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -207,7 +207,7 @@ def test_the_others_drive_on_when_a_robot_is_killed(tmp_path: Path) -> None:
 def test_ctrl_c_ends_all_processes_and_writes_what_there_is(tmp_path: Path) -> None:
     pytest.importorskip("zenoh")
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "examples.studies.onboard_lifelong", "--robots", "2", "--out", str(out)]
+    command = [sys.executable, "-m", "examples.studies", "onboard_lifelong", "--robots", "2", "--out", str(out)]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     process = subprocess.Popen(
         command,

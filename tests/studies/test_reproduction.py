@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from examples.outputs import study_trials
-from examples.studies.paper.__main__ import main
+from examples.studies.paper import main
 from examples.studies.paper.figure import Figure, Group, Section, grouped
 from examples.studies.paper.figure_report import markdown, write_figure
 from examples.studies.paper.numbers import METRICS, first_solution, measured
