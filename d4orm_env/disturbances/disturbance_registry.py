@@ -16,7 +16,7 @@ from d4orm_env.core.registry import Registry
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
-from d4orm_env.disturbances.intruder import Intruder
+from d4orm_env.disturbances.moving_obstacle import Intruder
 from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, StateNoise
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.chosen import Disturbances, at_work, checked_disturbances
 from d4orm_env.disturbances.controls import ControlNoise
-from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbances, at_work, checked_disturbances
 from d4orm_env.disturbances.perception import RayNoise
 from d4orm_env.envs.inputs import noise_std
 from d4orm_env.envs.rewards import RewardFunction

@@ -10,7 +10,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, frozen_array, whole_number
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.chosen import total_slack
+from d4orm_env.disturbances.disturbance import total_slack
 from d4orm_env.engine.types import OWN_ARRAYS
 from d4orm_env.envs.inputs import checked_cycles
 from d4orm_env.envs.joint_state import state_bounds

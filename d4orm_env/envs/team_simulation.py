@@ -11,8 +11,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.footprint_gaps import touching
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed
-from d4orm_env.disturbances.recorded_events import marks_of
+from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, marks_of
 from d4orm_env.envs.joint_state import JointState, join_state
 from d4orm_env.envs.rewards import no_terms
 from d4orm_env.envs.setup import EnvSetup

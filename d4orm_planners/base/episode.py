@@ -18,7 +18,7 @@ from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.disturbances.recorded_events import marks_of
+from d4orm_env.disturbances.disturbance import marks_of
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos

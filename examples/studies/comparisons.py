@@ -51,7 +51,7 @@ class Block(NamedTuple):
 
     def has(self, trial: Trial) -> bool:
         """Check whether a trial is of this team."""
-        same = (trial.scenario, trial.num_robots) == (self.scenario, self.num_robots)
+        same = (trial.scenario.partition(" (")[0], trial.num_robots) == (self.scenario, self.num_robots)
         return same and self.model in (None, trial.model)
 
 
@@ -92,10 +92,12 @@ class Comparison(NamedTuple):
         if self.quick_robots is None:
             return [blocks[0]._replace(seeds=1)]
         changed = {"num_robots": self.quick_robots, "seeds": 1}
-        return [
-            block._replace(settings={label: own | self.quick for label, own in block.settings.items()}, **changed)
-            for block in blocks
-        ]
+        small: list[Block] = []
+        for block in blocks:
+            settings = {label: own | self.quick for label, own in block.settings.items()}
+            if (less := block._replace(settings=settings, **changed)) not in small:  # teams may have differed in size
+                small.append(less)
+        return small
 
 
 def credits_and_penalties(budget: int) -> list[Block]:

@@ -23,13 +23,11 @@ import tempfile
 from pathlib import Path
 
 from examples.outputs import argument_parser, count, require, save_figure, save_gif, save_table
-from examples.studies.onboard.crew import RobotProcesses, free_endpoints
-from examples.studies.onboard.log import COLUMNS, Log
 from examples.studies.onboard.mission import TICK, Mission
-from examples.studies.onboard.picture import draw
-from examples.studies.onboard.results import Row, film, robot_rows, run_row, timeline
+from examples.studies.onboard.results import Row, draw, film, robot_rows, run_row, timeline
 from examples.studies.onboard.robot import Robot
-from examples.studies.onboard.world import World
+from examples.studies.onboard.thinking import COLUMNS, Log
+from examples.studies.onboard.world import RobotProcesses, World, free_endpoints
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.d_d4orm.transport import LocalNetwork
