@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, shown
-from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import DisturbanceEvents
 from d4orm_env.disturbances.draws import Draws
 from d4orm_env.dynamics.robot_model import TimeStep
 

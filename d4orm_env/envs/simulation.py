@@ -16,14 +16,12 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.engine.types import LOOK, RESET, SKIP, STEP, ObservationInputs, WorldBatch, WorldEngine
-from d4orm_env.envs.episode_metrics import EpisodeCounts, episode_metrics
 from d4orm_env.envs.inputs import checked_states
 from d4orm_env.envs.lifelong import assign_goals, reached_goals
-from d4orm_env.envs.range_sensors import sense_ranges
 from d4orm_env.envs.rewards import RewardInput, along_paths, compute_rewards, no_terms
 from d4orm_env.envs.setup import EnvSetup
-from d4orm_env.envs.world_paths import WorldPaths
-from d4orm_env.envs.world_problems import WorldProblems
+from d4orm_env.envs.team_step import EpisodeCounts, episode_metrics
+from d4orm_env.envs.world_problems import WorldPaths, WorldProblems, sense_ranges
 from d4orm_env.paths.shortest_paths import observe_paths
 
 _READ_BEFORE = ("state", "distance", "docked", "total_reward")
@@ -151,7 +149,7 @@ class Simulation:
         self._observe(orders, out)
 
     def episode_metrics(self) -> dict[str, Floats]:
-        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.episode_metrics.episode_metrics`."""
+        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.team_step.episode_metrics`."""
         worlds = self.worlds
         arrival = None if self.setup.lifelong else np.where(worlds.arrival > 0, worlds.arrival, np.inf)
         goals = self._goals_reached if self.setup.lifelong else worlds.docked

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.lines import Line2D
 
-from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import DisturbanceEvents
 from d4orm_env.render.panels import BODY, INK, PUSH, Array, Axes2D
 
 _ARROW_SECONDS = 1.0

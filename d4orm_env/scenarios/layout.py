@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import as_float32, frozen_array, shown
 from d4orm_env.core.portable import arctan2
-from d4orm_env.core.problem import MAX_HORIZON, Problem
-from d4orm_env.core.problem_checks import check_places
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import MAX_HORIZON, check_places
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.placement import Area, Points, with_random_obstacles

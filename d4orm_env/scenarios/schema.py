@@ -13,7 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from d4orm_env import footprints
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.portable import arctan2
-from d4orm_env.core.problem import Arrival, Problem
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import Arrival
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model

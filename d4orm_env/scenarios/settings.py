@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import positive_number, whole_number
-from d4orm_env.core.problem import MAX_HORIZON, Arrival, check_arrival
+from d4orm_env.core.problem_checks import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import get_model
 

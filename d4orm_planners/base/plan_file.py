@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import replaced_when_done, require_file
+from d4orm_env.core.files import ArrayArchive, replaced_when_done, require_file
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem

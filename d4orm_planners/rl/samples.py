@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import FloatArray, as_float32
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_planners.base.policy import Policy, robot_indices
 from d4orm_planners.rl.features import Features
 

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
 from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
