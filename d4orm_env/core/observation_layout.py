@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, pairwise
 from typing import NamedTuple, TypeAlias
 
@@ -76,14 +76,9 @@ class ObstacleParts(NamedTuple):
 
 
 class PathParts(NamedTuple):
-    """Slices of the part on its shortest path, from the first component of that on.
+    """Slices of the part on its shortest path, from the first component of that on."""
 
-    Attributes:
-        direction: ``d`` unit vector along it; zero at the goal.
-        length: [m].
-    """
-
-    direction: slice
+    direction: slice  # d, unit vector along it; zero at the goal
     length: slice
 
 
@@ -221,25 +216,16 @@ class ObservationLayout(ObservationSlices):
         seen of it, and a ray that meets nothing reads ``ray_range`` [m].
 
         Raises:
-            ValueError: If a number is negative or not whole, a range is not positive, or the robots cannot have rays or
-                a line of sight.
+            ValueError: If a number makes no sense, or the robots cannot have rays or a line of sight.
         """
         sizes = problem.dimension, num_neighbors, num_obstacles
         slices = ObservationSlices(*sizes, num_rays=num_rays, observed_path=observed_path)
         _check_sight(problem, num_rays, line_of_sight)
-        low, high = _bounds(problem, slices, slack, positive_number(ray_range, "ray_range", most=LARGEST))
-        limit = communication_range
-        return cls(
-            *sizes,
-            low,
-            high,
-            num_rays=num_rays,
-            observed_path=observed_path,
-            communication_range=np.inf
-            if limit is None
-            else positive_number(limit, "communication_range", most=LARGEST),
-            line_of_sight=line_of_sight,
-        )
+        number = partial(positive_number, most=LARGEST)
+        low, high = _bounds(problem, slices, slack, number(ray_range, "ray_range"))
+        limit = np.inf if communication_range is None else number(communication_range, "communication_range")
+        own = {"num_rays": num_rays, "observed_path": observed_path, "line_of_sight": line_of_sight}
+        return cls(*sizes, low, high, communication_range=limit, **own)
 
     @property
     def ray_range(self) -> float:
@@ -268,26 +254,29 @@ def _check_sight(problem: Problem, num_rays: int, line_of_sight: bool) -> None:
 
 def _bounds(problem: Problem, slices: ObservationSlices, slack: BoundsSlack, ray_range: float) -> FloatArray:
     """``(2, D)`` lower and upper bounds that no motion of the robots can leave, read-only."""
-    team, reach = problem.team, _reach(problem, slack)
-    radius, speed, acceleration = map(_largest, (team.radius, team.max_speed, team.max_acceleration))
+    team, d = problem.team, problem.dimension
+    radius, speed, acceleration = (float(x.max()) for x in (team.radius, team.max_speed, team.max_acceleration))
+    # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
+    # step a robot may exceed the speed limit, which is applied at its end.
+    drive = (speed + acceleration * problem.dt / 2 + slack.drift) * problem.duration + slack.distance
+    widest = np.ptp(np.concatenate([problem.start[:, :d], problem.goal, *problem.world.extremes()]), axis=0)
+    # Farthest that anything may be from a robot.
+    reach = float(np.sqrt(np.square(widest).sum())) + 2 * drive + 2 * radius
     top = speed + slack.speed
     own = _ends(
         slices.own, velocity=top, heading=1, speed=top, goal=reach, time_left=1, arrived=1, radius=radius,
         max_speed=speed, max_acceleration=acceleration,
     )  # fmt: skip
-    widest = max(radius, slack.radius)
-    neighbor = _ends(slices.neighbor, present=1, position=reach, velocity=2 * top, radius=widest)
+    neighbor = _ends(
+        slices.neighbor, present=1, position=reach, velocity=2 * top, radius=max(radius, slack.radius)
+    )  # fmt: skip
     obstacle = _ends(slices.obstacle, present=1, position=reach, gap=reach)
     rays = np.tile(np.array([[0], [ray_range]], np.float32), slices.num_rays)
     path = _ends(slices.path, direction=1, length=WINDING * reach)
     parts = [own, *[neighbor] * slices.num_neighbors, *[obstacle] * slices.num_obstacles, rays]
-    bounds: FloatArray = np.concatenate([*parts, *[path] * slices.observed_path], axis=1)
+    bounds = np.concatenate([*parts, *[path] * slices.observed_path], axis=1)
     bounds.setflags(write=False)
     return bounds
-
-
-def _largest(values: FloatArray) -> float:
-    return float(values.max())
 
 
 def _ends(parts: Parts, **largest: float) -> FloatArray:
@@ -309,28 +298,3 @@ def _component_names(parts: Parts) -> Iterator[str]:
         width = part.stop - part.start
         suffixes = ("_cos", "_sin") if name == "heading" else ("",) if width == 1 else ("_x", "_y", "_z")[:width]
         yield from (name + suffix for suffix in suffixes)
-
-
-def _reach(problem: Problem, slack: BoundsSlack) -> float:
-    """Farthest that anything may be from a robot [m]."""
-    team, places = problem.team, [problem.start[:, : problem.dimension], problem.goal, *_corners(problem)]
-    speed, acceleration = _largest(team.max_speed), _largest(team.max_acceleration)
-    # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
-    # step a robot may exceed the speed limit, which is applied at its end.
-    drive = (speed + acceleration * problem.dt / 2 + slack.drift) * problem.duration + slack.distance
-    return (
-        float(np.sqrt(np.square(np.ptp(np.concatenate(places), axis=0)).sum())) + 2 * drive + 2 * _largest(team.radius)
-    )
-
-
-def _corners(problem: Problem) -> list[FloatArray]:
-    """Extreme points of the world's obstacles and bounds, to bound distances to them."""
-    world, d = problem.world, problem.dimension
-    corners = [world.balls[:, :d] + sign * world.balls[:, d:] for sign in (-1, 1)]
-    corners += [world.boxes[:, :d], world.boxes[:, d:], *world.polygons]
-    if len(world.cylinders):
-        xy = np.concatenate([world.cylinders[:, :2] + sign * world.cylinders[:, 2:] for sign in (-1, 1)])
-        corners.append(np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
-    if world.lower is not None:
-        corners.append(world.bounds)
-    return corners

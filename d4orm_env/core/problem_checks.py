@@ -132,10 +132,8 @@ def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
 def check_tolerances(tolerance: FloatArray) -> None:
     """Refuse tolerances of goal headings ``(K,)`` that float32 does not resolve, or that allow any."""
     for robot in np.flatnonzero((tolerance < LEAST_TOLERANCE) | (tolerance > np.float32(np.pi)))[:1].tolist():
-        raise ValueError(
-            f"goal_heading_tolerance of robot_{robot} is {tolerance[robot]:g} rad; it must be from {LEAST_TOLERANCE:g} "
-            f"to pi"
-        )
+        value = f"goal_heading_tolerance of robot_{robot} is {tolerance[robot]:g} rad"
+        raise ValueError(f"{value}; it must be from {LEAST_TOLERANCE:g} to pi")
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
