@@ -56,7 +56,7 @@ class Scene(NamedTuple):
 
     def of(self, worlds: NDArray[np.intp]) -> Scene:
         """The same of some of the worlds."""
-        return Scene(self.problem, self.max_cycles, *(part[worlds] for part in self[2:]))
+        return Scene._make([*self[:2], *(part[worlds] for part in self[2:])])
 
     @property
     def standing(self) -> BoolArray:

@@ -136,22 +136,14 @@ class EnvSetup:
         return self._pool[int(random.integers(self._num_instances))]
 
     def draw(self, random: np.random.Generator) -> Problem:
-        """A new instance of the scenario.
-
-        Raises:
-            ValueError: If the spaces that were made for the first instance do not hold it, or it cannot share a batch
-                with that.
-        """
+        """A new instance of the scenario, refused if the spaces or the batch of the first one do not hold it."""
         assert self._redraw is not None
         drawn, old, region = self._redraw(int(random.integers(2**31))), self.problem, self.region
         points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
-        if (
-            drawn.team.models != old.team.models
-            or drawn.team.shapes != old.team.shapes
-            or (drawn.team.control_limits != old.team.control_limits).any()
-            or (points < region[0]).any()
-            or (points > region[1]).any()
-        ):
+        team, former = drawn.team, old.team
+        same = (team.models, team.shapes) == (former.models, former.shapes)
+        same = same and np.array_equal(team.control_limits, former.control_limits)
+        if not same or (points < region[0]).any() or (points > region[1]).any():
             raise ValueError(
                 f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
                 f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes places only"

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Floats
-from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
@@ -56,6 +55,22 @@ class WorldProblems:
         worlds.start[world], worlds.goal[world] = problem.start, problem.goal
         worlds.inverse[world] = problem.arrays.inverse_initial_distance
 
+    def sense_ranges(
+        self, engine: WorldEngine, batch: WorldBatch, out: FloatArray, worlds: NDArray[np.intp] | None = None
+    ) -> None:
+        """Fill the rays of the observations ``out`` ``(b, K, D)`` of some worlds, or of all, as these truly are."""
+        layout = self._setup.layout
+        if not layout.num_rays:
+            return
+        rows = slice(None) if worlds is None else worlds
+        state, bodies = batch.state[rows], batch.bodies[rows]
+        if self.alike:
+            engine.cast_rays(self.true[0], layout, state, bodies, out)
+            return
+        for row, world in enumerate(range(len(out)) if worlds is None else worlds):
+            one = slice(row, row + 1)
+            engine.cast_rays(self.true[world], layout, state[one], bodies[one], out[one])
+
     def _arrays_of(self, problem: Problem) -> tuple[ProblemArrays, ProblemArrays]:
         seen = problem.arrays_to_observe(self._setup.layout.num_obstacles)
         true = seen
@@ -100,24 +115,3 @@ class WorldPaths:
         if self._one_world:
             return self._problems[0].shortest_paths.ahead(positions)
         return ahead_in_each([self._problems[world].shortest_paths for world in worlds], positions)
-
-
-def sense_ranges(
-    engine: WorldEngine,
-    layout: ObservationLayout,
-    problems: WorldProblems,
-    batch: WorldBatch,
-    out: FloatArray,
-    worlds: NDArray[np.intp] | None = None,
-) -> None:
-    """Fill the rays of the observations ``out`` ``(b, K, D)`` of some worlds, or of all, as these truly are."""
-    if not layout.num_rays:
-        return
-    rows = slice(None) if worlds is None else worlds
-    state, bodies = batch.state[rows], batch.bodies[rows]
-    if problems.alike:
-        engine.cast_rays(problems.true[0], layout, state, bodies, out)
-        return
-    for row, world in enumerate(range(len(out)) if worlds is None else worlds):
-        one = slice(row, row + 1)
-        engine.cast_rays(problems.true[world], layout, state[one], bodies[one], out[one])

@@ -27,16 +27,6 @@ SPACING = 6
 RESTARTS, CANDIDATES = 20, 1000
 
 
-def paper_circle(settings: Settings, *, diameter: float = 5.0) -> Problem:
-    """The paper's circle of 5 m with antipodal goals: scenario ``circle`` with 100 steps, however slow the robots.
-
-    Args:
-        settings: The common arguments.
-        diameter: Diameter of the circle [m].
-    """
-    return circle(settings, diameter=diameter)
-
-
 def paper_sphere(settings: Settings, *, diameter: float = 5.0) -> Problem:
     """The paper's 3D scenario: robots of radius 0.3 m on a Fibonacci sphere of 5 m, goals at the antipodes.
 

@@ -53,32 +53,34 @@ _in_space = partial(BuiltIn, model="holonomic3d")
 # Instances of others, who let robots stop dead at their goals.
 _paper = partial(BuiltIn, horizon=100, goal_speed=np.inf)
 _amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05, goal_speed=np.inf)
-_mmd = partial(BuiltIn, draws=True, goal_speed=np.inf)
+_drawn = partial(BuiltIn, draws=True)
 
 for _scenario in (
     BuiltIn(generators.circle),
     _in_space(generators.sphere),
-    BuiltIn(generators.random, draws=True),
+    _drawn(generators.random),
     BuiltIn(generators.four_obstacles),
     BuiltIn(generators.heterogeneous, model=None, max_acceleration=None),
     BuiltIn(generators.swap),
-    *(_amswarm(getattr(generators, f"amswarm_{number}")) for number in range(1, 6)),
-    _paper(paper.paper_circle),
+    *(
+        _amswarm(partial(generators.amswarm, _centres), _name, f"AMSwarm environment {_name[-1]}: {_about}.")
+        for _name, (_about, _centres) in generators.AMSWARM.items()
+    ),
+    _paper(
+        generators.circle, "paper_circle",
+        "The paper's circle of 5 m with antipodal goals: scenario ``circle`` with 100 steps, however slow the robots.",
+    ),
     _paper(paper.paper_sphere, model="holonomic3d", radius=0.3),
     _paper(paper.paper_random, draws=True),
     _paper(paper.paper_heterogeneous, model=None, max_acceleration=None),
     _paper(paper.paper_obstacles, num_obstacles=4),
-    BuiltIn(wall_grid.rooms, draws=True),
-    BuiltIn(wall_grid.maze, draws=True),
-    BuiltIn(walled.warehouse, draws=True),
-    BuiltIn(walled.forest, draws=True),
-    BuiltIn(walled.corridor, draws=True),
-    BuiltIn(walled.doorway, draws=True),
-    _mmd(walled.mmd_conveyor),
-    _mmd(walled.mmd_highways),
-    _mmd(walled.mmd_drop_region),
+    *map(_drawn, (wall_grid.rooms, wall_grid.maze, walled.warehouse, walled.forest, walled.corridor, walled.doorway)),
+    *(
+        _drawn(partial(walled.mmd_map, _boxes), _name, _about, goal_speed=np.inf)
+        for _name, (_about, _boxes) in walled.MMD_MAPS.items()
+    ),
     BuiltIn(maps.map),
-):
+):  # fmt: skip
     register_scenario(_scenario.__name__, _scenario)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 
 import numpy as np
@@ -172,28 +172,25 @@ Box = tuple[float, float, float, float]
 """Centre and sides in a map from -1 to 1."""
 
 
-def mmd_conveyor(settings: Settings, *, side: float | None = None) -> Problem:
-    """MMD's map with two conveyors: corridors for one robot between three walls in the middle.
-
-    Args:
-        settings: The common arguments.
-        side: Of the map [m]; by default 6 m, and in proportion to the number of robots' root for more than 20.
-    """
-    return _mmd_map(settings, side, [(0, 0, 0.8, 0.1), (0, 0.35, 1, 0.1), (0, -0.35, 1, 0.1)])
-
-
-def mmd_highways(settings: Settings, *, side: float | None = None) -> Problem:
-    """MMD's map with highways: roads around nine blocks, three by three; arguments of :func:`mmd_conveyor`."""
-    rows = [(-0.875, 0.25), (0.0, 0.5), (0.875, 0.25)]
-    return _mmd_map(settings, side, [(x, y, width, height) for (x, width), (y, height) in product(rows, rows)])
-
-
-def mmd_drop_region(settings: Settings, *, side: float | None = None) -> Problem:
-    """MMD's map with drop regions: four square blocks with aisles around; arguments of :func:`mmd_conveyor`."""
-    return _mmd_map(settings, side, [(x, y, 0.4, 0.4) for x, y in product((-0.4, 0.4), repeat=2)])
+_ROADS = ((-0.875, 0.25), (0.0, 0.5), (0.875, 0.25))
+MMD_MAPS: Mapping[str, tuple[str, Sequence[Box]]] = {
+    "mmd_conveyor": (
+        "MMD's map with two conveyors: corridors for one robot between three walls in the middle.",
+        [(0, 0, 0.8, 0.1), (0, 0.35, 1, 0.1), (0, -0.35, 1, 0.1)],
+    ),
+    "mmd_highways": (
+        "MMD's map with highways: roads around nine blocks, three by three.",
+        [(x, y, width, height) for (x, width), (y, height) in product(_ROADS, _ROADS)],
+    ),
+    "mmd_drop_region": (
+        "MMD's map with drop regions: four square blocks with aisles between and around them.",
+        [(x, y, 0.4, 0.4) for x, y in product((-0.4, 0.4), repeat=2)],
+    ),
+}
+"""What describes each map, and its boxes; see :func:`mmd_map`."""
 
 
-def _mmd_map(settings: Settings, side: float | None, boxes: Sequence[Box]) -> Problem:
+def mmd_map(boxes: Sequence[Box], settings: Settings, *, side: float | None = None) -> Problem:
     """A map of MMD, three times as large, which makes its robots of 0.05 into ours of 0.15 m.
 
     Boxes are those of its authors' published code (yoraish/mmd, 2024). There starts and goals are uniform and keep 0.16
@@ -201,6 +198,11 @@ def _mmd_map(settings: Settings, side: float | None, boxes: Sequence[Box]) -> Pr
     robots of the publication learn there besides, lanes, one-way conveyors and stops, no problem here asks for.
     Source: Y. Shaoul, I. Mishani, S. Vats, J. Li and M. Likhachev, *Multi-Robot Motion Planning with Diffusion Models*,
     ICLR 2025.
+
+    Args:
+        boxes: The map's.
+        settings: The common arguments.
+        side: Of the map [m]; by default 6 m, and in proportion to the number of robots' root for more than 20.
     """
     require_plane(settings)
     if side is None:
