@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import accumulate, pairwise
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -224,7 +224,7 @@ class ObservationLayout(ObservationSlices):
         number = partial(positive_number, most=LARGEST)
         low, high = _bounds(problem, slices, slack, number(ray_range, "ray_range"))
         limit = np.inf if communication_range is None else number(communication_range, "communication_range")
-        own = {"num_rays": num_rays, "observed_path": observed_path, "line_of_sight": line_of_sight}
+        own: dict[str, Any] = {"num_rays": num_rays, "observed_path": observed_path, "line_of_sight": line_of_sight}
         return cls(*sizes, low, high, communication_range=limit, **own)
 
     @property

@@ -29,7 +29,7 @@ SHARED = ("comparisons",)
 NAMES = tuple(sorted({*COMPARISONS, "paper", *(path.stem for path in FOLDER.glob("[a-z]*.py"))} - {*SHARED}))
 WITH_TRIALS = (
     "ablation", "amswarm_gaps", "contact_penalty", "credit_by_update", "disturbance_study", "fewer_samples",
-    "gradient_dilution", "head_to_head", "imitate_expert", "lifelong", "multimodality", "multimodality_team",
+    "gradient_dilution", "head_to_head", "imitate_expert", "lifelong", "multimodality",
     "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners", "tuned_rivals", "warm_start",
     "zero_shot",
 )  # fmt: skip
@@ -52,6 +52,7 @@ def make_all() -> None:
     """Make all tables and figures."""
     out = argument_parser(__doc__).parse_args().out
     run("one_dimension", "--out", out)
+    run("multimodality", "--team", 8, "--trials", DATA / "multimodality_team.parquet", "--out", out)
     run("tune_rivals", "--trials", DATA / "tuning.parquet", "--out", out)
     for study in WITH_TRIALS:
         run(study, "--trials", DATA / f"{study}.parquet", "--out", out)

@@ -476,7 +476,7 @@ def test_d4orm_finds_several_kinds_of_solution_and_no_robot_weaves(tmp_path: Pat
 def test_planners_find_several_kinds_of_solution_for_a_team(tmp_path: Path) -> None:
     pytest.importorskip("casadi")
     out = tmp_path / "out"
-    completed("multimodality_team", out)
+    completed("multimodality", out, "--team", "8")
     rows = {row["planner"]: row for row in table(out / "multimodality_team.csv")}
     assert list(rows) == ["d4orm", "d4orm, preset paper", "ipopt"]
     assert rows["d4orm"]["solved"] == "4 of 4", "every seed solves so easy a problem"
