@@ -59,7 +59,7 @@ def run(figure: Figure, out: Path, seeds: int) -> list[Group]:
 
 @pytest.fixture
 def paper(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Runs ``python -m examples.studies.paper`` inside ``tmp_path``; gives exit status, output and errors."""
+    """Runs ``python -m examples.studies paper`` inside ``tmp_path``; gives exit status, output and errors."""
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments: str) -> tuple[int, str, str]:
