@@ -236,10 +236,8 @@ def check_places(
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
         gaps[robot] = world_gap(world, team.footprint[robot], poses[robot])
     for robot in np.flatnonzero(gaps <= 0):
-        raise ValueError(
-            f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an "
-            f"obstacle or outside the bounds ({_size(team, int(robot))}); move it, or change the world"
-        )
+        where = f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an obstacle"
+        raise ValueError(f"{where} or outside the bounds ({_size(team, int(robot))}); move it, or change the world")
     first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
