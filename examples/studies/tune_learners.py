@@ -18,10 +18,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from examples.outputs import count, save_table, study_parser, study_rows
 from examples.studies.training_seeds import LEARNERS, QUICK
-from examples.studies.tune_rivals import FIRST_SEED, KEPT, Between, OneOf, Settings
+from examples.studies.tune_rivals import FIRST_SEED, KEPT, Between, OneOf, Settings, candidates
 
 from d4orm_planners.rl.training import TrainingSettings, train
 
@@ -41,13 +40,6 @@ SPACES: Mapping[str, Mapping[str, Between | OneOf]] = {
 }  # fmt: skip
 
 
-def candidates(learner: str, number: int) -> list[Settings]:
-    """Nothing but what the learner has, and settings drawn from its space."""
-    random = np.random.default_rng([FIRST_SEED, *learner.encode()])
-    drawn = [{name: part.draw(random) for name, part in SPACES[learner].items()} for _ in range(number - 1)]
-    return [{}, *drawn]
-
-
 def with_settings(training: TrainingSettings, settings: Settings) -> TrainingSettings:
     """A training with other settings of its learner."""
     others = {name: value for name, value in settings.items() if name != "learning_rate"}
@@ -60,7 +52,7 @@ def with_settings(training: TrainingSettings, settings: Settings) -> TrainingSet
 
 def tune(learner: str, number: int, quick: bool, out: Path) -> list[dict[str, Any]]:
     """A row per training."""
-    training, chosen, rows = TRAININGS[learner], dict(enumerate(candidates(learner, number))), []
+    training, chosen, rows = TRAININGS[learner], dict(enumerate(candidates(learner, number, SPACES[learner]))), []
     if quick:
         training = replace(training, **{**QUICK, "stages": 1}, mixture=("random 2", "circle 2"))
     for turn, longer in enumerate(LONGER):

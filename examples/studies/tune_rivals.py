@@ -71,10 +71,10 @@ SPACES: Mapping[str, Mapping[str, Between | OneOf]] = {
 }  # fmt: skip
 
 
-def candidates(method: str, number: int) -> list[Settings]:
-    """The preset as it is, and settings drawn from the method's space."""
+def candidates(method: str, number: int, space: Mapping[str, Between | OneOf]) -> list[Settings]:
+    """Nothing but what the method has, and settings drawn from a space of its own."""
     random = np.random.default_rng([FIRST_SEED, *method.encode()])
-    drawn = [{name: part.draw(random) for name, part in SPACES[method].items()} for _ in range(number - 1)]
+    drawn = [{name: part.draw(random) for name, part in space.items()} for _ in range(number - 1)]
     return [{}, *drawn]
 
 
@@ -102,7 +102,7 @@ def run(method: str, chosen: Sequence[Settings], seeds: int, budget: int, out: P
 
 def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> list[Trial]:
     """Run all rounds of a method; the trials of all settings, each of its last round, which has those before."""
-    chosen = candidates(method, number)
+    chosen = candidates(method, number, SPACES[method])
     trials: list[Trial] = []
     for turn in range(ROUNDS):
         found = run(method, chosen, seeds << turn, budget, out)
