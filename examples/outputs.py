@@ -24,7 +24,7 @@ from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_st
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.evaluation.summary import mean_interval, wilson_interval
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
@@ -119,6 +119,14 @@ def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is
     solved = sum(map(counts, trials))
     lower, upper = wilson_interval(solved, len(trials))
     return {"solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}"}
+
+
+def success_of_seeds(successes: Sequence[float], column: str = "success") -> dict[str, str]:
+    """Mean success of several seeds [%], its 95% interval (Student's t), and the least and the most."""
+    mean, lower, upper = mean_interval(successes)
+    interval = "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%"
+    ends = f"{min(successes):.0f}%, {max(successes):.0f}%"
+    return {column: f"{mean:.0f}%", "95% interval": interval, "least, most": ends}
 
 
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:

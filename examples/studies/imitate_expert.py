@@ -19,11 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import require, save_table, study_parser, study_rows
+from examples.outputs import require, save_table, study_parser, study_rows, success_of_seeds
 
 require("rl", "stable_baselines3", "tensorboard")
 
-from d4orm_planners.evaluation.summary import mean_interval
 from d4orm_planners.rl.curve import Evaluation
 from d4orm_planners.rl.imitation import ImitationSettings, imitate
 from d4orm_planners.rl.training import TrainingSettings, train
@@ -84,15 +83,12 @@ def summary(rows: Rows) -> list[dict[str, object]]:
 
 def _point(way: str, point: Rows) -> dict[str, object]:
     ends = [100 * row["success"] for row in point]
-    success, lower, upper = mean_interval(ends)
     errors = [row["imitation_error"] for row in point if row["imitation_error"] is not None]
     return {
         "learned by": way,
         "moments or robot-steps": f"{np.mean([row['steps'] for row in point]):,.0f}",
         "seeds": len(point),
-        "success": f"{success:.0f}%",
-        "95% interval": "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%",
-        "least, most": f"{min(ends):.0f}%, {max(ends):.0f}%",
+        **success_of_seeds(ends),
         "travel time [s]": f"{np.mean([row['travel_time'] for row in point]):.2f}",
         "imitation error": f"{np.mean(errors):.2f}" if errors else "",
     }

@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from examples.outputs import COLOURS, argument_parser, count, plt, require, save_figure, save_table
+from examples.outputs import COLOURS, argument_parser, count, plt, require, save_figure, save_table, success_of_seeds
 
 require("rl", "stable_baselines3", "tensorboard")
 
@@ -94,15 +94,12 @@ def summary(rows: Rows) -> list[dict[str, object]]:
     for learner, stages in by_learner(rows).items():
         last, every = stages[max(stages)], [row for stage in stages.values() for row in stage]
         ends = [100 * float(row["success"]) for row in last]
-        success, lower, upper = mean_interval(ends)
         minutes = sum(float(row["seconds"]) for row in every) / len(last) / 60
         row = {
             "learner": learner,
             "seeds": len(last),
             "robot-steps": f"{max(stages) / 1e6:.1f} million",
-            "success in the end": f"{success:.0f}%",
-            "95% interval": "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%",
-            "least, most": f"{min(ends):.0f}%, {max(ends):.0f}%",
+            **success_of_seeds(ends, "success in the end"),
             "travel time [s]": f"{np.mean([float(one['travel_time']) for one in last]):.2f}",
             "minutes each": f"{minutes:.0f}",
             "environment's share": f"{np.mean([float(one['env_share']) for one in every]):.0%}",
