@@ -72,7 +72,7 @@ bench-compare: $(CORE_STAMP) ## Print what got slower since a commit: make bench
 	$(BIN)/python tests/release/bench_compare.py $(BASE) $(BENCH_ARGS)
 
 results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in examples/studies/data/
-	$(BIN)/python -m examples.studies --out docs/tables
+	$(BIN)/python -m examples.studies all --out docs/tables
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .

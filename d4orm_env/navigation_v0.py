@@ -17,11 +17,10 @@ from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
-from d4orm_env.envs.base_env import BaseEnv
+from d4orm_env.envs.base_env import RENDER_MODES, BaseEnv
 from d4orm_env.envs.inputs import MAX_ACTION, check_options, checked_cycles, usable
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.team_step import AgentInfos, TeamStep, agent_infos
-from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.scenarios.problems import ScenarioLike
 
 __all__ = ["env", "parallel_env", "raw_env"]

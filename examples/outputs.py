@@ -24,7 +24,7 @@ from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_st
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import wilson_interval
+from d4orm_planners.evaluation.summary import mean_interval, wilson_interval
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
@@ -114,6 +114,21 @@ def tell(what: str, done: int, total: int) -> None:
     print(f"{done} of {total}: {what}", flush=True)
 
 
+def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:
+    """How many trials are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
+    solved = sum(map(counts, trials))
+    lower, upper = wilson_interval(solved, len(trials))
+    return {"solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}"}
+
+
+def success_of_seeds(successes: Sequence[float], column: str = "success") -> dict[str, str]:
+    """Mean success of several seeds [%], its 95% interval (Student's t), and the least and the most."""
+    mean, lower, upper = mean_interval(successes)
+    interval = "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%"
+    ends = f"{min(successes):.0f}%, {max(successes):.0f}%"
+    return {column: f"{mean:.0f}%", "95% interval": interval, "least, most": ends}
+
+
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
     """A row for each label of ``groups``, in ``column``: success, denoising steps, travel time, and tests.
 
@@ -122,13 +137,10 @@ def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], refe
     """
     rows = []
     for label, trials in groups.items():
-        solved = [trial for trial in trials if is_solved(trial)]
-        lower, upper = wilson_interval(len(solved), len(trials))
-        travel = [trial.travel_time for trial in solved if trial.travel_time is not None]
+        travel = [trial.travel_time for trial in trials if is_solved(trial) and trial.travel_time is not None]
         test = paired(trials, groups[reference], penalised_steps, is_solved)
         rows.append(
-            {"team": team, column: label, "solved": f"{len(solved)} of {len(trials)}",
-             "interval": f"{lower:.0%} to {upper:.0%}",
+            {"team": team, column: label, **solved_columns(trials),
              "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
              "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
              "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, pairwise
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,6 +18,7 @@ __all__ = ["BoundsSlack", "ObservationLayout"]
 
 WINDING = 10
 """The longest path that an observation tells, over the farthest that anything may be from a robot."""
+_NEVER_NEGATIVE = ("time_left", "arrived", "present", "length")
 
 
 class BoundsSlack(NamedTuple):
@@ -75,14 +76,9 @@ class ObstacleParts(NamedTuple):
 
 
 class PathParts(NamedTuple):
-    """Slices of the part on its shortest path, from the first component of that on.
+    """Slices of the part on its shortest path, from the first component of that on."""
 
-    Attributes:
-        direction: ``d`` unit vector along it; zero at the goal.
-        length: [m].
-    """
-
-    direction: slice
+    direction: slice  # d, unit vector along it; zero at the goal
     length: slice
 
 
@@ -109,9 +105,8 @@ class ObservationSlices:
     observed_path: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        whole_number(self.num_neighbors, "num_neighbors", 0)
-        whole_number(self.num_obstacles, "num_obstacles", 0)
-        whole_number(self.num_rays, "num_rays", 0)
+        for name in ("num_neighbors", "num_obstacles", "num_rays"):
+            whole_number(getattr(self, name), name, 0)
 
     @cached_property
     def own(self) -> OwnParts:
@@ -217,67 +212,20 @@ class ObservationLayout(ObservationSlices):
     ) -> ObservationLayout:
         """The layout for a problem, with bounds that no motion of its robots can leave.
 
-        Args:
-            problem: The problem.
-            num_neighbors: Neighbours listed.
-            num_obstacles: Obstacles listed.
-            observed_path: Whether the path is there.
-            slack: Slack beyond that, for what disturbs the motion or what is seen of it.
-            num_rays: Rays of the range sensor.
-            ray_range: What a ray that meets nothing reads [m].
-            communication_range: Distance of centres beyond which neighbours are not observed [m]; ``None`` for none.
-            line_of_sight: Whether those behind obstacles are not observed either.
+        Arguments are as the attributes. There is ``slack`` beyond the bounds for what disturbs the motion or what is
+        seen of it, and a ray that meets nothing reads ``ray_range`` [m].
 
         Raises:
-            ValueError: If a number is negative or not whole, a range is not positive, or the robots cannot have rays or
-                a line of sight.
+            ValueError: If a number makes no sense, or the robots cannot have rays or a line of sight.
         """
         sizes = problem.dimension, num_neighbors, num_obstacles
         slices = ObservationSlices(*sizes, num_rays=num_rays, observed_path=observed_path)
-        if line_of_sight and problem.dimension != 2:
-            raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
-        if num_rays:
-            _check_rays(problem)
-        team, reach = problem.team, _reach(problem, slack)
-        radius, speed, acceleration = (
-            float(values.max()) for values in (team.radius, team.max_speed, team.max_acceleration)
-        )
-        high = np.empty(slices.size, np.float32)
-        top_speed, widest = speed + slack.speed, max(radius, slack.radius)
-        own = {
-            "velocity": top_speed,
-            "heading": 1,
-            "speed": top_speed,
-            "goal": reach,
-            "time_left": 1,
-            "arrived": 1,
-        }
-        own |= {"radius": radius, "max_speed": speed, "max_acceleration": acceleration}
-        neighbor = {"present": 1, "position": reach, "velocity": 2 * top_speed, "radius": widest}
-        _fill(high, slices.own, own)
-        _fill(slices.neighbors(high), slices.neighbor, neighbor)
-        _fill(slices.obstacles(high), slices.obstacle, {"present": 1, "position": reach, "gap": reach})
-        if observed_path:
-            _fill(slices.paths(high), slices.path, {"direction": 1, "length": WINDING * reach})
-        high[slices.rays] = positive_number(ray_range, "ray_range", most=LARGEST)
-        low = -high
-        low[slices.rays] = 0
-        _fill(low, slices.own, {"time_left": 0, "arrived": 0})
-        _fill(slices.neighbors(low), slices.neighbor, {"present": 0})
-        _fill(slices.obstacles(low), slices.obstacle, {"present": 0})
-        if observed_path:
-            _fill(slices.paths(low), slices.path, {"length": 0})
-        for bound in (low, high):
-            bound.setflags(write=False)
-        return cls(
-            *sizes,
-            low,
-            high,
-            num_rays=num_rays,
-            observed_path=observed_path,
-            communication_range=_checked_range(communication_range),
-            line_of_sight=line_of_sight,
-        )
+        _check_sight(problem, num_rays, line_of_sight)
+        number = partial(positive_number, most=LARGEST)
+        low, high = _bounds(problem, slices, slack, number(ray_range, "ray_range"))
+        limit = np.inf if communication_range is None else number(communication_range, "communication_range")
+        own: dict[str, Any] = {"num_rays": num_rays, "observed_path": observed_path, "line_of_sight": line_of_sight}
+        return cls(*sizes, low, high, communication_range=limit, **own)
 
     @property
     def ray_range(self) -> float:
@@ -292,18 +240,52 @@ class ObservationLayout(ObservationSlices):
         return bounds
 
 
-def _checked_range(given: float | None) -> float:
-    return np.inf if given is None else positive_number(given, "communication_range", most=LARGEST)
-
-
-def _check_rays(problem: Problem) -> None:
-    """Raise ``ValueError`` for a team that cannot have a range sensor."""
-    if problem.dimension != 2:
+def _check_sight(problem: Problem, num_rays: int, line_of_sight: bool) -> None:
+    """Raise ``ValueError`` for a team that cannot have a range sensor or a line of sight."""
+    if line_of_sight and problem.dimension != 2:
+        raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
+    if num_rays and problem.dimension != 2:
         raise ValueError("rays lie in the plane, and this problem is in space; leave observed_rays out")
-    if problem.team.footprint_arrays is not None:
+    if num_rays and problem.team.footprint_arrays is not None:
         raise ValueError(
             "rays meet robots that are discs, and this team has other footprints; leave footprint or observed_rays out"
         )
+
+
+def _bounds(problem: Problem, slices: ObservationSlices, slack: BoundsSlack, ray_range: float) -> FloatArray:
+    """``(2, D)`` lower and upper bounds that no motion of the robots can leave, read-only."""
+    team, d = problem.team, problem.dimension
+    radius, speed, acceleration = (float(x.max()) for x in (team.radius, team.max_speed, team.max_acceleration))
+    # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
+    # step a robot may exceed the speed limit, which is applied at its end.
+    drive = (speed + acceleration * problem.dt / 2 + slack.drift) * problem.duration + slack.distance
+    widest = np.ptp(np.concatenate([problem.start[:, :d], problem.goal, *problem.world.extremes()]), axis=0)
+    # Farthest that anything may be from a robot.
+    reach = float(np.sqrt(np.square(widest).sum())) + 2 * drive + 2 * radius
+    top = speed + slack.speed
+    own = _ends(
+        slices.own, velocity=top, heading=1, speed=top, goal=reach, time_left=1, arrived=1, radius=radius,
+        max_speed=speed, max_acceleration=acceleration,
+    )  # fmt: skip
+    neighbor = _ends(
+        slices.neighbor, present=1, position=reach, velocity=2 * top, radius=max(radius, slack.radius)
+    )  # fmt: skip
+    obstacle = _ends(slices.obstacle, present=1, position=reach, gap=reach)
+    rays = np.tile(np.array([[0], [ray_range]], np.float32), slices.num_rays)
+    path = _ends(slices.path, direction=1, length=WINDING * reach)
+    parts = [own, *[neighbor] * slices.num_neighbors, *[obstacle] * slices.num_obstacles, rays]
+    bounds = np.concatenate([*parts, *[path] * slices.observed_path], axis=1)
+    bounds.setflags(write=False)
+    return bounds
+
+
+def _ends(parts: Parts, **largest: float) -> FloatArray:
+    """``(2, .)`` bounds of parts by their largest values: as far below zero, where they are ever negative."""
+    ends: FloatArray = np.empty((2, parts[-1].stop), np.float32)
+    for name, high in largest.items():
+        part = getattr(parts, name)
+        ends[1, part], ends[0, part] = high, 0 if name in _NEVER_NEGATIVE else -high
+    return ends
 
 
 def _slices(*widths: int) -> Iterator[slice]:
@@ -316,35 +298,3 @@ def _component_names(parts: Parts) -> Iterator[str]:
         width = part.stop - part.start
         suffixes = ("_cos", "_sin") if name == "heading" else ("",) if width == 1 else ("_x", "_y", "_z")[:width]
         yield from (name + suffix for suffix in suffixes)
-
-
-def _fill(values: FloatArray, parts: NamedTuple, bounds: Mapping[str, float]) -> None:
-    """Set parts of ``values`` ``(..., .)`` in place."""
-    for name, bound in bounds.items():
-        values[..., getattr(parts, name)] = bound
-
-
-def _reach(problem: Problem, slack: BoundsSlack) -> float:
-    """Farthest that anything may be from a robot [m]."""
-    team, places = (
-        problem.team,
-        np.concatenate([problem.start[:, : problem.dimension], problem.goal, *_corners(problem)]),
-    )
-    speed, acceleration = float(team.max_speed.max()), float(team.max_acceleration.max())
-    # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
-    # step a robot may exceed the speed limit, which is applied at its end.
-    drive = (speed + acceleration * problem.dt / 2 + slack.drift) * problem.duration + slack.distance
-    return float(np.sqrt(np.square(np.ptp(places, axis=0)).sum())) + 2 * drive + 2 * float(team.radius.max())
-
-
-def _corners(problem: Problem) -> list[FloatArray]:
-    """Extreme points of the world's obstacles and bounds, to bound distances to them."""
-    world, d = problem.world, problem.dimension
-    corners = [world.balls[:, :d] + sign * world.balls[:, d:] for sign in (-1, 1)]
-    corners += [world.boxes[:, :d], world.boxes[:, d:], *world.polygons]
-    if len(world.cylinders):
-        xy = np.concatenate([world.cylinders[:, :2] + sign * world.cylinders[:, 2:] for sign in (-1, 1)])
-        corners.append(np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
-    if world.lower is not None:
-        corners.append(world.bounds)
-    return corners

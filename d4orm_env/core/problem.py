@@ -2,76 +2,36 @@
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, Self, get_args
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import (
-    LARGEST,
-    SMALLEST,
-    FloatArray,
-    Floats,
-    Frozen,
-    frozen_array,
-    frozen_per_robot,
-    positive_number,
-    shown,
-    whole_number,
-)
+from d4orm_env.core import problem_checks as checks
+from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array, frozen_per_robot
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.problem_arrays import ProblemArrays, goal_directions, inverse_initial_distance, squared_chords
-from d4orm_env.core.problem_checks import (
-    check_places,
-    check_resolution,
-    check_states,
-    check_tolerances,
-    check_turning,
-    goal_headings,
-    goal_speeds,
-    unwound_states,
-)
+from d4orm_env.core.problem_arrays import ProblemArrays, as_arrays, digest_of
+from d4orm_env.core.problem_checks import Arrival
 from d4orm_env.core.summary_line import KeyFigure, count, joined, team_text
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
-from d4orm_env.dynamics.transition import docking_speed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from d4orm_env.paths import shortest_paths as paths
     from d4orm_env.paths.shortest_paths import ShortestPaths
-    from d4orm_env.render import notebook, pictures
+    from d4orm_env.render import pictures
 else:
     paths = LazyModule("d4orm_env.paths.shortest_paths")
-    notebook = LazyModule("d4orm_env.render.notebook")
     pictures = LazyModule("d4orm_env.render.pictures")
 
-Arrival = Literal["dock", "stay"]
-"""Effect of arriving: the robot stays at its goal for good, or drives on."""
-
-MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
-"""Most steps of a problem, and most robots times steps: a slip of the finger must not fill the memory."""
-MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
-"""Bounds of ``dt`` [s]."""
 ROUNDING, GRAINS = 1 / 15_000, 4
 """Allowance for rounding, in radii of the largest robot, and in what float32 resolves at the farthest start or goal."""
-
-
-def check_arrival(value: object) -> None:
-    """Refuse what is no :data:`Arrival`.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    if value not in get_args(Arrival):
-        raise ValueError(f"arrival is {shown(value)}; choose one of {', '.join(get_args(Arrival))}")
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -151,47 +111,26 @@ class Problem(Frozen):
         world = World(dimension=team.dimension) if world is None else world
         if world.dimension != team.dimension:
             raise ValueError(f"the world has dimension {world.dimension} and the team {team.dimension}; match them")
-        dt = positive_number(dt, "dt", least=MIN_TIME_STEP, most=MAX_TIME_STEP)
-        check_arrival(arrival)
+        numbers = checks.checked_numbers(dt, horizon, margin, goal_radius, collision_penalty, team.num_robots)
+        checks.check_arrival(arrival)
         self._set(
+            **numbers,
             team=team,
             start=frozen_array(start, "start", (team.num_robots, team.state_size), largest=LARGEST),
             goal=frozen_array(goal, "goal", (team.num_robots, team.dimension), largest=LARGEST),
             world=world,
-            dt=dt,
-            horizon=whole_number(horizon, "horizon", 1, MAX_HORIZON),
-            margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
-            goal_radius=positive_number(goal_radius, "goal_radius", least=SMALLEST, most=LARGEST),
-            goal_speed=goal_speeds(team, dt, goal_speed),
-            goal_heading=goal_headings(team, goal_heading),
+            goal_speed=checks.goal_speeds(team, numbers["dt"], goal_speed),
+            goal_heading=checks.goal_headings(team, goal_heading),
             goal_heading_tolerance=frozen_per_robot(goal_heading_tolerance, "goal_heading_tolerance", team.num_robots),
             name=name,
             arrival=arrival,
-            collision_penalty=positive_number(collision_penalty, "collision_penalty", most=LARGEST),
         )
-        self._check()
-
-    def _check(self) -> None:
-        team, places = self.team, self.start[:, : self.dimension]
         # Asked for first, so that all clearances are found by the index of the engines.
         self.world.index(self._reach)
-        if self.horizon * team.num_robots > MAX_ROBOT_STEPS:
-            most = MAX_ROBOT_STEPS // team.num_robots
-            raise ValueError(
-                f"horizon is {self.horizon} steps for {team.num_robots} robots; it must be at most {most} for so many"
-            )
-        check_states(team, self.start)
-        self._set(start=unwound_states(team, self.start))
-        check_resolution(team, np.concatenate([places, self.goal], axis=1), self.dt, self.goal_radius)
-        check_turning(team, self.dt, self.goal_radius)
-        check_tolerances(self.goal_heading_tolerance)
-        at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, self.goal_heading)
-        for what, positions, headings in (("start", places, team.headings(self.start)), ("goal", self.goal, at_goals)):
-            fault = check_places(team, self.world, what, positions, self.margin, headings)
-            if fault:
-                warnings.warn(
-                    f"problem {self.name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=3
-                )
+        checks.check_states(team, self.start)
+        self._set(start=checks.unwound_states(team, self.start))
+        for fault in checks.check_physics(self):
+            warnings.warn(f"problem {name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=2)
 
     @property
     def num_robots(self) -> int:
@@ -252,35 +191,7 @@ class Problem(Frozen):
     @cached_property
     def arrays(self) -> ProblemArrays:
         """The problem as the engines read it."""
-        turns = not np.isnan(self.goal_heading).all()
-        arrays = ProblemArrays(
-            model_codes=np.array([MODEL_CODES[name] for name in self.team.models], np.int32),
-            limits=self.team.limits.copy(),
-            radius=self.team.radius,
-            start=self.start,
-            goal=self.goal,
-            inverse_initial_distance=inverse_initial_distance(
-                self.start[:, : self.dimension], self.goal, self.goal_radius
-            ),
-            boxes=self.world.shapes.boxes,
-            triangles=self.world.shapes.triangles,
-            grid=self.world.index(self._reach, within=self._within),
-            bounds=self.world.bounds,
-            time_step=np.array([self.dt, self.dt / 2, self.dt / 3, self.dt / 6], np.float32),
-            margin=np.float32(self.margin),
-            squared_goal_radius=np.float32(self.goal_radius * self.goal_radius),
-            squared_goal_speed=np.square(docking_speed(self.goal_speed, self.team.max_speed)),
-            docks=np.bool_(self.docks),
-            collision_penalty=np.float32(self.collision_penalty),
-            turns_at_goals=np.bool_(True) if turns else None,
-            goal_direction=goal_directions(self.goal_heading) if turns else None,
-            squared_goal_chord=squared_chords(self.goal_heading, self.goal_heading_tolerance) if turns else None,
-            footprints=self.team.footprint_arrays,
-        )
-        for array in arrays:
-            if isinstance(array, np.ndarray):
-                array.setflags(write=False)
-        return arrays
+        return as_arrays(self, self.world.index(self._reach, within=self._within))
 
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
@@ -301,46 +212,12 @@ class Problem(Frozen):
         Raises:
             ValueError: If one has none; the message names all of those.
         """
-        robots = np.flatnonzero(np.isinf(self.shortest_paths.length))
-        if len(robots):
-            names = ", ".join(f"robot_{robot}" for robot in robots)
-            reach = sorted({f"{radius + self.margin:.4g}" for radius in np.asarray(self.team.radius)[robots]})
-            raise ValueError(
-                f"{names} {'has' if len(robots) == 1 else 'have'} no path from start to goal that is "
-                f"{' or '.join(reach)} m clear of obstacles; move the start or the goal, open the world there, or use "
-                f"a smaller radius or margin"
-            )
+        self.shortest_paths.check_reachable()
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 over everything that defines the problem, the name left out."""
-        sha = hashlib.sha256(repr(self.team.models).encode())
-        arrays = self.arrays
-        if arrays.model_codes.max() >= NUM_BUILT_IN:  # such codes depend on the order of registration
-            sha.update(repr([model_digest(model) for model in self.team.robot_models]).encode())
-            arrays = arrays._replace(model_codes=np.minimum(arrays.model_codes, NUM_BUILT_IN))
-        # As before robots had goal speeds of their own: stored results refer to problems by this.
-        goal_speed = None if np.isinf(self.goal_speed).all() else self.goal_speed.tolist()
-        if goal_speed is None:
-            arrays = arrays._replace(squared_goal_speed=np.array(np.inf, np.float32))
-        world = self.world
-        obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
-        for value in (*arrays[:6], *obstacles, *arrays[9:14]):
-            array: np.ndarray = np.ascontiguousarray(value)
-            sha.update(f"{array.shape}{array.dtype}".encode())
-            sha.update(array.tobytes())
-        if world.origin.any():
-            sha.update(b"origin" + world.origin.tobytes())
-        sha.update(f"{self.dt!r} {self.horizon} {self.margin!r} {self.goal_radius!r} {goal_speed!r}".encode())
-        if not self.docks:
-            sha.update(self.arrival.encode())
-        if arrays.goal_direction is not None and arrays.squared_goal_chord is not None:
-            sha.update(arrays.goal_direction.tobytes() + arrays.squared_goal_chord.tobytes())
-        if self.team.shapes:
-            sha.update(repr(self.team.shapes).encode())
-        if self.collision_penalty != 1:
-            sha.update(f"collision_penalty {self.collision_penalty!r}".encode())
-        return sha.hexdigest()
+        return digest_of(self)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Problem) and self.digest == other.digest
@@ -351,13 +228,11 @@ class Problem(Frozen):
     @property
     def key_figures(self) -> list[KeyFigure]:
         """Return its key figures, in a few words each."""
-        world = self.world
-        bounds = (
-            "open" if world.lower is None else " x ".join(f"{side:g}" for side in np.ptp(world.bounds, axis=0)) + " m"
-        )
+        world, sides = self.world, np.ptp(self.world.bounds, axis=0)
+        extent = "open" if world.lower is None else f"{' x '.join(f'{side:g}' for side in sides)} m"
         return [
             ("robots", team_text(self.team.models)),
-            ("world", f"{bounds}, {count(world.num_obstacles, 'obstacle')}"),
+            ("world", f"{extent}, {count(world.num_obstacles, 'obstacle')}"),
             ("time", f"{count(self.horizon, 'step')} of {self.dt:g} s"),
             ("margin", f"{self.margin:g} m"),
             ("arrival", self.arrival),
@@ -367,20 +242,10 @@ class Problem(Frozen):
         return f"Problem: {self.name}\n  {joined(self.key_figures)}"
 
     def _repr_html_(self) -> str:
-        return notebook.problem_html(self, f"Problem: {self.name}", self.key_figures)
+        return pictures.problem_html(self, f"Problem: {self.name}", self.key_figures)
 
     def plot(self, axes: Axes | None = None) -> Axes:
-        """Draw starts, goals and world with matplotlib; see :func:`d4orm_env.render.pictures.plot`.
-
-        Args:
-            axes: Axes to draw on; by default those of a new figure of ``matplotlib.pyplot``.
-
-        Returns:
-            The axes, spatial for a spatial problem.
-
-        Raises:
-            ValueError: If the axes are spatial and the problem is not.
-        """
+        """Draw starts, goals and world on axes, by default new ones; see :func:`d4orm_env.render.pictures.plot`."""
         return pictures.plot(self, None, axes)
 
     def replace(self, **changes: object) -> Self:
@@ -388,7 +253,7 @@ class Problem(Frozen):
 
         What the robots' goals have by default, or in common, another team has too.
         """
-        if np.array_equal(self.goal_speed, goal_speeds(self.team, self.dt, None)):
+        if np.array_equal(self.goal_speed, checks.goal_speeds(self.team, self.dt, None)):
             changes = {"goal_speed": None} | changes
         if np.isnan(self.goal_heading).all():
             changes = {"goal_heading": None} | changes

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import hashlib
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,12 @@ from numpy.typing import NDArray
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
+from d4orm_env.dynamics.transition import docking_speed
 from d4orm_env.geometry.world_index import WorldIndex
+
+if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
 
 
 class ProblemArrays(NamedTuple):
@@ -79,3 +85,65 @@ def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radiu
     """``(K,)`` one over the start distance; a robot that starts at its goal counts from the goal radius."""
     inverse: FloatArray = (1.0 / np.maximum(np.linalg.norm(goal - positions, axis=-1), goal_radius)).astype(np.float32)
     return inverse
+
+
+def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:
+    """A problem with an index of its obstacles, as the engines read it."""
+    places, turns = problem.start[:, : problem.dimension], not np.isnan(problem.goal_heading).all()
+    arrays = ProblemArrays(
+        model_codes=np.array([MODEL_CODES[name] for name in problem.team.models], np.int32),
+        limits=problem.team.limits.copy(),
+        radius=problem.team.radius,
+        start=problem.start,
+        goal=problem.goal,
+        inverse_initial_distance=inverse_initial_distance(places, problem.goal, problem.goal_radius),
+        boxes=problem.world.shapes.boxes,
+        triangles=problem.world.shapes.triangles,
+        grid=grid,
+        bounds=problem.world.bounds,
+        time_step=np.array([problem.dt, problem.dt / 2, problem.dt / 3, problem.dt / 6], np.float32),
+        margin=np.float32(problem.margin),
+        squared_goal_radius=np.float32(problem.goal_radius * problem.goal_radius),
+        squared_goal_speed=np.square(docking_speed(problem.goal_speed, problem.team.max_speed)),
+        docks=np.bool_(problem.docks),
+        collision_penalty=np.float32(problem.collision_penalty),
+        turns_at_goals=np.bool_(True) if turns else None,
+        goal_direction=goal_directions(problem.goal_heading) if turns else None,
+        squared_goal_chord=squared_chords(problem.goal_heading, problem.goal_heading_tolerance) if turns else None,
+        footprints=problem.team.footprint_arrays,
+    )
+    for array in arrays:
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+    return arrays
+
+
+def digest_of(problem: Problem) -> str:
+    """SHA-256 over everything that defines a problem, the name left out."""
+    sha = hashlib.sha256(repr(problem.team.models).encode())
+    arrays = problem.arrays
+    if arrays.model_codes.max() >= NUM_BUILT_IN:  # such codes depend on the order of registration
+        sha.update(repr([model_digest(model) for model in problem.team.robot_models]).encode())
+        arrays = arrays._replace(model_codes=np.minimum(arrays.model_codes, NUM_BUILT_IN))
+    # As before robots had goal speeds of their own: stored results refer to problems by this.
+    goal_speed = None if np.isinf(problem.goal_speed).all() else problem.goal_speed.tolist()
+    if goal_speed is None:
+        arrays = arrays._replace(squared_goal_speed=np.array(np.inf, np.float32))
+    world = problem.world
+    obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
+    for value in (*arrays[:6], *obstacles, *arrays[9:14]):
+        array: np.ndarray = np.ascontiguousarray(value)
+        sha.update(f"{array.shape}{array.dtype}".encode())
+        sha.update(array.tobytes())
+    if world.origin.any():
+        sha.update(b"origin" + world.origin.tobytes())
+    sha.update(f"{problem.dt!r} {problem.horizon} {problem.margin!r} {problem.goal_radius!r} {goal_speed!r}".encode())
+    if not problem.docks:
+        sha.update(problem.arrival.encode())
+    if arrays.goal_direction is not None and arrays.squared_goal_chord is not None:
+        sha.update(arrays.goal_direction.tobytes() + arrays.squared_goal_chord.tobytes())
+    if problem.team.shapes:
+        sha.update(repr(problem.team.shapes).encode())
+    if problem.collision_penalty != 1:
+        sha.update(f"collision_penalty {problem.collision_penalty!r}".encode())
+    return sha.hexdigest()

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, IntArray, as_float32, shown
+from d4orm_env.core.arrays import (
+    LARGEST,
+    SMALLEST,
+    FloatArray,
+    Floats,
+    IntArray,
+    as_float32,
+    positive_number,
+    shown,
+    whole_number,
+)
 from d4orm_env.core.footprint_gaps import pair_gap, world_gap
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
@@ -14,6 +26,16 @@ from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
 from d4orm_env.footprints import Disc
 
+if TYPE_CHECKING:
+    from d4orm_env.core.problem import Problem
+
+Arrival = Literal["dock", "stay"]
+"""Effect of arriving: the robot stays at its goal for good, or drives on."""
+
+MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
+"""Most steps of a problem, and most robots times steps: a slip of the finger must not fill the memory."""
+MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
+"""Bounds of ``dt`` [s]."""
 MAX_HEADING = 1000.0
 """Largest heading that is given as a state [rad]; float32 resolves it to 6e-5 rad. What is taken is unwound."""
 LEAST_TOLERANCE = 1e-3
@@ -24,6 +46,45 @@ STEP_RESOLUTION = 10
 """A robot at its speed limit moves at least so many times that in one step."""
 INTEGRATION_ERROR = 2 / 15
 """Most that one step of RK4 may be off where a robot turns at its limits, as a share of the goal radius."""
+
+
+def check_arrival(value: object) -> None:
+    """Refuse what is no :data:`Arrival`."""
+    if value not in get_args(Arrival):
+        raise ValueError(f"arrival is {shown(value)}; choose one of {', '.join(get_args(Arrival))}")
+
+
+def checked_numbers(
+    dt: float, horizon: int, margin: float, goal_radius: float, collision_penalty: float, num_robots: int
+) -> dict[str, Any]:
+    """The numbers of a problem, each within its bounds, by name."""
+    numbers = {
+        "dt": positive_number(dt, "dt", least=MIN_TIME_STEP, most=MAX_TIME_STEP),
+        "horizon": whole_number(horizon, "horizon", 1, MAX_HORIZON),
+        "margin": positive_number(margin, "margin", zero_allowed=True, most=LARGEST),
+        "goal_radius": positive_number(goal_radius, "goal_radius", least=SMALLEST, most=LARGEST),
+        "collision_penalty": positive_number(collision_penalty, "collision_penalty", most=LARGEST),
+    }
+    if horizon * num_robots > MAX_ROBOT_STEPS:
+        most = MAX_ROBOT_STEPS // num_robots
+        raise ValueError(f"horizon is {horizon} steps for {num_robots} robots; it must be at most {most} for so many")
+    return numbers
+
+
+def check_physics(problem: Problem) -> list[str]:
+    """Refuse what float32 or RK4 does not hold and places that robots cannot be at; those within the margin."""
+    team, places = problem.team, problem.start[:, : problem.dimension]
+    check_resolution(team, np.concatenate([places, problem.goal], axis=1), problem.dt, problem.goal_radius)
+    check_turning(team, problem.dt, problem.goal_radius)
+    check_tolerances(problem.goal_heading_tolerance)
+    at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, problem.goal_heading)
+    faults = [
+        check_places(team, problem.world, what, positions, problem.margin, headings)
+        for what, positions, headings in (
+            ("start", places, team.headings(problem.start)), ("goal", problem.goal, at_goals)
+        )
+    ]  # fmt: skip
+    return [fault for fault in faults if fault]
 
 
 def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
@@ -71,10 +132,8 @@ def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
 def check_tolerances(tolerance: FloatArray) -> None:
     """Refuse tolerances of goal headings ``(K,)`` that float32 does not resolve, or that allow any."""
     for robot in np.flatnonzero((tolerance < LEAST_TOLERANCE) | (tolerance > np.float32(np.pi)))[:1].tolist():
-        raise ValueError(
-            f"goal_heading_tolerance of robot_{robot} is {tolerance[robot]:g} rad; it must be from {LEAST_TOLERANCE:g} "
-            f"to pi"
-        )
+        value = f"goal_heading_tolerance of robot_{robot} is {tolerance[robot]:g} rad"
+        raise ValueError(f"{value}; it must be from {LEAST_TOLERANCE:g} to pi")
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
@@ -165,19 +224,10 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
 def check_places(
     team: Team, world: World, what: str, places: FloatArray, margin: float, headings: FloatArray | None = None
 ) -> str:
-    """Refuse starts or goals (``what``) ``(K, d)`` outside the world, or that touch something.
+    """Refuse starts or goals (``what``) at ``places`` ``(K, d)`` outside the world, or that touch something.
 
-    Args:
-        team: The robots.
-        world: The world.
-        what: "start" or "goal".
-        places: Where they are [m].
-        margin: The margin [m].
-        headings: ``(K,)`` what turns their footprints [rad], NaN where it is not known: such a footprint counts as the
-            disc within it. All are unknown by default.
-
-    Returns:
-        What is nearest within the margin, for an error or a warning: the empty string if nothing is.
+    Where a heading ``(K,)`` [rad] is NaN, as all are by default, the disc within a footprint counts for it. Returned is
+    what is nearest within the margin, for an error or a warning: the empty string if nothing is.
     """
     radius = team.radius.astype(np.float64)
     gaps = world.clearance(places) - radius
@@ -186,24 +236,21 @@ def check_places(
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
         gaps[robot] = world_gap(world, team.footprint[robot], poses[robot])
     for robot in np.flatnonzero(gaps <= 0):
-        raise ValueError(
-            f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an "
-            f"obstacle or outside the bounds ({_size(team, int(robot))}); move it, or change the world"
-        )
+        where = f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an obstacle"
+        raise ValueError(f"{where} or outside the bounds ({_size(team, int(robot))}); move it, or change the world")
     first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
         gap_of = [pair_gap(team.footprint[i], poses[i], team.footprint[j], poses[j]) for i, j in pairs]
         between = np.array(gap_of, np.float64)
-    overlapping = np.flatnonzero(between <= 0)
-    if len(overlapping):
+    if len(overlapping := np.flatnonzero(between <= 0)):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]
         pair = int(of_first[np.argmin(between[of_first])])
         one, other = int(first[pair]), int(second[pair])
+        distance = "" if shaped else f"more than {radius[one] + radius[other]:g} m "
         raise ValueError(
             f"{what}s of robot_{one} at {_point(places[one])} and robot_{other} at {_point(places[other])} "
-            f"overlap by {0 - between[pair]:.3g} m; move them "
-            + ("apart" if shaped else f"more than {radius[one] + radius[other]:g} m apart")
+            f"overlap by {0 - between[pair]:.3g} m; move them {distance}apart"
         )
     least = int(np.argmin(gaps))
     gap, nearest = gaps[least], "an obstacle or the bounds"

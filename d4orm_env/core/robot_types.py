@@ -44,89 +44,56 @@ class RobotType:
         return {"model": self.model, "radius": self.radius, "margin": self.margin, **limits}
 
 
-ROBOTS: Mapping[str, RobotType] = MappingProxyType(
-    {
-        "crazyflie": RobotType(
-            model="holonomic3d",
-            radius=0.07,
-            max_speed=1.0,
-            max_acceleration=2.0,
-            margin=0.1,
-            lag=0.2,
-            sources={
-                "radius": f"Crazyflie 2.1+ {_BITCRAZE}; the air below it needs more",
-                "max_speed": "ours, for indoor flight by motion capture",
-                "max_acceleration": "ours: a tilt of 11 degrees, which leaves thrust for the height with a low battery",
-                "margin": _MEASURED,
-                "lag": "of accelerations in crazyflow 0.4.0, where 0.1 s left D4orm-C2F circling its goals",
-            },
-        ),
-        "crazyflie_brushless": RobotType(
-            model="holonomic3d",
-            radius=0.08,
-            max_speed=1.5,
-            max_acceleration=3.0,
-            margin=0.1,
-            lag=0.08,
-            sources={
-                "radius": "ours: about 50 mm to the motors, 55 mm propellers; measure yours",
-                "max_speed": "ours, for indoor flight by motion capture",
-                "max_acceleration": "ours: a tilt of 17 degrees",
-                "margin": "as crazyflie, not measured",
-                "lag": "ours, not measured",
-            },
-        ),
-        "turtlebot3_burger": RobotType(
-            model="differential_drive",
-            radius=0.105,
-            max_speed=0.22,
-            max_acceleration=0.5,
-            max_turn_rate=1.8,
-            margin=0.05,
-            lag=0.15,
-            sources={
-                "radius": "turtlebot3_navigation2: robot_radius 0.105 (138 x 178 mm, turning about the wheels' axle)",
-                "max_speed": "ROBOTIS e-Manual, specifications: 0.22 m/s",
-                "max_acceleration": "ours; turtlebot3_navigation allows 2.5",
-                "max_turn_rate": "ours; the e-Manual has 2.84 rad/s at most",
-                "margin": "ours, not measured",
-                "lag": "ours: a loop at 10 Hz over ROS 2",
-            },
-        ),
-        "robomaster": RobotType(
-            model="holonomic2d",
-            radius=0.2,
-            max_speed=1.0,
-            max_acceleration=1.0,
-            margin=0.05,
-            lag=0.1,
-            sources={
-                "radius": "DJI RoboMaster S1/EP: 320 x 240 mm, half of the diagonal",
-                "max_speed": "ours; DJI: 3.5 m/s forwards, 2.8 m/s sideways",
-                "max_acceleration": "ours, for mecanum wheels without slip",
-                "margin": "ours, not measured",
-                "lag": "ours, not measured",
-            },
-        ),
-        "jackal": RobotType(
-            model="differential_drive",
-            radius=0.333,
-            max_speed=1.5,
-            max_acceleration=1.0,
-            max_turn_rate=1.5,
-            margin=0.1,
-            lag=0.2,
-            sources={
-                "radius": "Clearpath Jackal: 508 x 430 mm, half of the diagonal; not looked up",
-                "max_speed": "ours; 2.0 m/s at most, not looked up",
-                "max_acceleration": "ours, for skid steering",
-                "max_turn_rate": "ours, not measured",
-                "margin": "ours, not measured",
-                "lag": "ours, not measured",
-            },
-        ),
-    }
-)
+def _robot(model: str, **numbers: tuple[float, str]) -> RobotType:
+    """A robot by its numbers, each with its source."""
+    values = {name: value for name, (value, _) in numbers.items()}
+    return RobotType(model=model, sources={name: source for name, (_, source) in numbers.items()}, **values)
+
+
+ROBOTS: Mapping[str, RobotType] = MappingProxyType({
+    "crazyflie": _robot(
+        "holonomic3d",
+        radius=(0.07, f"Crazyflie 2.1+ {_BITCRAZE}; the air below it needs more"),
+        max_speed=(1.0, "ours, for indoor flight by motion capture"),
+        max_acceleration=(2.0, "ours: a tilt of 11 degrees, which leaves thrust for the height with a low battery"),
+        margin=(0.1, _MEASURED),
+        lag=(0.2, "of accelerations in crazyflow 0.4.0, where 0.1 s left D4orm-C2F circling its goals"),
+    ),
+    "crazyflie_brushless": _robot(
+        "holonomic3d",
+        radius=(0.08, "ours: about 50 mm to the motors, 55 mm propellers; measure yours"),
+        max_speed=(1.5, "ours, for indoor flight by motion capture"),
+        max_acceleration=(3.0, "ours: a tilt of 17 degrees"),
+        margin=(0.1, "as crazyflie, not measured"),
+        lag=(0.08, "ours, not measured"),
+    ),
+    "turtlebot3_burger": _robot(
+        "differential_drive",
+        radius=(0.105, "turtlebot3_navigation2: robot_radius 0.105 (138 x 178 mm, turning about the wheels' axle)"),
+        max_speed=(0.22, "ROBOTIS e-Manual, specifications: 0.22 m/s"),
+        max_acceleration=(0.5, "ours; turtlebot3_navigation allows 2.5"),
+        max_turn_rate=(1.8, "ours; the e-Manual has 2.84 rad/s at most"),
+        margin=(0.05, "ours, not measured"),
+        lag=(0.15, "ours: a loop at 10 Hz over ROS 2"),
+    ),
+    "robomaster": _robot(
+        "holonomic2d",
+        radius=(0.2, "DJI RoboMaster S1/EP: 320 x 240 mm, half of the diagonal"),
+        max_speed=(1.0, "ours; DJI: 3.5 m/s forwards, 2.8 m/s sideways"),
+        max_acceleration=(1.0, "ours, for mecanum wheels without slip"),
+        margin=(0.05, "ours, not measured"),
+        lag=(0.1, "ours, not measured"),
+    ),
+    "jackal": _robot(
+        "differential_drive",
+        radius=(0.333, "Clearpath Jackal: 508 x 430 mm, half of the diagonal; not looked up"),
+        max_speed=(1.5, "ours; 2.0 m/s at most, not looked up"),
+        max_acceleration=(1.0, "ours, for skid steering"),
+        max_turn_rate=(1.5, "ours, not measured"),
+        margin=(0.1, "ours, not measured"),
+        lag=(0.2, "ours, not measured"),
+    ),
+})  # fmt: skip
 """The robots that are known by name."""
 
 

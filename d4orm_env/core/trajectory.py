@@ -1,18 +1,20 @@
-"""Rollout of controls: states, rewards and flags over time."""
+"""Rollout of controls: states, rewards and flags over time, and the disturbances of an execution."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.summary_line import KeyFigure, count, joined
 
 if TYPE_CHECKING:
-    from d4orm_env.render import notebook
+    from d4orm_env.render import pictures
 else:
-    notebook = LazyModule("d4orm_env.render.notebook")
+    pictures = LazyModule("d4orm_env.render.pictures")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,4 +59,30 @@ class Trajectory:
         return f"Trajectory: {self.title}\n  {joined(self.key_figures)}"
 
     def _repr_html_(self) -> str:
-        return notebook.paths_html(self, f"Trajectory: {self.title}", self.key_figures)
+        return pictures.paths_html(self, f"Trajectory: {self.title}", self.key_figures)
+
+
+@dataclass(frozen=True, eq=False)
+class DisturbanceEvents:
+    """Disturbances that a team met in ``T`` steps.
+
+    Attributes:
+        pushed: ``(T + 1, K, d)`` velocity that the step before gave to each robot [m/s]; zero for none.
+        stalled: ``(T + 1, K)`` bool: does not obey.
+        bodies: ``(T + 1, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots.
+    """
+
+    pushed: FloatArray
+    stalled: BoolArray
+    bodies: FloatArray
+
+    def until(self, step: int) -> DisturbanceEvents:
+        """The same up to that step."""
+        return DisturbanceEvents(self.pushed[: step + 1], self.stalled[: step + 1], self.bodies[: step + 1])
+
+    @property
+    def stall_starts(self) -> BoolArray:
+        """``(T + 1, K)`` bool: where a robot stops obeying."""
+        before = np.concatenate([np.zeros_like(self.stalled[:1]), self.stalled[:-1]])
+        starts: BoolArray = self.stalled & ~before
+        return starts

@@ -136,6 +136,16 @@ class World(Frozen):
             return np.array([[-np.inf] * self.dimension, [np.inf] * self.dimension], np.float32)
         return np.stack([self.lower, self.upper])
 
+    def extremes(self) -> list[FloatArray]:
+        """Return outermost points ``(., dimension)`` of obstacles and bounds, to bound distances to them."""
+        d = self.dimension
+        corners = [self.balls[:, :d] + sign * self.balls[:, d:] for sign in (-1, 1)]
+        corners += [self.boxes[:, :d], self.boxes[:, d:], *self.polygons]
+        if len(self.cylinders):
+            xy = np.concatenate([self.cylinders[:, :2] + sign * self.cylinders[:, 2:] for sign in (-1, 1)])
+            corners.append(np.concatenate([xy, np.zeros((len(xy), 1))], axis=1))
+        return corners if self.lower is None else [*corners, self.bounds]
+
     @cached_property
     def triangles(self) -> tuple[tuple[tuple[int, ...], ...], ...]:
         """Triangles that fill each polygon, each three numbers of corners."""

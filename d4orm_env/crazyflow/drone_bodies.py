@@ -2,20 +2,49 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32
+import numpy as np
+from crazyflow.drones import Drone
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, shown
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.seeds import Stream, generator
-from d4orm_env.crazyflow.drone_physics import DronePhysics
-from d4orm_env.crazyflow.flight import SETPOINT_RATE, Flight
-from d4orm_env.crazyflow.flight_record import FlightRecord, least_gaps
+from d4orm_env.crazyflow.flight import SETPOINT_RATE, Flight, FlightRecord, least_gaps
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.dynamics.transition import advance
 from d4orm_env.envs.body_simulation import Moved, Robots
 from d4orm_env.envs.lifelong import reached_goals
+
+DRONES = tuple(drone.value for drone in Drone)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DronePhysics:
+    """The drones of a team in crazyflow.
+
+    Attributes:
+        drone: Their type, as crazyflow names it: ``"cf2x_L250"`` is the Crazyflie 2.x.
+        mass_factor: Their mass over that which their controller reckons with.
+        gust: Force on every drone, in another random direction every 0.5 s [N].
+
+    Raises:
+        ValueError: For an unknown type, or a number out of range.
+    """
+
+    drone: str = Drone.cf2x_L250.value
+    mass_factor: float = 1.0
+    gust: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.drone not in DRONES:
+            raise ValueError(f"drone is {shown(self.drone)}; choose one of {', '.join(DRONES)}")
+        factor = positive_number(self.mass_factor, "mass_factor", least=0.1, most=10)
+        object.__setattr__(self, "mass_factor", factor)
+        object.__setattr__(self, "gust", positive_number(self.gust, "gust", zero_allowed=True, most=10))
+
 
 MODEL = "holonomic3d"
 SENSED = 0.2

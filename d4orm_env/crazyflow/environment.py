@@ -6,9 +6,8 @@ from functools import partial
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import shown
-from d4orm_env.crazyflow.drone_bodies import DroneBodies, check_problem
-from d4orm_env.crazyflow.drone_physics import DronePhysics
-from d4orm_env.crazyflow.flight_record import FlightRecord
+from d4orm_env.crazyflow.drone_bodies import DroneBodies, DronePhysics, check_problem
+from d4orm_env.crazyflow.flight import FlightRecord
 from d4orm_env.envs.body_simulation import BodySimulation
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.scenarios.problems import ScenarioLike

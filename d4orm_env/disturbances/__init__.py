@@ -9,8 +9,7 @@ environments to the bit, and one disturbance draws the same whatever others ther
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.intruder import Intruder
-from d4orm_env.disturbances.moving_obstacle import MovingObstacle, load_pedestrians
+from d4orm_env.disturbances.moving_obstacle import Intruder, MovingObstacle, load_pedestrians
 from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, StateNoise
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 

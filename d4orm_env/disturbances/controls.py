@@ -7,16 +7,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.brakes import brake
-from d4orm_env.disturbances.disturbance import Disturbance, Memory, Scene
+from d4orm_env.disturbances.disturbance import Disturbance, M, Memory, Scene
 from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.levels import MAX_DELAY, check_components, per_component, scaled, share, standard_deviation
+from d4orm_env.disturbances.levels import (
+    MAX_DELAY,
+    check_components,
+    level,
+    per_component,
+    scaled,
+    share,
+    standard_deviation,
+    truth,
+)
 
 
 class Drawn(NamedTuple):
@@ -26,13 +35,10 @@ class Drawn(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Spread:
-    """Standard deviation ``std``, checked: one number or one per component."""
+class _Spread(Disturbance[M]):
+    """Standard deviation ``std``: one number or one per component."""
 
-    std: float | tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", per_component(self.std, f"{type(self).__name__} std"))
+    std: float | tuple[float, ...] = level(per_component)
 
     @property
     def negligible(self) -> bool:
@@ -43,7 +49,7 @@ class _Spread:
 
 
 @dataclass(frozen=True)
-class ControlNoise(_Spread, Disturbance[Memory]):
+class ControlNoise(_Spread[Memory]):
     """Gaussian noise on the controls, independent over steps, robots and components; the paper's (section V-D).
 
     Attributes:
@@ -55,7 +61,7 @@ class ControlNoise(_Spread, Disturbance[Memory]):
 
 
 @dataclass(frozen=True)
-class CorrelatedNoise(_Spread, Disturbance[Drawn]):
+class CorrelatedNoise(_Spread[Drawn]):
     """Gaussian noise on the controls that is correlated over time: an Ornstein-Uhlenbeck process per component.
 
     It is stationary from the beginning, with autocorrelation ``exp(-t / time_constant)`` (G. E. Uhlenbeck and L. S.
@@ -67,12 +73,7 @@ class CorrelatedNoise(_Spread, Disturbance[Drawn]):
         time_constant: [s].
     """
 
-    time_constant: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        constant = positive_number(self.time_constant, "CorrelatedNoise time_constant", most=LARGEST)
-        object.__setattr__(self, "time_constant", constant)
+    time_constant: float = level(partial(positive_number, most=LARGEST), 1.0)
 
     def begin(self, scene: Scene, draws: Draws) -> Drawn:
         return Drawn(draws.normal(*scene.controls.shape[1:]))
@@ -87,7 +88,7 @@ class CorrelatedNoise(_Spread, Disturbance[Drawn]):
 
 
 @dataclass(frozen=True)
-class Bias(_Spread, Disturbance[Drawn]):
+class Bias(_Spread[Drawn]):
     """A constant added to the controls of a robot, Gaussian, drawn per robot, component and episode.
 
     Attributes:
@@ -110,14 +111,7 @@ class Gain(Disturbance[Drawn]):
         std: Standard deviation of the factor.
     """
 
-    std: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", standard_deviation(self.std, "Gain std"))
-
-    @property
-    def negligible(self) -> bool:
-        return self.std == 0
+    std: float = level(standard_deviation, off=0)
 
     def begin(self, scene: Scene, draws: Draws) -> Drawn:
         factors = 1 + np.float32(self.std) * draws.normal(scene.problem.num_robots, 1)
@@ -135,15 +129,7 @@ class Quantisation(Disturbance[Memory]):
         step: At least 1e-7, or zero [control units].
     """
 
-    step: float
-
-    def __post_init__(self) -> None:
-        step = positive_number(self.step, "Quantisation step", zero_allowed=True, least=SMALLEST, most=LARGEST)
-        object.__setattr__(self, "step", step)
-
-    @property
-    def negligible(self) -> bool:
-        return self.step == 0
+    step: float = level(partial(positive_number, zero_allowed=True, least=SMALLEST, most=LARGEST), off=0)
 
     def command(self, controls: FloatArray, memory: Memory, scene: Scene, draws: Draws) -> FloatArray:
         step = np.float32(self.step)
@@ -157,6 +143,15 @@ class Queue(NamedTuple):
     values: FloatArray
 
 
+def _steps_or_range(value: Any, name: str) -> int | tuple[int, int]:
+    ends = value if isinstance(value, tuple | list) else (value, value)
+    if len(ends) != 2:
+        raise ValueError(f"{name} is {shown(value)}; give a number of steps, or a range as (1, 3)")
+    least = whole_number(ends[0], name, 0, MAX_DELAY)
+    most = whole_number(ends[1], name, least, MAX_DELAY)
+    return least if least == most else (least, most)
+
+
 @dataclass(frozen=True)
 class Delay(Disturbance[Queue]):
     """Commands are executed some time steps late; until the first one arrives, the control is zero.
@@ -165,23 +160,11 @@ class Delay(Disturbance[Queue]):
         steps: Time steps, at most 1000. ``(1, 3)`` draws from 1, 2 and 3 anew for every robot and step.
     """
 
-    steps: int | tuple[int, int]
-
-    def __post_init__(self) -> None:
-        ends = self.steps if isinstance(self.steps, tuple | list) else (self.steps, self.steps)
-        if len(ends) != 2:
-            raise ValueError(f"Delay steps is {shown(self.steps)}; give a number of steps, or a range as (1, 3)")
-        least = whole_number(ends[0], "Delay steps", 0, MAX_DELAY)
-        most = whole_number(ends[1], "Delay steps", least, MAX_DELAY)
-        object.__setattr__(self, "steps", least if least == most else (least, most))
+    steps: int | tuple[int, int] = level(_steps_or_range, off=0)
 
     @property
     def _range(self) -> tuple[int, int]:
         return self.steps if isinstance(self.steps, tuple) else (self.steps, self.steps)
-
-    @property
-    def negligible(self) -> bool:
-        return self.steps == 0
 
     def begin(self, scene: Scene, draws: Draws) -> Queue:
         worlds, *shape = scene.controls.shape
@@ -207,15 +190,7 @@ class Lag(Disturbance[Drawn]):
         time_constant: After it 63% of a change have happened; zero for none [s].
     """
 
-    time_constant: float
-
-    def __post_init__(self) -> None:
-        constant = positive_number(self.time_constant, "Lag time_constant", zero_allowed=True, most=LARGEST)
-        object.__setattr__(self, "time_constant", constant)
-
-    @property
-    def negligible(self) -> bool:
-        return self.time_constant == 0
+    time_constant: float = level(standard_deviation, off=0)
 
     def begin(self, scene: Scene, draws: Draws) -> Drawn:
         return Drawn(np.zeros_like(scene.controls))
@@ -238,17 +213,8 @@ class Dropout(Disturbance[Drawn]):
         hold: Whether the robot goes on with the command that it got last, zero before the first; otherwise it brakes.
     """
 
-    probability: float
-    hold: bool = True
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "probability", share(self.probability, "Dropout probability"))
-        if not isinstance(self.hold, bool):
-            raise ValueError(f"Dropout hold is {shown(self.hold)}; it must be True or False")
-
-    @property
-    def negligible(self) -> bool:
-        return self.probability == 0
+    probability: float = level(share, off=0)
+    hold: bool = level(truth, True)
 
     def begin(self, scene: Scene, draws: Draws) -> Drawn:
         return Drawn(np.zeros_like(scene.controls))
@@ -257,5 +223,5 @@ class Dropout(Disturbance[Drawn]):
         lost = draws.uniform(controls.shape[1]) < self.probability
         np.copyto(memory.values, controls, where=~lost[..., None])
         if not self.hold:
-            np.copyto(memory.values, brake(scene, scene.states, lost), where=lost[..., None])
+            np.copyto(memory.values, scene.brake(scene.states, lost), where=lost[..., None])
         return memory.values.copy()

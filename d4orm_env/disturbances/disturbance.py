@@ -7,16 +7,21 @@ to the bit. All arrays have a leading axis over the worlds.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import reduce
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, shown
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
+from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import DisturbanceEvents
 from d4orm_env.disturbances.draws import Draws
+from d4orm_env.dynamics.robot_model import TimeStep
 
 Memory = tuple[NDArray[np.generic], ...]
 """Memory of a disturbance over an episode: arrays ``(B, ...)``, changed in place. A ``NamedTuple`` names them."""
@@ -51,20 +56,30 @@ class Scene(NamedTuple):
 
     def of(self, worlds: NDArray[np.intp]) -> Scene:
         """The same of some of the worlds."""
-        return self._replace(
-            start=self.start[worlds],
-            goal=self.goal[worlds],
-            states=self.states[worlds],
-            controls=self.controls[worlds],
-            arrived=self.arrived[worlds],
-            steps=self.steps[worlds],
-            bodies=self.bodies[worlds],
-        )
+        return Scene._make([*self[:2], *(part[worlds] for part in self[2:])])
 
     @property
     def standing(self) -> BoolArray:
         """``(B, K)`` bool: docked, so that nothing moves it."""
         return self.arrived & self.problem.docks
+
+    def brake(self, states: FloatArray, robots: BoolArray) -> FloatArray:
+        """``(B, K, m)`` controls that stop ``robots`` ``(B, K)`` as fast as limits allow, zero for the others.
+
+        They are in ``states`` ``(B, K, n)``.
+        """
+        problem = self.problem
+        controls: FloatArray = np.zeros((*states.shape[:2], problem.control_size), np.float32)
+        step = TimeStep(*problem.arrays.time_step)
+        still = (np.float32(0),) * problem.dimension
+        for robot, model in enumerate(problem.team.robot_models):
+            worlds = np.flatnonzero(robots[:, robot])
+            if len(worlds):
+                x = tuple(states[worlds, robot, : model.state_size].T)
+                wanted = model.functions.track(x, still, tuple(problem.arrays.limits[robot]), step, NUMPY_OPS)
+                for component, value in enumerate(wanted):
+                    controls[worlds, robot, component] = value
+        return controls
 
 
 class Observed(NamedTuple):
@@ -112,10 +127,19 @@ class Disturbance(Generic[M]):
     is shared by all worlds and keeps nothing: what an episode needs is in its memory.
     """
 
+    def __post_init__(self) -> None:
+        for attribute in fields(self):
+            if "check" in attribute.metadata:
+                name = f"{type(self).__name__} {attribute.name}"
+                object.__setattr__(
+                    self, attribute.name, attribute.metadata["check"](getattr(self, attribute.name), name)
+                )
+
     @property
     def negligible(self) -> bool:
-        """True if it changes nothing, as at level zero; it is left out then."""
-        return False
+        """True if it changes nothing, as where an attribute is off; it is left out then."""
+        neutral = ((getattr(self, one.name), one.metadata["off"]) for one in fields(self) if "off" in one.metadata)
+        return any(value == off for value, off in neutral)
 
     @property
     def replayable(self) -> bool:
@@ -169,3 +193,47 @@ class Disturbance(Generic[M]):
 
 AnyDisturbance: TypeAlias = Disturbance[Any]
 """Whatever its memory is."""
+Disturbances: TypeAlias = tuple[AnyDisturbance, ...]
+
+
+def checked_disturbances(given: object) -> Disturbances:
+    """Return what an environment was given, a list of disturbances, as a tuple."""
+    if isinstance(given, Disturbance):
+        given = (given,)
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ValueError(f"disturbances is {shown(given)}; give a list of them, as [Delay(2), Push(0.1, 0.3)]")
+    listed = tuple(given)
+    for one in listed:
+        if not isinstance(one, Disturbance):
+            raise ValueError(
+                f"disturbances holds {shown(one)}, which is none; give instances, as [Delay(2), Push(0.1, 0.3)]"
+            )
+    return listed
+
+
+def at_work(disturbances: Disturbances, problem: Problem) -> Disturbances:
+    """Return those that change anything, so that all others leave the environment as it is to the bit.
+
+    Raises:
+        ValueError: If the robots or the world of the problem cannot have one of them.
+    """
+    for one in disturbances:
+        one.check(problem)
+    return tuple(one for one in disturbances if not one.negligible)
+
+
+def total_slack(disturbances: Disturbances, problem: Problem) -> BoundsSlack:
+    """Room that all of them need together."""
+    return reduce(BoundsSlack.joined, (one.slack(problem) for one in disturbances), BoundsSlack())
+
+
+def marks_of(effects: Sequence[DisturbanceEffect], problem: Problem) -> DisturbanceEvents:
+    """Marks of one world from its effects at the beginning and after every step, each of one world."""
+    still = np.zeros((1, problem.num_robots, problem.dimension), np.float32)
+    obeying = np.zeros((1, problem.num_robots), np.bool_)
+    nothing = np.zeros((1, 0, 2 * problem.dimension + 1), np.float32)
+    return DisturbanceEvents(
+        pushed=np.concatenate([still if effect.pushed is None else effect.pushed for effect in effects]),
+        stalled=np.concatenate([obeying if effect.stalled is None else effect.stalled for effect in effects]),
+        bodies=np.concatenate([nothing if effect.bodies is None else effect.bodies for effect in effects]),
+    )

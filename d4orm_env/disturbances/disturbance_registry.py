@@ -16,7 +16,7 @@ from d4orm_env.core.registry import Registry
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
-from d4orm_env.disturbances.intruder import Intruder
+from d4orm_env.disturbances.moving_obstacle import Intruder
 from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, StateNoise
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
@@ -55,13 +55,7 @@ def register_disturbance(name: str, kind: type[AnyDisturbance] | str) -> None:
 
 
 class Level(NamedTuple):
-    """Meaning of a name such as ``push(rate=0.5).speed``.
-
-    Attributes:
-        kind: The kind of disturbance.
-        attribute: Attribute that the level is of.
-        fixed: Values of other attributes.
-    """
+    """Meaning of a name such as ``push(rate=0.5).speed``: kind, attribute that the level is of, values of others."""
 
     kind: type[AnyDisturbance]
     attribute: str
@@ -115,11 +109,7 @@ def _split_path(text: str) -> tuple[str, str, str]:
 
 
 def disturbance_at(text: str, level: object) -> AnyDisturbance:
-    """The disturbance of a name at a level, all else as by default.
-
-    Args:
-        text: As for :func:`find_level`.
-        level: The value of the attribute; a list of two is a range for an attribute that takes one.
+    """The disturbance of a name, as for :func:`find_level`, at a level, all else as by default.
 
     Raises:
         ValueError: If there is no such disturbance, the level makes no sense, or another attribute has no default.
@@ -156,13 +146,9 @@ def _make(kind: type[AnyDisturbance], values: Mapping[str, object], text: str) -
     return kind(**values)
 
 
-def name_of(disturbance: AnyDisturbance) -> str:
-    """Return the name of its kind here, or its import path."""
-    return name_of_kind(type(disturbance))
-
-
-def name_of_kind(kind: type[AnyDisturbance]) -> str:
-    """Return the name of a kind here, or its import path."""
+def name_of(disturbance: AnyDisturbance | type[AnyDisturbance]) -> str:
+    """Return the name of a kind, or of an instance's, here, or its import path."""
+    kind = disturbance if isinstance(disturbance, type) else type(disturbance)
     for name in DISTURBANCES:
         if DISTURBANCES.origin(name) in (kind, f"{kind.__module__}:{kind.__qualname__}"):
             return name

@@ -128,13 +128,9 @@ class DisturbedWorlds:
         return Scene(self.problem, self.max_cycles, start, goal, states, controls, arrived, steps, self._bodies)
 
     def begin(self, worlds: Worlds, seeds: Sequence[int], start: FloatArray, goal: FloatArray) -> None:
-        """Begin the episodes of some worlds, the first time of all.
+        """Begin the episodes of worlds ``(b,)``, the first time of all, from ``(b, K, n)`` to ``(b, K, d)`` [m].
 
-        Args:
-            worlds: Their numbers, ``(b,)``.
-            seeds: Number that each has drawn from its environment's generator, from 0 to ``2**63 - 1``.
-            start: ``(b, K, n)``.
-            goal: ``(b, K, d)`` [m].
+        Seeds are what each has drawn from its environment's generator, from 0 to ``2**63 - 1``.
         """
         self._keys[worlds] = keys = episode_keys(seeds)
         if self._ahead is not None:
@@ -159,11 +155,7 @@ class DisturbedWorlds:
         self._begun = True
 
     def act(self, scene: Scene, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States ``(B, K, n)`` and controls ``(B, K, m)`` that a step truly begins from.
-
-        Args:
-            scene: The worlds.
-            controls: ``(B, K, m)`` as commanded.
+        """States ``(B, K, n)`` and controls ``(B, K, m)`` that a step truly begins from, of those commanded.
 
         Raises:
             ValueError: If a disturbance returns another shape.

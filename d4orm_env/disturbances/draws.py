@@ -20,8 +20,7 @@ Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
 Ahead = dict[tuple[int, int, int, tuple[int, ...]], tuple[int, FloatArray]]
 """Numbers that a single world has drawn ahead in its episode: by kind of number, stream, call and shape the first step,
-and rows of numbers, one for each step from there on.
-rows of numbers, one for each step from there on."""
+and rows of numbers, one for each step from there on."""
 
 _NORMAL, _UNIFORM = range(2)
 """Kinds of number."""

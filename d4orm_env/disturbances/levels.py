@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import MISSING, field
+from functools import partial
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -11,30 +16,34 @@ MAX_DELAY = 1000
 """Most steps of a delay: every world remembers so many."""
 
 
-def standard_deviation(value: object, name: str, most: float = LARGEST) -> float:
-    """``value`` as a number of zero or more.
+Check = Callable[[Any, str], object]
+"""``(value, name) -> value`` as it is kept, or a ``ValueError`` that has the name."""
 
-    Raises:
-        ValueError: If it is none.
-    """
-    return positive_number(value, name, zero_allowed=True, most=most)
+standard_deviation: Callable[[object, str], float] = partial(positive_number, zero_allowed=True, most=LARGEST)
+"""A number of zero or more."""
+share: Callable[[object, str], float] = partial(positive_number, zero_allowed=True, most=1.0)
+"""A probability."""
 
 
-def share(value: object, name: str) -> float:
-    """``value`` as a probability.
+def level(check: Check, default: object = MISSING, **neutral: object) -> Any:
+    """An attribute of a disturbance that is checked; where it is ``off=``, if that is given, nothing is disturbed."""
+    return field(default=default, metadata={"check": check, **neutral})
 
-    Raises:
-        ValueError: If it is not a number from 0 to 1.
-    """
-    return positive_number(value, name, zero_allowed=True, most=1.0)
+
+def unless(special: object, check: Check) -> Check:
+    """The check of all values but a special one."""
+    return lambda value, name: value if value is special or value == special else check(value, name)
+
+
+def truth(value: object, name: str) -> bool:
+    """True or False."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} is {shown(value)}; it must be True or False")
+    return value
 
 
 def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:
-    """One number, or one per control component, of zero or more.
-
-    Raises:
-        ValueError: If it is something else.
-    """
+    """One number, or one per control component, of zero or more."""
     try:
         array = as_float32(value)
     except ValueError:
@@ -49,11 +58,7 @@ def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:
 
 
 def check_components(value: float | tuple[float, ...], name: str, control_size: int) -> None:
-    """Refuse levels that are neither one nor one per control component.
-
-    Raises:
-        ValueError: If they are as many as something else.
-    """
+    """Refuse levels that are neither one nor one per control component."""
     if isinstance(value, tuple) and len(value) != control_size:
         raise ValueError(
             f"{name} has shape ({len(value)},); give one number, or {control_size}, one per control component"

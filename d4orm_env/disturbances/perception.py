@@ -5,7 +5,8 @@ truth stays in infos, rewards and metrics.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Disturbance, Memory, Observed, Scene
 from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.levels import MAX_DELAY, standard_deviation
+from d4orm_env.disturbances.levels import MAX_DELAY, level, standard_deviation, unless
 
 _FARTHEST = 6.0
 """No normal that is drawn lies so many standard deviations from zero."""
@@ -41,32 +42,26 @@ class StateNoise(Disturbance[Scales]):
         heading_std: Of headings [rad].
     """
 
-    position_std: float
-    velocity_std: float = 0.0
-    heading_std: float = 0.0
-
-    def __post_init__(self) -> None:
-        for attribute in fields(self):
-            value = standard_deviation(getattr(self, attribute.name), f"StateNoise {attribute.name}")
-            object.__setattr__(self, attribute.name, value)
+    position_std: float = level(standard_deviation)
+    velocity_std: float = level(standard_deviation, 0.0)
+    heading_std: float = level(standard_deviation, 0.0)
 
     @property
     def negligible(self) -> bool:
         return not (self.position_std or self.velocity_std or self.heading_std)
 
     def check(self, problem: Problem) -> None:
-        models = problem.team.robot_models
-        names = ", ".join(sorted(set(problem.team.models)))
-        if self.velocity_std and not any(model.speed_indices for model in models):
-            raise ValueError(
-                f"StateNoise velocity_std is {self.velocity_std:g}, and no state of {names} holds a velocity; leave it "
-                "out, or use a model that has one"
-            )
-        if self.heading_std and all(model.heading_index is None for model in models):
-            raise ValueError(
-                f"StateNoise heading_std is {self.heading_std:g}, and no state of {names} holds a heading; leave it "
-                "out, or use a model that has one"
-            )
+        models, names = problem.team.robot_models, ", ".join(sorted(set(problem.team.models)))
+        held = {
+            "velocity": (self.velocity_std, any(model.speed_indices for model in models)),
+            "heading": (self.heading_std, any(model.heading_index is not None for model in models)),
+        }
+        for what, (std, is_held) in held.items():
+            if std and not is_held:
+                raise ValueError(
+                    f"StateNoise {what}_std is {std:g}, and no state of {names} holds a {what}; leave it out, or use a "
+                    "model that has one"
+                )
 
     def slack(self, problem: Problem) -> BoundsSlack:
         return BoundsSlack(*(_FARTHEST * std for std in (self.position_std, self.velocity_std, self.heading_std)))
@@ -107,14 +102,7 @@ class StateDelay(Disturbance[Past]):
         steps: Time steps, at most 1000.
     """
 
-    steps: int
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "steps", whole_number(self.steps, "StateDelay steps", 0, MAX_DELAY))
-
-    @property
-    def negligible(self) -> bool:
-        return self.steps == 0
+    steps: int = level(partial(whole_number, minimum=0, maximum=MAX_DELAY), off=0)
 
     def begin(self, scene: Scene, draws: Draws) -> Past:
         parts, length = (scene.states, scene.controls, scene.bodies), self.steps + 1
@@ -139,15 +127,7 @@ class Occlusion(Disturbance[Memory]):
         range: Distance of centres, for obstacles of the centre from their surface [m].
     """
 
-    range: float = math.inf
-
-    def __post_init__(self) -> None:
-        if self.range != math.inf:
-            object.__setattr__(self, "range", positive_number(self.range, "Occlusion range", most=LARGEST))
-
-    @property
-    def negligible(self) -> bool:
-        return self.range == math.inf
+    range: float = level(unless(math.inf, partial(positive_number, most=LARGEST)), math.inf, off=math.inf)
 
     def see(self, seen: Observed, memory: Memory, scene: Scene, draws: Draws) -> Observed:
         if not seen.bodies.shape[1]:
@@ -180,14 +160,7 @@ class RayNoise(Disturbance[Memory]):
         std: Standard deviation [m].
     """
 
-    std: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "std", standard_deviation(self.std, "RayNoise std"))
-
-    @property
-    def negligible(self) -> bool:
-        return self.std == 0
+    std: float = level(standard_deviation, off=0)
 
     def observe(self, observations: FloatArray, layout: ObservationLayout, draws: Draws) -> FloatArray:
         rays = observations[..., layout.rays]

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.portable import cos, sin
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.brakes import brake
 from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Memory, Scene
 from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.levels import share, standard_deviation
+from d4orm_env.disturbances.levels import level, share, standard_deviation, unless
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 
 _NEVER = 2**62
@@ -42,16 +42,8 @@ class Push(Disturbance[Given]):
         speed: [m/s].
     """
 
-    rate: float = 0.2
-    speed: float = 0.3
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "rate", standard_deviation(self.rate, "Push rate"))
-        object.__setattr__(self, "speed", standard_deviation(self.speed, "Push speed"))
-
-    @property
-    def negligible(self) -> bool:
-        return not (self.rate and self.speed)
+    rate: float = level(standard_deviation, 0.2, off=0)
+    speed: float = level(standard_deviation, 0.3, off=0)
 
     def slack(self, problem: Problem) -> BoundsSlack:
         return BoundsSlack(drift=self.speed)
@@ -123,21 +115,9 @@ class Stall(Disturbance[Stops]):
             ``Stall(1.0, robots=1)`` is one robot of the team that is sure to stall.
     """
 
-    probability: float
-    duration: float = math.inf
-    robots: int | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "probability", share(self.probability, "Stall probability"))
-        if self.duration != math.inf:
-            duration = positive_number(self.duration, "Stall duration", zero_allowed=True, most=LARGEST)
-            object.__setattr__(self, "duration", duration)
-        if self.robots is not None:
-            object.__setattr__(self, "robots", whole_number(self.robots, "Stall robots", 1))
-
-    @property
-    def negligible(self) -> bool:
-        return not (self.probability and self.duration)
+    probability: float = level(share, off=0)
+    duration: float = level(unless(math.inf, standard_deviation), math.inf, off=0)
+    robots: int | None = level(unless(None, partial(whole_number, minimum=1)), None)
 
     @property
     def replayable(self) -> bool:
@@ -160,7 +140,7 @@ class Stall(Disturbance[Stops]):
         stalled = memory.now(scene)
         if not stalled.any():
             return states, controls
-        return states, np.where(stalled[..., None], brake(scene, states, stalled), controls)
+        return states, np.where(stalled[..., None], scene.brake(states, stalled), controls)
 
     def effect(self, memory: Stops, scene: Scene) -> DisturbanceEffect:
         stalled = memory.now(scene)
@@ -177,14 +157,7 @@ class Drag(Disturbance[Memory]):
         coefficient: [1/s].
     """
 
-    coefficient: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "coefficient", standard_deviation(self.coefficient, "Drag coefficient"))
-
-    @property
-    def negligible(self) -> bool:
-        return self.coefficient == 0
+    coefficient: float = level(standard_deviation, off=0)
 
     def check(self, problem: Problem) -> None:
         for robot, model in enumerate(problem.team.robot_models):
@@ -212,15 +185,7 @@ class LimitMismatch(Disturbance[Memory]):
         factor: Above 0, at most 1.
     """
 
-    factor: float
-
-    def __post_init__(self) -> None:
-        factor = positive_number(self.factor, "LimitMismatch factor", least=1e-3, most=1.0)
-        object.__setattr__(self, "factor", factor)
-
-    @property
-    def negligible(self) -> bool:
-        return self.factor == 1
+    factor: float = level(partial(positive_number, least=1e-3, most=1.0), off=1)
 
     def limits(self, limits: FloatArray) -> FloatArray:
         limits = limits.copy()

@@ -27,16 +27,9 @@ def checked_states(
     docked: BoolArray,
     bounds: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """``states`` as an array ``(..., K, n)``, as robots may be put into.
+    """``states`` as an array ``(..., K, n)``, as robots may be put into; those ``docked`` ``(..., K)`` must be at rest.
 
-    Args:
-        problem: The problem.
-        states: States as given.
-        docked: ``(..., K)`` bool, robots that must be at rest.
-        bounds: Lowest and highest joint state; see :func:`d4orm_env.envs.joint_state.state_bounds`.
-
-    Raises:
-        ValueError: If a state is none that a robot may be in; the message names the robot.
+    The bounds are the lowest and highest joint state; see :func:`d4orm_env.envs.joint_state.state_bounds`.
     """
     array = frozen_array(states, "states", (*docked.shape, problem.state_size), largest=LARGEST)
     low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
@@ -63,12 +56,7 @@ def usable(actions: FloatArray) -> BoolArray:
 
 
 def check_options(options: object, known: tuple[str, ...] = (), ignored: tuple[str, ...] = ()) -> None:
-    """Refuse what ``reset`` would otherwise ignore.
-
-    Raises:
-        TypeError: If ``options`` is no dictionary.
-        ValueError: For an option that is neither in ``known`` nor in ``ignored``.
-    """
+    """Refuse what ``reset`` would otherwise ignore: an option that is neither in ``known`` nor in ``ignored``."""
     if options is None:
         return
     if not isinstance(options, dict):
@@ -82,11 +70,7 @@ def check_options(options: object, known: tuple[str, ...] = (), ignored: tuple[s
 
 
 def noise_std(value: ArrayLike, control_size: int) -> FloatArray | None:
-    """``(m,)`` standard deviations from one number or one per component; ``None`` where all are zero.
-
-    Raises:
-        ValueError: If it has another shape, or a value is negative, not finite or above 1e6.
-    """
+    """``(m,)`` standard deviations from one number or one per component; ``None`` where all are zero."""
     std = per_component(value, "control_noise_std")
     check_components(std, "control_noise_std", control_size)
     return np.full(control_size, std, np.float32) if np.any(std) else None

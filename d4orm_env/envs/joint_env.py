@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.envs.base_env import BaseEnv
+from d4orm_env.envs.base_env import RENDER_MODES, BaseEnv
 from d4orm_env.envs.inputs import check_options, joint_controls
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.team_step import Info, TeamStep, agent_infos
-from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.scenarios.problems import ScenarioLike
 
 __all__ = ["JointNavigationEnv", "register_environments"]

@@ -115,14 +115,8 @@ def state_bounds(
 ) -> tuple[FloatArray, FloatArray]:
     """Finite bounds that every joint state of an episode keeps.
 
-    A robot gets no farther from its start than its limits allow in ``max_cycles`` steps, and angles do not wind up.
-
-    Args:
-        problem: The problem.
-        places: ``(2, d)`` box that holds every start and goal [m].
-        max_cycles: Steps in an episode.
-        slack: Slack beyond that, for what disturbs the motion or what is seen of it.
-        num_bodies: Number of bodies beside the robots.
+    A robot gets no farther from its start, in the box ``places`` ``(2, d)`` [m], than its limits and the slack allow in
+    ``max_cycles`` steps, and angles do not wind up.
 
     Returns:
         Lowest and highest joint state vector.

@@ -30,13 +30,9 @@ def goal_region(problem: Problem) -> FloatArray:
 
 
 def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> BoolArray:
-    """``(K,)`` which robots are within the goal radius of their goals, at no more than the goal speed.
+    """``(K,)`` which robots in ``states`` ``(K, n)`` are within the goal radius of the goals in ``arrays``.
 
-    Args:
-        team: The robots.
-        arrays: The problem, with their present goals.
-        states: ``(K, n)``.
-        controls: ``(K, m)`` executed last, of which first-order robots' speed is read.
+    That is at no more than the goal speed; that of first-order robots is read from ``controls`` ``(K, m)``.
     """
     offsets = arrays.goal - states[:, : arrays.goal.shape[1]]
     squared_speed = np.zeros(len(states), np.float32)
@@ -51,17 +47,7 @@ def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, control
 
 
 def assign_goals(problem: Problem, robots: NDArray[np.intp], world: WorldBatch, random: np.random.Generator) -> None:
-    """Give some robots of a batch of one world fresh goals, and distances from there.
-
-    Args:
-        problem: The problem.
-        robots: Their numbers.
-        world: The world, which is changed.
-        random: Generator of the draws.
-
-    Raises:
-        RuntimeError: If there is no free place.
-    """
+    """Give some robots of a batch of one world, which is changed, fresh goals and distances from there."""
     positions, goals = world.state[0, :, : problem.dimension], world.goal[0]
     for robot in robots.tolist():
         goals[robot] = fresh_goal(problem, robot, positions, goals, random)
@@ -73,9 +59,10 @@ def assign_goals(problem: Problem, robots: NDArray[np.intp], world: WorldBatch, 
 def fresh_goal(
     problem: Problem, robot: int, positions: FloatArray, goals: FloatArray, random: np.random.Generator
 ) -> FloatArray:
-    """A random goal where ``robot`` would keep the margin to every body, every other goal, obstacles and bounds.
+    """A random goal ``(d,)`` where ``robot`` would keep the margin to every body, other goals, obstacles and bounds.
 
-    Among obstacles it is one that has a free path to the robot's first goal, unless its start has none.
+    It is uniform over the free part of :func:`goal_region`. Among obstacles it is one that has a free path to the
+    robot's first goal, unless its start has none.
 
     Args:
         problem: The problem; its goals are not looked at.
@@ -83,9 +70,6 @@ def fresh_goal(
         positions: ``(K, d)`` where the robots are [m].
         goals: ``(K, d)`` present goals; ``robot``'s own is ignored.
         random: Generator of the draws.
-
-    Returns:
-        ``(d,)`` the goal, uniform over the free and reachable part of :func:`goal_region`.
 
     Raises:
         RuntimeError: If 5120 draws find no free place.

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.chosen import Disturbances, at_work, checked_disturbances
 from d4orm_env.disturbances.controls import ControlNoise
-from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbances, at_work, checked_disturbances
 from d4orm_env.disturbances.perception import RayNoise
 from d4orm_env.envs.inputs import noise_std
 from d4orm_env.envs.rewards import RewardFunction
@@ -124,12 +123,11 @@ class EnvOptions:
             raise ValueError(f"randomize_instance is {shown(self.randomize_instance)}; it must be True, False or None")
         if self.progress not in ("straight", "path"):
             raise ValueError(f"progress is {shown(self.progress)}; it must be 'straight' or 'path'")
-        if not isinstance(self.observed_path, bool):
-            raise ValueError(f"observed_path is {shown(self.observed_path)}; it must be True or False")
+        for name in ("observed_path", "line_of_sight"):
+            if not isinstance(value := getattr(self, name), bool):
+                raise ValueError(f"{name} is {shown(value)}; it must be True or False")
         if not self.observed_rays and any(isinstance(one, RayNoise) for one in self.disturbances):
             raise ValueError("RayNoise is of range sensors, and these robots have none; give observed_rays")
-        if not isinstance(self.line_of_sight, bool):
-            raise ValueError(f"line_of_sight is {shown(self.line_of_sight)}; it must be True or False")
         if self.lifelong and (self.progress == "path" or self.observed_path):
             raise ValueError(
                 "progress='path' and observed_path need goals that stay; leave them out in lifelong mode, which draws "

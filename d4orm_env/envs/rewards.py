@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -78,22 +78,14 @@ class RewardInput:
         rows: int | slice,
     ) -> RewardInput:
         """The step of the worlds in ``rows``, all or one, with what :class:`WorldBatch` does not know."""
-        return cls(
-            previous_states=before.state[rows],
-            states=after.state[rows],
-            controls=after.control[rows],
-            goals=after.goal[rows],
-            previous_distances=before.distance[rows],
-            distances=after.distance[rows],
-            initial_distances=np.float32(1) / after.inverse[rows],
-            previously_arrived=before.docked[rows],
-            arrived=arrived[rows],
-            collided=after.collided[rows],
-            margin_violated=after.violated[rows],
-            paper=paper[rows],
-            team=problem.team,
-            dt=problem.dt,
-        )
+        arrays = {
+            "previous_states": before.state, "states": after.state, "controls": after.control, "goals": after.goal,
+            "previous_distances": before.distance, "distances": after.distance, "previously_arrived": before.docked,
+            "arrived": arrived, "collided": after.collided, "margin_violated": after.violated, "paper": paper,
+        }  # fmt: skip
+        parts: dict[str, Any] = {name: array[rows] for name, array in arrays.items()}
+        initial = np.float32(1) / after.inverse[rows]
+        return cls(**parts, initial_distances=initial, team=problem.team, dt=problem.dt)
 
     @property
     def previous_positions(self) -> FloatArray:
@@ -159,13 +151,9 @@ def paper_reward(step: RewardInput) -> FloatArray:
 def along_paths(step: RewardInput, initial: Floats, previous: Floats, present: Floats) -> RewardInput:
     """The same step with all distances, the paper's reward included, along the shortest paths.
 
-    A distance stays straight where a robot has got to that no path leads from, as inside an obstacle.
-
-    Args:
-        step: One of ``(..., K)``.
-        initial: ``(..., K)`` length of the paths from the starts [m].
-        previous: ``(..., K)`` length from where the robots were before the step [m].
-        present: ``(..., K)`` length from where they are after it [m].
+    ``initial`` are lengths of the paths from the starts, ``previous`` from where robots were before the step, and
+    ``present`` from where they are after it, each ``(..., K)`` [m]. A distance stays straight where a robot has got to
+    that no path leads from, as inside an obstacle.
     """
     straight = step.previous_distances, step.distances
     before, after = (
@@ -188,11 +176,7 @@ REWARDS: Mapping[str, RewardFunction | None] = MappingProxyType({"paper": None, 
 
 
 def find_reward(reward: str | RewardFunction) -> RewardFunction | None:
-    """The function behind ``reward=``; ``None`` for the paper's.
-
-    Raises:
-        ValueError: If it is neither a name that exists nor a callable.
-    """
+    """The function behind ``reward=``; ``None`` for the paper's."""
     if callable(reward):
         return reward
     if not isinstance(reward, str) or reward not in REWARDS:

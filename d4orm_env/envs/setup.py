@@ -10,7 +10,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, frozen_array, whole_number
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.chosen import total_slack
+from d4orm_env.disturbances.disturbance import total_slack
 from d4orm_env.engine.types import OWN_ARRAYS
 from d4orm_env.envs.inputs import checked_cycles
 from d4orm_env.envs.joint_state import state_bounds
@@ -136,22 +136,14 @@ class EnvSetup:
         return self._pool[int(random.integers(self._num_instances))]
 
     def draw(self, random: np.random.Generator) -> Problem:
-        """A new instance of the scenario.
-
-        Raises:
-            ValueError: If the spaces that were made for the first instance do not hold it, or it cannot share a batch
-                with that.
-        """
+        """A new instance of the scenario, refused if the spaces or the batch of the first one do not hold it."""
         assert self._redraw is not None
         drawn, old, region = self._redraw(int(random.integers(2**31))), self.problem, self.region
         points = np.concatenate([drawn.start[:, : old.dimension], drawn.goal])
-        if (
-            drawn.team.models != old.team.models
-            or drawn.team.shapes != old.team.shapes
-            or (drawn.team.control_limits != old.team.control_limits).any()
-            or (points < region[0]).any()
-            or (points > region[1]).any()
-        ):
+        team, former = drawn.team, old.team
+        same = (team.models, team.shapes) == (former.models, former.shapes)
+        same = same and np.array_equal(team.control_limits, former.control_limits)
+        if not same or (points < region[0]).any() or (points > region[1]).any():
             raise ValueError(
                 f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
                 f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes places only"

@@ -16,14 +16,12 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.engine.types import LOOK, RESET, SKIP, STEP, ObservationInputs, WorldBatch, WorldEngine
-from d4orm_env.envs.episode_metrics import EpisodeCounts, episode_metrics
 from d4orm_env.envs.inputs import checked_states
 from d4orm_env.envs.lifelong import assign_goals, reached_goals
-from d4orm_env.envs.range_sensors import sense_ranges
 from d4orm_env.envs.rewards import RewardInput, along_paths, compute_rewards, no_terms
 from d4orm_env.envs.setup import EnvSetup
-from d4orm_env.envs.world_paths import WorldPaths
-from d4orm_env.envs.world_problems import WorldProblems
+from d4orm_env.envs.team_step import EpisodeCounts, episode_metrics
+from d4orm_env.envs.world_problems import WorldPaths, WorldProblems
 from d4orm_env.paths.shortest_paths import observe_paths
 
 _READ_BEFORE = ("state", "distance", "docked", "total_reward")
@@ -85,12 +83,12 @@ class Simulation:
         return np.asarray(self.worlds.terminated | self.worlds.truncated)
 
     def reset_worlds(self, seeds: Mapping[int, int], out: FloatArray, *, others: np.uint8 = LOOK) -> None:
-        """Begin episodes.
+        """Begin episodes, and fill the observations ``out`` ``(B, K, D)``.
 
         Args:
             seeds: Of each world that begins one, the number from 0 to ``2**63 - 1`` that all that is random in it
                 follows from.
-            out: ``(B, K, D)`` observations, output.
+            out: Output.
             others: Order for the other worlds, ``LOOK`` or ``SKIP``.
 
         Raises:
@@ -140,8 +138,7 @@ class Simulation:
             out: ``(B, K, D)`` observations, output.
 
         Raises:
-            ValueError: If the states have another shape, are not finite, faster than the robots may be, outside the
-                state space, have padding that is not zero, or move a docked robot. Contact is allowed.
+            ValueError: If a state is none that a robot may be in; contact is allowed.
         """
         problem, shape = self.problems.all[0], self.worlds.docked.shape
         checked = checked_states(problem, states, docked & problem.docks, self.state_bounds)
@@ -151,7 +148,7 @@ class Simulation:
         self._observe(orders, out)
 
     def episode_metrics(self) -> dict[str, Floats]:
-        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.episode_metrics.episode_metrics`."""
+        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.team_step.episode_metrics`."""
         worlds = self.worlds
         arrival = None if self.setup.lifelong else np.where(worlds.arrival > 0, worlds.arrival, np.inf)
         goals = self._goals_reached if self.setup.lifelong else worlds.docked
@@ -236,7 +233,7 @@ class Simulation:
         """Complete the observations ``out`` ``(B, K, D)`` of the worlds that are not skipped."""
         layout = self.setup.layout
         if not self._observes_apart:
-            sense_ranges(self._engine, layout, self.problems, self.worlds, out)
+            self.problems.sense_ranges(self._engine, self.worlds, out)
             if layout.observed_path:
                 observe_paths(out, layout, self._paths.direction, self._paths.length)
             return
@@ -250,7 +247,7 @@ class Simulation:
             self._engine.observe_worlds(self.problems.seen[world], layout, inputs.select(one), seen[one])
         if layout.observed_path:
             observe_paths(seen, layout, *self._paths.look(worlds, inputs.state))
-        sense_ranges(self._engine, layout, self.problems, self.worlds, seen, None if every else worlds)
+        self.problems.sense_ranges(self._engine, self.worlds, seen, None if every else worlds)
         seen = self._disturbed.observe(seen, layout, self._scene, None if every else worlds)
         if seen is not out:
             out[worlds] = seen

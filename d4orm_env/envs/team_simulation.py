@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.footprint_gaps import touching
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed
-from d4orm_env.disturbances.recorded_events import marks_of
+from d4orm_env.core.trajectory import DisturbanceEvents
+from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, marks_of
 from d4orm_env.envs.joint_state import JointState, join_state
 from d4orm_env.envs.rewards import no_terms
 from d4orm_env.envs.setup import EnvSetup
@@ -123,7 +122,7 @@ class TeamSimulation(Simulation):
         return self._joined(self.true)
 
     def metrics(self) -> dict[str, float]:
-        """The episode so far in numbers; see :func:`d4orm_env.envs.episode_metrics.episode_metrics`."""
+        """The episode so far in numbers; see :func:`d4orm_env.envs.team_step.episode_metrics`."""
         self.require_reset()
         return {name: float(values[0]) for name, values in self.episode_metrics().items()}
 

@@ -1,4 +1,4 @@
-"""Result of a step for a team, and the infos that environments make of it."""
+"""Results of a step for a team, the infos that environments make of it, and numbers of an episode."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 
 Info: TypeAlias = dict[str, Any]
 """Results of an environment beside observations and rewards, by name."""
@@ -54,3 +57,63 @@ def agent_infos(names: Iterable[str], robots: Iterable[int], step: TeamStep) -> 
         }
         for name, robot in zip(names, robots)
     }
+
+
+Counts = NDArray[np.int64]
+
+
+class EpisodeCounts(NamedTuple):
+    """Counts of an episode of one world or, with leading axes, of many.
+
+    Attributes:
+        steps: ``(...)`` steps taken.
+        reward: ``(...)`` sum over steps and robots.
+        goals: ``(..., K)`` goals reached by each robot.
+        contacts: ``(..., K)`` steps in contact.
+        violations: ``(..., K)`` steps within the margin.
+        arrival_step: ``(..., K)`` step since which a robot is at its goal, infinite where it is not; ``None`` in
+            lifelong mode.
+        lost: ``(..., K)`` robots that a disturbance keeps from ever arriving, if there can be any.
+    """
+
+    steps: int | Counts
+    reward: float | Floats
+    goals: Counts | BoolArray
+    contacts: Counts
+    violations: Counts
+    arrival_step: Floats | None
+    lost: BoolArray | None = None
+
+
+def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
+    """Episodes in numbers; ``dt`` is the time step [s].
+
+    Returns:
+        ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
+        ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin; ``collided`` and
+        ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots docked; ``success``:
+        1.0 when all have docked, but for those that are lost, and none was ever in contact; ``travel_time`` and
+        ``makespan``: mean and latest arrival [s], with the time so far for a robot that has not docked. Each ``(...)``
+        float64.
+    """
+    team_size, steps = counts.contacts.shape[-1], np.asarray(counts.steps, np.float64)
+    robot_steps = team_size * np.maximum(steps, 1)
+    reached = counts.goals.sum(axis=-1).astype(np.float64)
+    collided = np.count_nonzero(counts.contacts, axis=-1)
+    metrics = {
+        "steps": steps,
+        "reward": np.asarray(counts.reward / robot_steps),
+        "goals_reached": reached,
+        "goals_per_robot_minute": 60 * reached / (robot_steps * dt),
+        "collisions": counts.contacts.sum(axis=-1).astype(np.float64),
+        "margin_violations": counts.violations.sum(axis=-1).astype(np.float64),
+        "collided": np.asarray(collided, np.float64),
+        "margin_violated": np.asarray(np.count_nonzero(counts.violations, axis=-1), np.float64),
+    }
+    if counts.arrival_step is None:
+        return metrics
+    times = np.minimum(counts.arrival_step * dt, (steps * dt)[..., None])
+    there = counts.goals > 0 if counts.lost is None else (counts.goals > 0) | counts.lost
+    success = (there.all(axis=-1) & (np.asarray(collided) == 0)).astype(np.float64)
+    arrivals = {"travel_time": times.mean(axis=-1), "makespan": times.max(axis=-1)}
+    return metrics | {"arrived": reached.copy(), "success": success} | arrivals

@@ -20,8 +20,7 @@ from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.simulation import Simulation
 from d4orm_env.envs.team_step import Info
-from d4orm_env.envs.vector_infos import final_infos, masked
-from d4orm_env.envs.vector_inputs import checked_autoreset_mode, reset_mask, world_seeds
+from d4orm_env.envs.vector_io import checked_autoreset_mode, final_infos, masked, reset_mask, world_seeds
 from d4orm_env.scenarios.problems import ScenarioLike
 
 __all__ = ["NavigationVectorEnv"]
@@ -213,7 +212,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         return np.concatenate([part.reshape(self.num_envs, -1).astype(np.float32) for part in parts], axis=1)
 
     def metrics(self) -> dict[str, NDArray[np.float64]]:
-        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.episode_metrics.episode_metrics`.
+        """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.team_step.episode_metrics`.
 
         Raises:
             RuntimeError: Before the first reset.

@@ -1,14 +1,19 @@
-"""The problems of a batch of worlds, as the engines read them."""
+"""The problems of a batch of worlds as the engines read them, shortest paths in them, and range sensors."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
-from d4orm_env.engine.types import WorldBatch
+from d4orm_env.engine.types import WorldBatch, WorldEngine
 from d4orm_env.envs.setup import EnvSetup
+from d4orm_env.paths.shortest_paths import ahead_in_each
 
 
 class WorldProblems:
@@ -50,6 +55,22 @@ class WorldProblems:
         worlds.start[world], worlds.goal[world] = problem.start, problem.goal
         worlds.inverse[world] = problem.arrays.inverse_initial_distance
 
+    def sense_ranges(
+        self, engine: WorldEngine, batch: WorldBatch, out: FloatArray, worlds: NDArray[np.intp] | None = None
+    ) -> None:
+        """Fill the rays of the observations ``out`` ``(b, K, D)`` of some worlds, or of all, as these truly are."""
+        layout = self._setup.layout
+        if not layout.num_rays:
+            return
+        rows = slice(None) if worlds is None else worlds
+        state, bodies = batch.state[rows], batch.bodies[rows]
+        if self.alike:
+            engine.cast_rays(self.true[0], layout, state, bodies, out)
+            return
+        for row, world in enumerate(range(len(out)) if worlds is None else worlds):
+            one = slice(row, row + 1)
+            engine.cast_rays(self.true[world], layout, state[one], bodies[one], out[one])
+
     def _arrays_of(self, problem: Problem) -> tuple[ProblemArrays, ProblemArrays]:
         seen = problem.arrays_to_observe(self._setup.layout.num_obstacles)
         true = seen
@@ -59,3 +80,38 @@ class WorldProblems:
             # A goal radius that nothing is within: a robot under way to its next goal neither docks nor stops.
             true = true._replace(squared_goal_radius=np.float32(-1))
         return seen, true
+
+
+class WorldPaths:
+    """Paths of ``B`` worlds to the goals, as they were last looked for.
+
+    Args:
+        problems: Of each world; it may change.
+        one_world: Whether all are one.
+
+    Attributes:
+        direction: ``(B, K, d)`` unit vectors.
+        length: ``(B, K)`` [m].
+    """
+
+    def __init__(self, problems: Sequence[Problem], *, one_world: bool) -> None:
+        self._problems, self._one_world = problems, one_world
+        shape = len(problems), problems[0].num_robots
+        self.direction: Floats = np.zeros((*shape, problems[0].dimension))
+        self.length: Floats = np.zeros(shape)
+
+    @property
+    def first_length(self) -> Floats:
+        """``(B, K)`` length of the paths from the starts [m]."""
+        return np.stack([problem.shortest_paths.length for problem in self._problems])
+
+    def update(self, worlds: NDArray[np.intp], states: FloatArray) -> None:
+        """Look for the paths in some worlds, where the robots are in ``states`` ``(B, K, n)``."""
+        self.direction[worlds], self.length[worlds] = self.look(worlds, states[worlds])
+
+    def look(self, worlds: NDArray[np.intp], states: FloatArray) -> tuple[Floats, Floats]:
+        """Directions ``(b, K, d)`` and lengths ``(b, K)`` of paths in some worlds, from ``states`` ``(b, K, n)``."""
+        positions = states[..., : self.direction.shape[-1]]
+        if self._one_world:
+            return self._problems[0].shortest_paths.ahead(positions)
+        return ahead_in_each([self._problems[world].shortest_paths for world in worlds], positions)

@@ -9,7 +9,6 @@ if find_spec("mujoco") is None:
     raise ImportError("rigid bodies need MuJoCo; install it with: pip install 'd4orm-env[mujoco]'")
 
 from d4orm_env.mujoco.environment import env, parallel_env, raw_env
-from d4orm_env.mujoco.physics import Physics
-from d4orm_env.mujoco.scene import check_problem
+from d4orm_env.mujoco.scene import Physics, check_problem
 
 __all__ = ["Physics", "check_problem", "env", "parallel_env", "raw_env"]

@@ -1,4 +1,4 @@
-"""Pictures of a scene by MuJoCo's own renderer, without a screen."""
+"""Rendering of MuJoCo's environments: by MuJoCo where OpenGL draws without a screen, else by our own pictures."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.envs.base_env import Frame, Viewer
+from d4orm_env.envs.body_simulation import BodySimulation
+from d4orm_env.envs.team_simulation import TeamSimulation
+from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_env.mujoco.scene import colour
 
 PLATFORMS = ("egl", "osmesa")
@@ -101,3 +105,56 @@ class Camera:
         self._gl.make_current()
         self._context.free()
         self._gl.free()
+
+
+RENDERERS = ("auto", "mujoco", "pictures")
+"""Renderers of frames."""
+
+
+class MujocoViewer(Viewer):
+    """Draws a simulation in the environment's render mode.
+
+    Args:
+        render_mode: As of :class:`~d4orm_env.envs.base_env.Viewer`.
+        renderer: One of :data:`RENDERERS`; ``"auto"`` becomes what is there when the first frame is drawn.
+    """
+
+    def __init__(self, render_mode: str | None, renderer: str) -> None:
+        super().__init__(render_mode)
+        self.renderer = renderer if render_mode == "rgb_array" else "pictures"
+        self._camera: Camera | None = None
+        self._looks_at: object = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return super().__getstate__() | {"_camera": None, "_looks_at": None}
+
+    def render(self, simulation: TeamSimulation) -> Frame | None:
+        """``(height, width, 3)`` uint8 frame in mode ``"rgb_array"``, else ``None``.
+
+        Raises:
+            NoCameraError: If MuJoCo is to draw and OpenGL cannot.
+        """
+        assert isinstance(simulation, BodySimulation)
+        if self.renderer != "pictures":
+            simulation.require_reset()
+            bodies = simulation.bodies
+            assert isinstance(bodies, TeamBodies)
+            try:
+                if self._camera is None or self._looks_at is not bodies:
+                    self.close()
+                    self._camera, self._looks_at = Camera(bodies.scene.model, bodies.problem), bodies
+            except NoCameraError:
+                if self.renderer == "mujoco":
+                    raise
+                self.renderer = "pictures"
+            else:
+                self.renderer = "mujoco"
+                return self._camera.draw(bodies.data, simulation.goals)
+        return super().render(simulation)
+
+    def close(self) -> None:
+        """Close window, picture and camera; a later frame opens new ones."""
+        super().close()
+        if self._camera is not None:
+            self._camera.close()
+        self._camera = self._looks_at = None

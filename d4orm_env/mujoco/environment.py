@@ -9,13 +9,12 @@ from pettingzoo.utils import OrderEnforcingWrapper
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray, shown
+from d4orm_env.envs.base_env import RENDER_MODES
 from d4orm_env.envs.body_simulation import BodySimulation
 from d4orm_env.envs.options import EnvOptions
-from d4orm_env.envs.viewer import RENDER_MODES
 from d4orm_env.mujoco.bodies import TeamBodies
-from d4orm_env.mujoco.mujoco_viewer import RENDERERS, MujocoViewer
-from d4orm_env.mujoco.physics import Physics
-from d4orm_env.mujoco.scene import check_problem
+from d4orm_env.mujoco.camera import RENDERERS, MujocoViewer
+from d4orm_env.mujoco.scene import Physics, check_problem
 from d4orm_env.navigation_v0 import AECNavigationEnv
 from d4orm_env.scenarios.problems import ScenarioLike
 

@@ -10,8 +10,9 @@ import numpy as np
 from d4orm_env.core.arrays import Floats, IntArray, Ints
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.paths.lattice import Lattice, corner_below
 from d4orm_env.paths.spaces import Place, Space, clearance_at, distance, place_of, sees
-from d4orm_env.paths.wavefront import NOBODY, Front, Lattice, corner_below
+from d4orm_env.paths.wavefront import NOBODY, Front
 
 
 class Fields(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,16 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
-from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.world import World
 
 if TYPE_CHECKING:
+    from d4orm_env.paths import lattice as grids
     from d4orm_env.paths import looking, spaces, wavefront
+    from d4orm_env.paths.lattice import Lattice
     from d4orm_env.paths.looking import Fields
     from d4orm_env.paths.spaces import Space
-    from d4orm_env.paths.wavefront import Front, Lattice
+    from d4orm_env.paths.wavefront import Front
 else:
+    grids = LazyModule("d4orm_env.paths.lattice")
     looking = LazyModule("d4orm_env.paths.looking")
     spaces = LazyModule("d4orm_env.paths.spaces")
     wavefront = LazyModule("d4orm_env.paths.wavefront")
@@ -30,13 +30,8 @@ else:
 
 MAX_NODES, MAX_NODES_IN_ALL = 2**21, 2**24
 """Most nodes of a grid, and of the grids of all robots together; coarser ones where there would be more."""
-MAX_POINTS = 2**24
-"""Most points of a grid, blocked ones included."""
-
 STEP = 0.5
 """Distance of neighbouring nodes, as a share of the robot's radius and margin."""
-STRETCH = 1.05
-"""Least factor by which the next grid is coarser where one has too many points."""
 REFINEMENTS = 2
 """Number of times that a robot without a path is tried again, each time on a grid that is twice as fine."""
 
@@ -98,6 +93,20 @@ class ShortestPaths:
             anchor = int(fields.parents[first + anchor])
         points = np.stack(corners)
         return points[np.append(True, (np.diff(points, axis=0) != 0).any(axis=1))]
+
+    def check_reachable(self) -> None:
+        """Raise ``ValueError``, which names them, if robots have no path."""
+        robots = np.flatnonzero(np.isinf(self.length))
+        if len(robots):
+            names = ", ".join(f"robot_{robot}" for robot in robots)
+            reach = sorted(
+                {f"{radius + self.problem.margin:.4g}" for radius in np.asarray(self.problem.team.radius)[robots]}
+            )
+            raise ValueError(
+                f"{names} {'has' if len(robots) == 1 else 'have'} no path from start to goal that is "
+                f"{' or '.join(reach)} m clear of obstacles; move the start or the goal, open the world there, or use "
+                f"a smaller radius or margin"
+            )
 
     def _look(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Return the next position to head for, and the whole distance."""
@@ -200,81 +209,8 @@ def _first_or_finer(problem: Problem, space: Space, reach: float, before: Lattic
     """The lattice that paths are looked for on at first, or one that is twice as fine as the one before."""
     most = min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
     if before is None:
-        return lay_lattice(problem, space, reach, STEP * reach, most, MAX_NODES)
-    return lay_lattice(problem, space, reach, before.step / 2, most, MAX_POINTS)
-
-
-def lay_lattice(
-    problem: Problem,
-    space: Space | None,
-    reach: float,
-    step: float,
-    most: int,
-    most_points: int = MAX_POINTS,
-    pad: float = 0.0,
-) -> Lattice:
-    """Nodes so far apart wherever paths may lead; farther apart where there would be too many.
-
-    Args:
-        problem: The starts, goals and bounds.
-        space: Its obstacles; ``None`` where there are none.
-        reach: Radius that must fit at a node [m].
-        step: Distance of neighbouring nodes [m], at least: that of the lattice is said by its ``step``.
-        most: Most nodes.
-        most_points: Most points, blocked ones included.
-        pad: Distance beyond starts, goals and obstacles that paths may lead, at least twice the reach [m].
-    """
-    low, high = _extent(problem, space, max(pad, 2 * reach))
-    most_points = most if space is None else most_points
-    while True:
-        while np.floor((high - low) / step + 1).prod() > most_points:
-            step *= STRETCH
-        lattice = _empty_lattice(low, high, step, most)
-        count = _fill(lattice, problem.world, space, reach)
-        if count <= most:
-            return lattice._replace(points=lattice.points[:count].copy(), places=lattice.places[:count].copy())
-        step *= STRETCH * root(count / most, problem.dimension)
-
-
-def _extent(problem: Problem, space: Space | None, pad: float) -> tuple[Floats, Floats]:
-    """Lowest and highest corner of where paths may lead [m]."""
-    d, bounds = problem.dimension, problem.world.bounds.astype(np.float64)
-    places = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
-    if space is not None:
-        obstacles = space.extent[:, :d]
-        places = np.concatenate([places, np.where(np.isinf(obstacles), problem.goal[0], obstacles)])
-    return np.maximum(places.min(axis=0) - pad, bounds[0]), np.minimum(places.max(axis=0) + pad, bounds[1])
-
-
-def _empty_lattice(low: Floats, high: Floats, step: float, most: int) -> wavefront.Lattice:
-    """The points of a lattice in the middle between two corners, and room for so many nodes."""
-    d = len(low)
-    size, flat = np.floor((high - low) / step).astype(np.int64) + 1, [0] * (3 - d)
-    count = min(int(size.prod()), most)
-    return wavefront.Lattice(
-        low=np.append((low + high - (size - 1) * step) / 2, flat).astype(np.float64),
-        step=step,
-        size=np.append(size, [1] * (3 - d)).astype(np.int64),
-        moves=np.array([(*move, *flat) for move in product((-1, 0, 1), repeat=d) if any(move)]),
-        nodes=np.empty(size.prod(), np.int32),
-        points=np.empty(count, np.int32),
-        places=np.empty((count, 3)),
-    )
-
-
-def _fill(lattice: Lattice, world: World, space: Space | None, reach: float) -> int:
-    """Find the nodes of a lattice, and write as many as there is room for; how many there are."""
-    if space is not None:
-        return wavefront.settle_nodes(space, lattice, reach)
-    bounds, d = world.bounds.astype(np.float64), world.dimension
-    lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * lattice.step
-    free = ((lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)).all(axis=1)
-    inside = np.flatnonzero(free)
-    count = len(inside)
-    lattice.nodes[:] = -1
-    lattice.nodes[inside] = np.arange(count)
-    lattice.points[:count], lattice.places[:count] = inside, lattice.places[inside]
-    return count
+        return grids.lay_lattice(problem, space, reach, STEP * reach, most, MAX_NODES)
+    return grids.lay_lattice(problem, space, reach, before.step / 2, most)
 
 
 def in_space(places: Floats) -> Floats:

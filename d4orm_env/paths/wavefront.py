@@ -14,40 +14,16 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numba.extending import register_jitable
 
-from d4orm_env.core.arrays import BoolArray, Floats, IntArray, Ints, Whole
+from d4orm_env.core.arrays import BoolArray, Floats, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-from d4orm_env.paths.spaces import Place, Space, about_to_obstacles, clearance_at, distance, place_of, sees, to_bounds
+from d4orm_env.paths.lattice import Lattice, corner_below, indices_of, neighbour, settled
+from d4orm_env.paths.spaces import Place, Space, clearance_at, distance, place_of, sees
 
 _HALVINGS = 6
 """Number of halvings of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
-_PUSHES, _SLACK = 4, 0.03
-"""Number of times a node is pushed away from an obstacle, and the excess of a push, as a share of the reach; a third of
-it each time, so as to end in the middle of narrow gaps."""
 NOBODY = np.int32(-1)
 """In place of an anchor that is not there."""
-
-
-class Lattice(NamedTuple):
-    """A grid whose free points are the nodes of a wavefront, both numbered with the last axis fastest.
-
-    Attributes:
-        low: ``(3,)`` the first point [m].
-        step: Between neighbours along an axis [m].
-        size: ``(3,)`` int64 points along each axis.
-        moves: ``(M, 3)`` int64 to the neighbours of a point.
-        nodes: ``(G,)`` int32 the node of each point; -1 where it is not free.
-        points: ``(N,)`` int32 the point of each node.
-        places: ``(N, 3)`` where each node is [m].
-    """
-
-    low: Floats
-    step: float
-    size: IntArray
-    moves: IntArray
-    nodes: Ints
-    points: Ints
-    places: Floats
 
 
 class Front(NamedTuple):
@@ -66,30 +42,6 @@ class Front(NamedTuple):
     values: Floats
     parents: Ints
     room: float
-
-
-@inlined
-def _indices(size: IntArray, n: Whole) -> tuple[int, int, int]:
-    """Steps to a point along each axis."""
-    return n // (size[2] * size[1]), n // size[2] % size[1], n % size[2]
-
-
-@inlined
-def corner_below(low: Floats, step: float, size: IntArray, q: Place) -> tuple[int, int, int]:
-    """Steps along each axis to the point below a place, or to the outermost one."""
-    i = min(max(np.int64((q[0] - low[0]) / step), 0), size[0] - 1)
-    j = min(max(np.int64((q[1] - low[1]) / step), 0), size[1] - 1)
-    return i, j, min(max(np.int64((q[2] - low[2]) / step), 0), size[2] - 1)
-
-
-@inlined
-def _neighbour(lattice: Lattice, move: int, i: int, j: int, k: int) -> np.int64:
-    """The node next to a point; -1 where none is."""
-    ni, nj, nk = i + lattice.moves[move, 0], j + lattice.moves[move, 1], k + lattice.moves[move, 2]
-    size = lattice.size
-    if ni < 0 or nj < 0 or nk < 0 or ni >= size[0] or nj >= size[1] or nk >= size[2]:
-        return np.int64(-1)
-    return np.int64(lattice.nodes[(ni * size[1] + nj) * size[2] + nk])
 
 
 @inlined
@@ -120,60 +72,6 @@ def _turned(space: Space, reach: float, a: Place, own: float, p: Place, q: Place
             else:
                 high = cut
     return one, other
-
-
-@compiled
-def _settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tuple[Place, bool]:
-    """The place, or if a body of this reach does not fit there one less than half a step away where it does.
-
-    And whether it does.
-    """
-    half, probe, slack = lattice.step / 2, lattice.step / 64, reach * _SLACK
-    x, y, z = place
-    clearance = clearance_at(space, x, y, z)
-    for _ in range(_PUSHES):
-        if clearance > reach or clearance < reach - lattice.step:
-            break
-        gx = clearance_at(space, x + probe, y, z) - clearance_at(space, x - probe, y, z)
-        gy = clearance_at(space, x, y + probe, z) - clearance_at(space, x, y - probe, z)
-        gz = clearance_at(space, x, y, z + probe) - clearance_at(space, x, y, z - probe)
-        norm = np.sqrt(gx * gx + gy * gy + gz * gz)
-        if norm == 0.0:
-            break
-        push = (reach + slack - clearance) / norm
-        slack /= 3
-        x = min(max(x + push * gx, place[0] - half), place[0] + half)
-        y = min(max(y + push * gy, place[1] - half), place[1] + half)
-        z = min(max(z + push * gz, place[2] - half), place[2] + half)
-        clearance = clearance_at(space, x, y, z)
-    return (x, y, z), clearance > reach
-
-
-@cached_kernel(variant="settle", **OPTIONS)
-def settle_nodes(space: Space, lattice: Lattice, reach: float) -> int:
-    """Find the points of a lattice where a body of this reach fits, if that is less than half a step away.
-
-    Returns:
-        How many there are; as many as there is room for are written as nodes.
-    """
-    low, step, count = lattice.low, lattice.step, 0
-    for n in range(lattice.nodes.shape[0]):
-        i, j, k = _indices(lattice.size, n)
-        place = (low[0] + i * step, low[1] + j * step, low[2] + k * step)
-        fits = (
-            about_to_obstacles(space, place[0], place[1], place[2])
-            > reach
-            < to_bounds(space, place[0], place[1], place[2])
-        )
-        if not fits:
-            place, fits = _settled(space, lattice, reach, place)
-        lattice.nodes[n] = count if fits else -1
-        if fits:
-            if count < lattice.points.shape[0]:
-                lattice.points[count] = n
-                lattice.places[count, 0], lattice.places[count, 1], lattice.places[count, 2] = place
-            count += 1
-    return count
 
 
 class _Nodes(NamedTuple):
@@ -214,10 +112,10 @@ def _seen_anchor(
     n: Whole,
 ) -> tuple[np.int32, float]:
     """The best anchor of the neighbours of a node that it sees, and the path by it; -1 for none."""
-    (i, j, k), q, tried = _indices(lattice.size, lattice.points[n]), place_of(lattice.places, n), nodes.tried
+    (i, j, k), q, tried = indices_of(lattice.size, lattice.points[n]), place_of(lattice.places, n), nodes.tried
     best, chosen, count = np.inf, NOBODY, 0
     for move in range(lattice.moves.shape[0]):
-        p = _neighbour(lattice, move, i, j, k)
+        p = neighbour(lattice, move, i, j, k)
         if p < 0 or not nodes.done[p]:
             continue
         a = nodes.anchor[p]
@@ -243,16 +141,16 @@ def _detour(
 
     In a narrow gap neighbours may see each other by way of a place between them only; elsewhere it is ``q``.
     """
-    i, j, k = _indices(lattice.size, lattice.points[n])
+    i, j, k = indices_of(lattice.size, lattice.points[n])
     best, through, bend = np.inf, np.int64(-1), q
     for straight in (True, False):
         for move in range(lattice.moves.shape[0]):
-            p = _neighbour(lattice, move, i, j, k)
+            p = neighbour(lattice, move, i, j, k)
             if p < 0 or not nodes.done[p]:
                 continue
             place, c, fits = place_of(lattice.places, p), q, True
             if not straight:
-                c, fits = _settled(space, lattice, reach, _between(place, q, 0.5))
+                c, fits = settled(space, lattice, reach, _between(place, q, 0.5))
             length = nodes.value[p] + distance(place, c) + distance(c, q)
             if not fits or length >= best or not sees(space, reach, place, reach, c, reach):
                 continue
@@ -303,9 +201,9 @@ def _pass_on(
     heap: Heap,
 ) -> None:
     """Give the neighbours of node ``n`` paths by its anchor ``a`` at a place of clearance ``own``, if shorter."""
-    i, j, k = _indices(lattice.size, lattice.points[n])
+    i, j, k = indices_of(lattice.size, lattice.points[n])
     for move in range(lattice.moves.shape[0]):
-        p = _neighbour(lattice, move, i, j, k)
+        p = neighbour(lattice, move, i, j, k)
         if p < 0 or nodes.done[p]:
             continue
         place = place_of(lattice.places, p)

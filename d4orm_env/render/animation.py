@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from d4orm_env.core.arrays import positive_number, whole_number
-from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 from d4orm_env.render.frames import FrameRenderer
 from d4orm_env.render.panels import picture_palette, view_limits
 from d4orm_env.render.pictures import checked_trajectory, contact_points

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.lines import Line2D
 
-from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import DisturbanceEvents
 from d4orm_env.render.panels import BODY, INK, PUSH, Array, Axes2D
 
 _ARROW_SECONDS = 1.0
@@ -51,15 +51,13 @@ class MarkLayer:
         self.bodies.set_verts(self.panel.outlines(now[:, :d], now[:, -1]))
         # A body that has left comes again somewhere else, or is absent.
         moved, speed = (np.linalg.norm(part, axis=-1) for part in (np.diff(bodies[..., :d], axis=0), bodies[..., d:-1]))
-        jumps = (moved > 2 * self.problem.dt * np.maximum(speed[1:], speed[:-1])) | (
-            np.diff(bodies[..., -1], axis=0) != 0
-        )
+        far = moved > 2 * self.problem.dt * np.maximum(speed[1:], speed[:-1])
+        jumps = far | (np.diff(bodies[..., -1], axis=0) != 0)
         flat = self.panel.flatten(bodies[..., :d])
         flat[bodies[..., -1] == 0] = np.nan
         parts = [np.split(flat[:, i], np.flatnonzero(jumps[:, i]) + 1) for i in range(bodies.shape[1])]
-        self.paths.set_segments(
-            [path for paths in parts for path in paths if len(path) > 1 and np.isfinite(path).all()]
-        )
+        whole = [path for paths in parts for path in paths if len(path) > 1 and np.isfinite(path).all()]
+        self.paths.set_segments(whole)
 
     def _draw_pushes(self, pushed: Array, positions: Array, begin: int) -> None:
         given = np.asarray(pushed[begin:], np.float64)

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import DisturbanceEvents
 from d4orm_env.render.event_marks import MarkLayer
 from d4orm_env.render.panels import INK, Array, Axes2D, TeamLayer, make_axes, view_limits
 from d4orm_env.render.style import own_style
@@ -136,16 +136,11 @@ class FrameRenderer:
     def _keep_in_view(self, places: Array) -> None:
         reach = np.max(self.problem.team.radius)
         lower, upper = places.min(axis=0) - reach, places.max(axis=0) + reach
-        if (lower < self._limits[0]).any() or (upper > self._limits[1]).any():
-            room = 0.15 * (self._limits[1] - self._limits[0])
-            self._build(
-                np.stack(
-                    [
-                        np.where(lower < self._limits[0], lower - room, self._limits[0]),
-                        np.where(upper > self._limits[1], upper + room, self._limits[1]),
-                    ]
-                )
-            )
+        low, high = self._limits
+        if (lower < low).any() or (upper > high).any():
+            room = 0.15 * (high - low)
+            lower, upper = np.where(lower < low, lower - room, low), np.where(upper > high, upper + room, high)
+            self._build(np.stack([lower, upper]))
 
     @own_style()
     def _paint(self) -> NDArray[np.uint8]:

@@ -1,8 +1,12 @@
-"""Still pictures of a trajectory, with matplotlib."""
+"""Still pictures of a trajectory with matplotlib, and as HTML for notebooks."""
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Iterable
 from functools import partial
+from html import escape
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from d4orm_env.core.disturbance_events import DisturbanceEvents
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.summary_line import count
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.summary_line import KeyFigure, count
+from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 from d4orm_env.render.event_marks import MarkLayer, mark_legend
 from d4orm_env.render.panels import (
     CONTACT,
@@ -130,12 +133,8 @@ def _draw_history(layer: TeamLayer, trajectory: Trajectory) -> None:
 
 def _draw_starts(layer: TeamLayer) -> None:
     panel, start = layer.panel, layer.problem.start
-    panel.polygons(
-        layer.body_outlines(start),
-        **layer.hollow,
-        linewidths=layer.goals.get_linewidth(),
-        zorder=2.5,
-    )
+    outlines, width = layer.body_outlines(start), layer.goals.get_linewidth()
+    panel.polygons(outlines, **layer.hollow, linewidths=width, zorder=2.5)
     panel.segments(layer.heading_lines(start), colors=layer.colors[layer.drives], linewidths=1.2, zorder=2.5)
 
 
@@ -246,3 +245,39 @@ def save_picture(
         with own_style({"svg.hashsalt": "d4orm", "pdf.fonttype": 42}):
             figure.savefig(temporary, format=kind, dpi=160, metadata=undated.get(kind))
     return path
+
+
+_DPI = 72
+
+
+def motion_html(problem: Problem, trajectory: Trajectory, title: str, rows: Iterable[KeyFigure]) -> str:
+    """A motion of a team: its picture and its key figures, escaped."""
+    return _page(title, rows, plot_trajectory(problem, trajectory, title=""))
+
+
+def problem_html(problem: Problem, title: str, rows: Iterable[KeyFigure]) -> str:
+    """A problem: its picture and its key figures, escaped."""
+    return _page(title, rows, plot_problem(problem))
+
+
+@own_style()
+def paths_html(trajectory: Trajectory, title: str, rows: Iterable[KeyFigure]) -> str:
+    """A motion whose world is not known: where the robots went, seen from above, and its key figures, escaped."""
+    figure = Figure(figsize=(4.6, 4.6), layout="constrained")
+    axes = figure.add_subplot(111, aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    x, y = trajectory.positions[..., 0], trajectory.positions[..., 1]
+    axes.plot(x, y, linewidth=1)
+    axes.plot(x[-1:], y[-1:], "o")
+    return _page(title, rows, figure)
+
+
+@own_style()
+def _page(title: str, rows: Iterable[KeyFigure], figure: Figure) -> str:
+    stream = BytesIO()
+    figure.savefig(stream, format="png", dpi=_DPI)
+    picture = base64.b64encode(stream.getvalue()).decode()
+    table = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
+    return (
+        f'<div><strong>{escape(title)}</strong><div style="display:flex;flex-wrap:wrap;gap:1em;align-items:center">'
+        f'<img alt="{escape(title)}" src="data:image/png;base64,{picture}"><table>{table}</table></div></div>'
+    )

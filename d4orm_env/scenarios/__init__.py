@@ -6,8 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from d4orm_env.scenarios.maps import load_map
-from d4orm_env.scenarios.problems import make_problem
-from d4orm_env.scenarios.scenario_registry import describe_scenario, list_scenarios, register_scenario
+from d4orm_env.scenarios.problems import describe_scenario, list_scenarios, make_problem, register_scenario
 
 if TYPE_CHECKING:
     from d4orm_env.scenarios.dynobench import load_dynobench

@@ -85,15 +85,9 @@ def _last_reached(
 
 @lru_cache(maxsize=4)
 def free_space(world: World, reach: float, step: float) -> FreeSpace:
-    """The free space of a world with bounds.
+    """The free space of a world with bounds for robots whose centres keep ``reach`` to everything [m].
 
-    Args:
-        world: Obstacles and bounds.
-        reach: Distance that a robot's centre keeps to them [m].
-        step: Of the lattice, which begins at the lower bounds [m].
-
-    Raises:
-        ValueError: If the lattice gets too large.
+    The lattice begins at the lower bounds, in steps of ``step`` [m].
     """
     low, high = world.bounds.astype(np.float64)
     shape = ((high - low) / step + 1).astype(int)

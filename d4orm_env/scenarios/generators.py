@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -126,50 +126,40 @@ def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = N
     return build(settings, Layout(starts, goals, World(dimension=dimension), distance, area))
 
 
-def amswarm_1(settings: Settings, *, jitter: float = 0.0) -> Problem:
-    """AMSwarm environment 1: ten 3D robots on a circle, no obstacles.
+AMSWARM: Mapping[str, tuple[str, Sequence[tuple[float, float]]]] = {
+    "amswarm_1": ("ten 3D robots on a circle, no obstacles", ()),
+    "amswarm_2": ("five cylinders close together in the centre", ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))),
+    "amswarm_3": ("four cylinders around the centre", ((0, 1), (0, -1), (1, 0), (-1, 0))),
+    "amswarm_4": (
+        "a cylinder in the centre and four at the corners of a square", ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+    ),
+    "amswarm_5": ("five cylinders, to one side", ((0, 0), (0, 1), (0, -1), (-1, 1), (-1, -1))),
+}  # fmt: skip
+"""Environments of AMSwarm, and where their cylinders are; see :func:`amswarm`."""
 
-    The paper's comparison with AMSwarm (section VIII): ``holonomic3d`` robots of radius 0.29 m with margin 0.05 m,
-    antipodal on a circle of radius 2.5 m in the plane z = 0, in bounds of +-3 m. The obstacles of the other
-    environments are vertical cylinders of radius 0.2 m.
+
+def amswarm(centres: Sequence[tuple[float, float]], settings: Settings, *, jitter: float = 0.0) -> Problem:
+    """Ten 3D robots among cylinders: the paper's comparison with AMSwarm (section VIII).
+
+    ``holonomic3d`` robots of radius 0.29 m with margin 0.05 m, antipodal on a circle of radius 2.5 m in the plane
+    z = 0, in bounds of +-3 m. The obstacles are vertical cylinders of radius 0.2 m.
 
     Args:
+        centres: x and y of the cylinders [m].
         settings: The common arguments; ten robots.
         jitter: Each coordinate of each start is moved by a uniform random number within +-``jitter`` [m].
     """
-    return _amswarm(settings, jitter, ())
-
-
-def amswarm_2(settings: Settings, *, jitter: float = 0.0) -> Problem:
-    """AMSwarm environment 2: five cylinders close together in the centre.
-
-    Cylinders at (0, 0), (+-0.5, 0) and (0, +-0.5); the rest as :func:`amswarm_1`.
-    """
-    return _amswarm(settings, jitter, ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)))
-
-
-def amswarm_3(settings: Settings, *, jitter: float = 0.0) -> Problem:
-    """AMSwarm environment 3: four cylinders around the centre.
-
-    Cylinders at (0, +-1) and (+-1, 0); the rest as :func:`amswarm_1`.
-    """
-    return _amswarm(settings, jitter, ((0, 1), (0, -1), (1, 0), (-1, 0)))
-
-
-def amswarm_4(settings: Settings, *, jitter: float = 0.0) -> Problem:
-    """AMSwarm environment 4: a cylinder in the centre and four at the corners of a square.
-
-    Cylinders at (0, 0) and (+-1, +-1); the rest as :func:`amswarm_1`.
-    """
-    return _amswarm(settings, jitter, ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)))
-
-
-def amswarm_5(settings: Settings, *, jitter: float = 0.0) -> Problem:
-    """AMSwarm environment 5: five cylinders, to one side.
-
-    Cylinders at (0, 0), (0, +-1) and (-1, +-1); the rest as :func:`amswarm_1`.
-    """
-    return _amswarm(settings, jitter, ((0, 0), (0, 1), (0, -1), (-1, 1), (-1, -1)))
+    _require_space(settings)
+    if settings.num_robots != 10:
+        raise ValueError(
+            f"num_robots is {settings.num_robots}; scenario {settings.scenario!r} has exactly 10 robots, so leave "
+            f"num_robots out, or use scenario 'circle' with model='holonomic3d'"
+        )
+    jitter = bounded(jitter, "jitter", zero_allowed=True)
+    layout = antipodal_circle(settings, 5.0)
+    moved = layout.starts + settings.generator(JITTER).uniform(-jitter, jitter, layout.starts.shape)
+    world = World(dimension=3, cylinders=[(x, y, 0.2) for x, y in centres], lower=[-3.0] * 3, upper=[3.0] * 3)
+    return build(settings, replace(layout, starts=moved, world=world))
 
 
 def fibonacci_sphere(count: int) -> Points:
@@ -181,11 +171,7 @@ def fibonacci_sphere(count: int) -> Points:
 
 
 def mixed_team(settings: Settings, first: tuple[str, float], second: tuple[str, float]) -> Settings:
-    """The settings with two models in turn, each with its limit of acceleration [m/s^2] unless one is given.
-
-    Raises:
-        ValueError: If a model is given.
-    """
+    """The settings with two models in turn, each with its limit of acceleration [m/s^2] unless one is given."""
     if settings.model is not None:
         raise ValueError(
             f"scenario {settings.scenario!r} mixes {first[0]} and {second[0]} itself and takes no model, "
@@ -197,14 +183,11 @@ def mixed_team(settings: Settings, first: tuple[str, float], second: tuple[str, 
 
 
 def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
-    """Robots on the Fibonacci points of a sphere, goals at the antipodes.
-
-    Raises:
-        ValueError: If the models are planar, or the robots do not fit.
-    """
+    """Robots on the Fibonacci points of a sphere, goals at the antipodes."""
     _require_space(settings)
     points = fibonacci_sphere(settings.num_robots)
-    needed = 2 * settings.spacing / _smallest_distance(points)
+    gaps = (np.linalg.norm(points[:index] - points[index], axis=1).min() for index in range(1, len(points)))
+    needed = 2 * settings.spacing / float(min(gaps, default=np.inf))
     if needed >= diameter:
         raise _too_small(settings, "diameter", diameter, needed)
     starts, goals = _antipodal(points * (diameter / 2))
@@ -213,11 +196,7 @@ def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
 
 
 def antipodal_circle(settings: Settings, diameter: float) -> Layout:
-    """Robots evenly on a circle, goals at the antipodes.
-
-    Raises:
-        ValueError: If the robots do not fit.
-    """
+    """Robots evenly on a circle, goals at the antipodes."""
     count, dimension = settings.num_robots, settings.team.dimension
     needed = settings.spacing / float(sin(math.pi / count)) if count > 1 else 0.0
     if needed >= diameter:
@@ -235,32 +214,12 @@ def _antipodal(points: Points) -> tuple[Points, Points]:
     return starts, 0.0 - starts
 
 
-def _amswarm(settings: Settings, jitter: float, centres: Sequence[tuple[float, float]]) -> Problem:
-    _require_space(settings)
-    if settings.num_robots != 10:
-        raise ValueError(
-            f"num_robots is {settings.num_robots}; scenario {settings.scenario!r} has exactly 10 robots, so leave "
-            f"num_robots out, or use scenario 'circle' with model='holonomic3d'"
-        )
-    jitter = bounded(jitter, "jitter", zero_allowed=True)
-    layout = antipodal_circle(settings, 5.0)
-    moved = layout.starts + settings.generator(JITTER).uniform(-jitter, jitter, layout.starts.shape)
-    world = World(dimension=3, cylinders=[(x, y, 0.2) for x, y in centres], lower=[-3.0] * 3, upper=[3.0] * 3)
-    return build(settings, replace(layout, starts=moved, world=world))
-
-
 def _require_space(settings: Settings) -> None:
     if settings.team.dimension != 3:
         raise ValueError(
             f"scenario {settings.scenario!r} is three-dimensional and model {settings.model!r} is not; "
             f"use model='holonomic3d', or scenario 'circle'"
         )
-
-
-def _smallest_distance(points: Points) -> float:
-    """Between any two of at least two points; infinite for one."""
-    gaps = (np.linalg.norm(points[:index] - points[index], axis=1).min() for index in range(1, len(points)))
-    return float(min(gaps, default=np.inf))
 
 
 def _too_small(settings: Settings, name: str, value: float, needed: float) -> ValueError:

@@ -1,4 +1,4 @@
-"""Layout of robots and obstacles, made into a problem: headings, horizon, random obstacles, the final check."""
+"""Layout of robots and obstacles, made into a problem: headings, horizon, bounds, random obstacles, the final check."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import as_float32
+from d4orm_env.core.arrays import as_float32, frozen_array, shown
 from d4orm_env.core.portable import arctan2
-from d4orm_env.core.problem import MAX_HORIZON, Problem
-from d4orm_env.core.problem_checks import check_places
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import MAX_HORIZON, check_places
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.bounding import require_inside, with_bounds
 from d4orm_env.scenarios.placement import Area, Points, with_random_obstacles
-from d4orm_env.scenarios.settings import Settings
+from d4orm_env.scenarios.settings import LARGEST, Settings, bounded
 
 MIN_HORIZON = 100
 HORIZON_SLACK = 1.6
@@ -49,11 +48,10 @@ def build(settings: Settings, layout: Layout) -> Problem:
     Raises:
         ValueError: If bounds or random obstacles do not fit, or a start or goal does not keep the margin.
     """
-    team = settings.team
+    team, horizon = settings.team, settings.horizon
     if settings.height is not None:
         layout = _lifted(layout, settings.height)
     places = np.vstack([layout.starts, layout.goals])
-    horizon = settings.horizon
     world = with_bounds(settings, layout.world, layout.area)
     require_inside(settings, world, layout.starts, layout.goals)
     if layout.area is not None:
@@ -76,11 +74,7 @@ def build(settings: Settings, layout: Layout) -> Problem:
 
 
 def _lifted(layout: Layout, height: float) -> Layout:
-    """The layout with its lowest start or goal at that height [m]; obstacles of scenarios reach through all heights.
-
-    Raises:
-        ValueError: If it is planar.
-    """
+    """The layout with its lowest start or goal at that height [m]; obstacles of scenarios reach through all heights."""
     places = np.vstack([layout.starts, layout.goals])
     if places.shape[1] != 3:
         raise ValueError(
@@ -96,18 +90,10 @@ def _lifted(layout: Layout, height: float) -> Layout:
 
 
 def default_horizon(team: Team, dt: float, distance: float) -> int:
-    """Steps that give every robot time to drive ``distance`` and to give way to others.
+    """Steps that give every robot time to drive ``distance`` [m] and to give way to others.
 
     At least 100 steps (the paper's horizon); more where 1.6 times the straight drive from rest to rest takes longer,
     rounded up to whole tens. With the default limits and ``dt`` that is 100 steps up to 5.25 m.
-
-    Args:
-        team: The robots and their limits.
-        dt: Time step [s].
-        distance: Longest distance from a start to its goal [m].
-
-    Raises:
-        ValueError: If that takes more than a million steps.
     """
     speed, acceleration = np.float64(team.max_speed), np.float64(team.max_acceleration)
     has_inertia = np.array([not model.first_order for model in team.robot_models])
@@ -143,12 +129,50 @@ def in_space(points: ArrayLike, dimension: int) -> Points:
 def require_margin(settings: Settings, world: World, starts: Points, goals: Points) -> None:
     """Check that the surfaces of robots and obstacles are more than the margin apart, at the start and at the goal.
 
-    Raises:
-        ValueError: If not: the problem would have no solution that keeps the margin.
+    The problem would have no solution that keeps the margin.
     """
     for what, places in (("start", starts), ("goal", goals)):
         fault = check_places(settings.team, world, what, as_float32(places), settings.margin)
         if fault:
             raise ValueError(
                 f"scenario {settings.scenario!r}: {fault}; make the scenario larger, or the radius or margin smaller"
+            )
+
+
+def with_bounds(settings: Settings, world: World, area: Area | None) -> World:
+    """The world, with the bounds that were asked for if any were.
+
+    A margin is laid around the scenario's ``area``, the same for every seed, so that worlds that differ in their seed
+    alone have the same bounds.
+    """
+    if settings.bounds is None:
+        return world
+    if area is None or world.lower is not None:
+        raise ValueError(
+            f"scenario {settings.scenario!r} has bounds of its own and takes none, not {shown(settings.bounds)}; leave "
+            "bounds out"
+        )
+    if isinstance(settings.bounds, list | tuple | np.ndarray):
+        lower, upper = frozen_array(settings.bounds, "bounds", (2, world.dimension), largest=LARGEST)
+    else:
+        out = area.half_extent + bounded(settings.bounds, "bounds")
+        lower, upper = as_float32(area.centre - out), as_float32(area.centre + out)
+    return replace(world, lower=lower, upper=upper)
+
+
+def require_inside(settings: Settings, world: World, starts: Points, goals: Points) -> None:
+    """Check that the bounds that were asked for leave every start and goal its radius and the margin."""
+    if settings.bounds is None:
+        return
+    lower, upper = world.bounds.astype(np.float64)
+    needed = np.asarray(settings.team.radius, np.float64) + settings.margin
+    for what, places in (("start", starts), ("goal", goals)):
+        gaps: NDArray[np.float64] = np.minimum(places - lower, upper - places).min(axis=1)
+        robot = int(np.argmin(gaps - needed))
+        if gaps[robot] <= needed[robot]:
+            place = ", ".join(f"{coordinate:g}" for coordinate in places[robot])
+            where = f"{gaps[robot]:.3g} m inside" if gaps[robot] >= 0 else f"{-gaps[robot]:.3g} m outside"
+            raise ValueError(
+                f"scenario {settings.scenario!r}: the {what} of robot_{robot} at ({place}) is {where} the bounds "
+                f"{shown(settings.bounds)}, and its radius and the margin take {needed[robot]:.3g} m; use wider bounds"
             )

@@ -13,7 +13,7 @@ import numpy as np
 from d4orm_env.core.portable import cos, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.generators import antipodal_circle, antipodal_sphere, mixed_team
+from d4orm_env.scenarios.generators import antipodal_circle, antipodal_sphere, circle, mixed_team
 from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.placement import Area, Points
 from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, bounded, require_plane
@@ -25,16 +25,6 @@ SIDE, NEAREST, FURTHEST = 10.0, 5.0, 6.0
 SPACING = 6
 """Least distance of two random starts, in robots' radii."""
 RESTARTS, CANDIDATES = 20, 1000
-
-
-def paper_circle(settings: Settings, *, diameter: float = 5.0) -> Problem:
-    """The paper's circle of 5 m with antipodal goals: scenario ``circle`` with 100 steps, however slow the robots.
-
-    Args:
-        settings: The common arguments.
-        diameter: Diameter of the circle [m].
-    """
-    return build(settings, antipodal_circle(settings, bounded(diameter, "diameter")))
 
 
 def paper_sphere(settings: Settings, *, diameter: float = 5.0) -> Problem:
@@ -85,7 +75,7 @@ def paper_heterogeneous(settings: Settings, *, diameter: float = 5.0) -> Problem
         diameter: Diameter of the circle [m].
     """
     mixed = mixed_team(settings, first=("holonomic2d", 1.0), second=("differential_drive", 2.0))
-    return build(mixed, antipodal_circle(mixed, bounded(diameter, "diameter")))
+    return circle(mixed, diameter=diameter)
 
 
 def paper_obstacles(settings: Settings, *, diameter: float = 5.0) -> Problem:

@@ -46,16 +46,10 @@ class Area(NamedTuple):
 
 
 def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
-    """Random starts and goals in the square (cube) of side ``size`` around the origin.
+    """Random starts and goals ``(K, d)`` in the square (cube) of side ``size`` around the origin.
 
     Starts keep more than the margin to each other, goals likewise, and no robot starts at its goal. Each place is drawn
     uniformly, and drawn again until it is free.
-
-    Returns:
-        ``(K, d)`` starts and ``(K, d)`` goals.
-
-    Raises:
-        ValueError: If the robots do not fit; the message says the size that would do.
     """
     count, dimension = settings.num_robots, settings.team.dimension
     random = settings.generator(STARTS_AND_GOALS)
@@ -86,17 +80,9 @@ def size_for(count: int, spacing: float, dimension: int) -> float:
 def with_random_obstacles(settings: Settings, world: World, places: Points, area: Area) -> World:
     """The world and ``settings.num_obstacles`` random circles, or spheres in space.
 
-    They keep more than the margin to every start and goal, and leave the largest robot a passage with its margin on
-    both sides, between each other and to everything else: no obstacle closes a path.
-
-    Args:
-        settings: Number and radius of obstacles, team, seed.
-        world: The world they are added to.
-        places: ``(., d)`` starts, then goals, or none where these are drawn later [m].
-        area: Region that they are drawn from.
-
-    Raises:
-        ValueError: If so many do not fit; the message says how many do.
+    They keep more than the margin to the ``places`` ``(2 K, d)``, starts, then goals, of which there are none where
+    these are drawn later, and leave the largest robot a passage with its margin on both sides, between each other and
+    to everything else: no obstacle closes a path.
     """
     if not settings.num_obstacles:
         return world
@@ -114,17 +100,14 @@ def with_random_obstacles(settings: Settings, world: World, places: Points, area
     for index in range(settings.num_obstacles):
         ball = _first(random, area, is_free)
         if ball is None:
-            raise _too_many(settings, index, size)
+            raise ValueError(
+                f"scenario {settings.scenario!r}: only {index} of {settings.num_obstacles} obstacles of radius "
+                f"{size:g} m fit between the robots; use num_obstacles={index}, a smaller obstacle_radius or a larger "
+                f"scenario"
+            )
         balls = np.vstack([balls, ball])
     rows = np.vstack([world.balls, np.hstack([balls, np.full((len(balls), 1), size)])])
     return replace(world, circles=rows) if world.dimension == 2 else replace(world, spheres=rows)
-
-
-def _too_many(settings: Settings, fitting: int, size: float) -> ValueError:
-    return ValueError(
-        f"scenario {settings.scenario!r}: only {fitting} of {settings.num_obstacles} obstacles of radius {size:g} m "
-        f"fit between the robots; use num_obstacles={fitting}, a smaller obstacle_radius or a larger scenario"
-    )
 
 
 def round_up(value: float) -> str:

@@ -7,16 +7,20 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import yaml
 
+from d4orm_env import footprints
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import read_yaml
+from d4orm_env.footprints import Disc
 from d4orm_env.scenarios.dynobench import load_dynobench
-from d4orm_env.scenarios.schema import describe, parse
+from d4orm_env.scenarios.schema import VERSION, parse, start_fields
 
 
 def load_problem(path: str | os.PathLike[str]) -> Problem:
@@ -92,3 +96,73 @@ def _flow(value: object) -> str:
         value, width=2**31 - 1, sort_keys=False, explicit_end=False, default_style=style, default_flow_style=True
     )
     return text.removesuffix("...\n").strip()
+
+
+def describe(problem: Problem) -> dict[str, object]:
+    """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
+    settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius")}
+    speeds = _decimals(problem.goal_speed)
+    settings["goal_speed"] = speeds[0] if len(set(speeds)) == 1 else speeds
+    if not problem.docks:
+        settings["arrival"] = problem.arrival
+    if problem.collision_penalty != 1:
+        settings["collision_penalty"] = problem.collision_penalty
+    robots = [_describe_robot(problem, robot) for robot in range(problem.num_robots)]
+    return {
+        "version": VERSION,
+        "name": str(problem.name).encode("utf-8", "replace").decode(),  # YAML has no lone surrogates
+        **settings,
+        "robots": robots,
+        "world": _describe_world(problem),
+    }
+
+
+def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
+    team, dimension = problem.team, problem.dimension
+    model = team.robot_models[robot]
+    state = _decimals(problem.start[robot, : model.state_size])
+    entry: dict[str, object] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
+    if "velocity" in start_fields(model):
+        entry["velocity"] = state[dimension:]
+    elif "state" in start_fields(model):
+        entry["state"] = state[dimension:]
+    else:
+        entry |= dict(zip(start_fields(model), state[dimension:], strict=True))
+    footprint = team.footprint[robot]
+    shape = {"radius": team.radius[[robot]]} if isinstance(footprint, Disc) else {}
+    if not shape:
+        entry["footprint"] = footprints.described(footprint)
+    for name in (*shape, "max_speed", "max_acceleration", "max_turn_rate"):
+        (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
+    if not np.isnan(problem.goal_heading[robot]):
+        for name in ("goal_heading", "goal_heading_tolerance"):
+            (entry[name],) = _decimals(getattr(problem, name)[[robot]])
+    if model.own_limits:
+        names = [limit.name for limit in model.own_limits]
+        values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])
+        entry["own_limits"] = dict(zip(names, values, strict=True))
+    return entry
+
+
+def _describe_world(problem: Problem) -> dict[str, object]:
+    world, dimension = problem.world, problem.dimension
+    content: dict[str, object] = {}
+    if world.lower is not None:
+        lower, upper = map(_decimals, world.bounds)
+        content["bounds"] = {"lower": lower, "upper": upper}
+    if world.origin.any():
+        content["origin"] = world.origin.tolist()
+    for kind in ("circles", "spheres", "cylinders"):
+        rows = [_decimals(row) for row in getattr(world, kind)]
+        content[kind] = [{"center": row[:-1], "radius": row[-1]} for row in rows]
+    boxes = [_decimals(row) for row in world.boxes]
+    content["boxes"] = [{"lower": row[:dimension], "upper": row[dimension:]} for row in boxes]
+    content["polygons"] = [{"corners": [_decimals(corner) for corner in corners]} for corners in world.polygons]
+    return {kind: entries for kind, entries in content.items() if entries}
+
+
+def _decimals(values: Iterable[np.float32]) -> list[float]:
+    """float32 values as the shortest decimals that read back as the same float32."""
+    shortest = [float(str(value)) for value in values]
+    # Reading a decimal by way of float64 may round twice; the exact value never does.
+    return [number if np.float32(number) == value else float(value) for number, value in zip(shortest, values)]

@@ -1,17 +1,22 @@
-"""Problems from scenarios: by name, by file, by import path, and of the user's own."""
+"""Problems from scenarios: by name, by file, by import path, and of the user's own; the table of names."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
+import numpy as np
+
+from d4orm_env.core.arrays import shown
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.registry import Registry
 from d4orm_env.core.yaml_text import is_yaml_path
-from d4orm_env.scenarios.scenario import Scenario, complain
-from d4orm_env.scenarios.scenario_registry import SCENARIOS
+from d4orm_env.scenarios import generators, maps, paper, wall_grid, walled
+from d4orm_env.scenarios.scenario import BuiltIn, Scenario, complain
 
 if TYPE_CHECKING:
     from d4orm_env.scenarios import problem_files
@@ -21,15 +26,81 @@ else:
 ScenarioLike: TypeAlias = str | os.PathLike[str] | Callable[..., Problem] | Scenario
 """A name, a YAML file, a callable, or where one is, ``"package.module:function"`` or ``"folder/file.py:function"``."""
 
+SCENARIOS = Registry(
+    "scenario", "d4orm.scenarios", lambda name, generator: Scenario(name.rpartition(":")[2], generator)
+)
+"""All scenarios by name; :func:`register_scenario` adds to them."""
 
-class _File:
+
+def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
+    """Make a scenario known by name, wherever one is asked for.
+
+    Args:
+        name: Its name.
+        generator: ``(seed, num_robots, **settings) -> Problem``, called with the first two by position. The same
+            arguments must give the same problem. A problem called ``"custom"`` gets the scenario's name. The first line
+            of the docstring describes the scenario.
+
+    Raises:
+        ValueError: If the name is taken or no name, or the generator cannot be called like that.
+    """
+    if isinstance(name, str) and is_yaml_path(name):
+        raise ValueError(f"scenario name {shown(name)} is that of a file; give one that does not end in .yaml")
+    SCENARIOS.add(name, generator)
+
+
+_in_space = partial(BuiltIn, model="holonomic3d")
+# Instances of others, who let robots stop dead at their goals.
+_paper = partial(BuiltIn, horizon=100, goal_speed=np.inf)
+_amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05, goal_speed=np.inf)
+_drawn = partial(BuiltIn, draws=True)
+
+for _scenario in (
+    BuiltIn(generators.circle),
+    _in_space(generators.sphere),
+    _drawn(generators.random),
+    BuiltIn(generators.four_obstacles),
+    BuiltIn(generators.heterogeneous, model=None, max_acceleration=None),
+    BuiltIn(generators.swap),
+    *(
+        _amswarm(partial(generators.amswarm, _centres), _name, f"AMSwarm environment {_name[-1]}: {_about}.")
+        for _name, (_about, _centres) in generators.AMSWARM.items()
+    ),
+    _paper(
+        generators.circle, "paper_circle",
+        "The paper's circle of 5 m with antipodal goals: scenario ``circle`` with 100 steps, however slow the robots.",
+    ),
+    _paper(paper.paper_sphere, model="holonomic3d", radius=0.3),
+    _paper(paper.paper_random, draws=True),
+    _paper(paper.paper_heterogeneous, model=None, max_acceleration=None),
+    _paper(paper.paper_obstacles, num_obstacles=4),
+    *map(_drawn, (wall_grid.rooms, wall_grid.maze, walled.warehouse, walled.forest, walled.corridor, walled.doorway)),
+    *(
+        _drawn(partial(walled.mmd_map, _boxes), _name, _about, goal_speed=np.inf)
+        for _name, (_about, _boxes) in walled.MMD_MAPS.items()
+    ),
+    BuiltIn(maps.map),
+):  # fmt: skip
+    register_scenario(_scenario.__name__, _scenario)
+
+
+def list_scenarios() -> tuple[str, ...]:
+    """The names :func:`~d4orm_env.scenarios.make_problem` knows."""
+    return tuple(SCENARIOS)
+
+
+def describe_scenario(name: str) -> str:
+    """One line on a scenario.
+
+    Raises:
+        ValueError: If there is no such scenario.
+    """
+    return SCENARIOS.look_up(name).description
+
+
+def _file(path: str | os.PathLike[str], seed: int = 0, num_robots: int | None = None) -> Problem:
     """A scenario file as a generator: the same problem for every seed."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._path = path
-
-    def __call__(self, seed: int = 0, num_robots: int | None = None) -> Problem:
-        return problem_files.load_problem(self._path)
+    return problem_files.load_problem(path)
 
 
 def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:
@@ -48,7 +119,7 @@ def find_scenario(scenario: ScenarioLike) -> Scenario:
     if isinstance(scenario, Scenario):
         return scenario
     if is_scenario_file(scenario):
-        return Scenario(Path(scenario).stem, _File(scenario))
+        return Scenario(Path(scenario).stem, partial(_file, scenario))
     if callable(scenario):
         return Scenario(getattr(scenario, "__name__", type(scenario).__name__), scenario)
     return SCENARIOS.find(scenario)

@@ -26,13 +26,23 @@ class BuiltIn:
 
     Args:
         function: The generator, ``(Settings, **own arguments) -> Problem``.
+        name: Its name; the function's by default.
+        about: What describes it; the function's docstring by default.
         draws: Whether every seed is known to give other places, and never another team; ``False`` leaves it to be found
             out.
         **defaults: Where its defaults differ from those of :class:`~d4orm_env.scenarios.settings.Settings`.
     """
 
-    def __init__(self, function: Callable[..., Problem], *, draws: bool = False, **defaults: object) -> None:
-        self.__name__, self.__doc__ = function.__name__, function.__doc__
+    def __init__(
+        self,
+        function: Callable[..., Problem],
+        name: str = "",
+        about: str = "",
+        *,
+        draws: bool = False,
+        **defaults: object,
+    ) -> None:
+        self.__name__, self.__doc__ = name or function.__name__, about or function.__doc__
         self._function, self._defaults = function, defaults
         self.draws = draws
         self._own = tuple(inspect.signature(function).parameters)[1:]

@@ -5,21 +5,22 @@ The public description is the documented example ``examples/scenarios/mixed_team
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from d4orm_env import footprints
+from d4orm_env.core.arrays import shown
 from d4orm_env.core.portable import arctan2
-from d4orm_env.core.problem import Arrival, Problem
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import Arrival
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import Disc
-from d4orm_env.scenarios.scenario_registry import SCENARIOS
+from d4orm_env.scenarios.problems import SCENARIOS
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
 VERSION = 1
@@ -82,20 +83,16 @@ class RobotEntry(Entry):
     def start_state(self) -> list[float]:
         """The start state, defaults filled in; a robot with a heading faces its goal."""
         model = get_model(self.model)
-        state = list(self.start)
-        offset = np.subtract(self.goal, self.start)
-        if "state" in start_fields(model):
-            rest = [0.0] * (model.state_size - model.dimension)
-            if model.heading_index is not None:
-                rest[model.heading_index - model.dimension] = float(arctan2(offset[1], offset[0]))
-            state += self.state or rest
-        if "velocity" in start_fields(model):
-            state += self.velocity or [0.0] * model.dimension
-        if "heading" in start_fields(model):
-            state += [float(arctan2(offset[1], offset[0])) if self.heading is None else self.heading]
-        if "speed" in start_fields(model):
-            state += [0.0 if self.speed is None else self.speed]
-        return state
+        parts = [getattr(self, name) for name in start_fields(model)]
+        rest = [0.0] * (model.state_size - model.dimension)
+        if model.heading_index is not None:
+            offset = np.subtract(self.goal, self.start)
+            rest[model.heading_index - model.dimension] = float(arctan2(offset[1], offset[0]))
+        if start_fields(model) in (("velocity",), ("state",)):
+            rest = parts[0] or rest
+        else:
+            rest = [usual if given is None else given for usual, given in zip(rest, parts, strict=True)]
+        return [*self.start, *rest]
 
 
 class RoundEntry(Entry):
@@ -152,9 +149,8 @@ class WorldEntry(Entry):
     origin: Place | None = None
 
     def build(self, dimension: int) -> World:
-        rows = {
-            kind: [entry.row for entry in getattr(self, kind)] for kind in ("circles", "spheres", "cylinders", "boxes")
-        }
+        kinds = ("circles", "spheres", "cylinders", "boxes")
+        rows = {kind: [entry.row for entry in getattr(self, kind)] for kind in kinds}
         lower, upper = (self.bounds.lower, self.bounds.upper) if self.bounds else (None, None)
         polygons = [entry.corners for entry in self.polygons]
         return World(dimension, **rows, polygons=polygons, lower=lower, upper=upper, origin=self.origin)
@@ -184,21 +180,15 @@ class ProblemFile(Entry):
         team = Team(models, **columns, own_limits=self._own_limits(), footprint=shapes)
         size = team.state_size  # asks every robot
         start = [state + [0.0] * (size - len(state)) for state in (robot.start_state for robot in self.robots)]
+        names = set(type(self).model_fields) - {"version", "robots", "world"}
         return Problem(
-            team=team,
-            start=start,
+            team,
+            start,
             goal=[robot.goal for robot in self.robots],
             world=self.world.build(team.dimension),
-            dt=self.dt,
-            horizon=self.horizon,
-            margin=self.margin,
-            goal_radius=self.goal_radius,
-            goal_speed=self.goal_speed,
-            arrival=self.arrival,
-            collision_penalty=self.collision_penalty,
             goal_heading=[np.nan if robot.goal_heading is None else robot.goal_heading for robot in self.robots],
             goal_heading_tolerance=[robot.goal_heading_tolerance for robot in self.robots],
-            name=self.name,
+            **{name: getattr(self, name) for name in names},
         )
 
     def _own_limits(self) -> dict[str, list[float]]:
@@ -237,19 +227,11 @@ class ScenarioFile(BaseModel):
         return problem if self.name is None else problem.replace(name=self.name)
 
 
-PARTS: dict[tuple[str, ...], type[BaseModel]] = {
-    (): ProblemFile,
-    ("robots",): RobotEntry,
-    ("world",): WorldEntry,
-    ("world", "bounds"): BoxEntry,
-    ("world", "circles"): RoundEntry,
-    ("world", "spheres"): SphereEntry,
-    ("world", "cylinders"): RoundEntry,
-    ("world", "boxes"): BoxEntry,
-    ("world", "polygons"): PolygonEntry,
-}
-"""The schema of each part of the explicit form."""
-
+PARTS: dict[str, type[BaseModel]] = {
+    "": ProblemFile, "robots": RobotEntry, "world": WorldEntry, "bounds": BoxEntry, "circles": RoundEntry,
+    "spheres": SphereEntry, "cylinders": RoundEntry, "boxes": BoxEntry, "polygons": PolygonEntry,
+}  # fmt: skip
+"""The schema of each part of the explicit form, by the last name on the way to it."""
 
 KINDS = ("float", "list[float]")
 """Names of alternatives that pydantic puts among those of fields."""
@@ -285,95 +267,22 @@ def parse(data: object) -> Problem:
         return content.build()
 
 
-def describe(problem: Problem) -> dict[str, object]:
-    """The content of a file that means that problem, to the bit: the inverse of :func:`parse`."""
-    settings = {name: getattr(problem, name) for name in ("dt", "horizon", "margin", "goal_radius")}
-    speeds = _decimals(problem.goal_speed)
-    settings["goal_speed"] = speeds[0] if len(set(speeds)) == 1 else speeds
-    if not problem.docks:
-        settings["arrival"] = problem.arrival
-    if problem.collision_penalty != 1:
-        settings["collision_penalty"] = problem.collision_penalty
-    robots = [_describe_robot(problem, robot) for robot in range(problem.num_robots)]
-    return {
-        "version": VERSION,
-        "name": str(problem.name).encode("utf-8", "replace").decode(),  # YAML has no lone surrogates
-        **settings,
-        "robots": robots,
-        "world": _describe_world(problem),
-    }
-
-
-def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
-    team, dimension = problem.team, problem.dimension
-    model = team.robot_models[robot]
-    state = _decimals(problem.start[robot, : model.state_size])
-    entry: dict[str, object] = {"model": model.name, "start": state[:dimension], "goal": _decimals(problem.goal[robot])}
-    if "velocity" in start_fields(model):
-        entry["velocity"] = state[dimension:]
-    elif "state" in start_fields(model):
-        entry["state"] = state[dimension:]
-    else:
-        entry |= dict(zip(start_fields(model), state[dimension:], strict=True))
-    footprint = team.footprint[robot]
-    shape = {"radius": team.radius[[robot]]} if isinstance(footprint, Disc) else {}
-    if not shape:
-        entry["footprint"] = footprints.described(footprint)
-    for name in (*shape, "max_speed", "max_acceleration", "max_turn_rate"):
-        (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
-    if not np.isnan(problem.goal_heading[robot]):
-        for name in ("goal_heading", "goal_heading_tolerance"):
-            (entry[name],) = _decimals(getattr(problem, name)[[robot]])
-    if model.own_limits:
-        names = [limit.name for limit in model.own_limits]
-        values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])
-        entry["own_limits"] = dict(zip(names, values, strict=True))
-    return entry
-
-
 def _footprint(entry: RobotEntry) -> footprints.Footprint:
     return Disc(entry.radius) if entry.footprint is None else footprints.parsed(entry.footprint)
-
-
-def _describe_world(problem: Problem) -> dict[str, object]:
-    world, dimension = problem.world, problem.dimension
-    content: dict[str, object] = {}
-    if world.lower is not None:
-        lower, upper = map(_decimals, world.bounds)
-        content["bounds"] = {"lower": lower, "upper": upper}
-    if world.origin.any():
-        content["origin"] = world.origin.tolist()
-    for kind in ("circles", "spheres", "cylinders"):
-        rows = [_decimals(row) for row in getattr(world, kind)]
-        content[kind] = [{"center": row[:-1], "radius": row[-1]} for row in rows]
-    boxes = [_decimals(row) for row in world.boxes]
-    content["boxes"] = [{"lower": row[:dimension], "upper": row[dimension:]} for row in boxes]
-    content["polygons"] = [{"corners": [_decimals(corner) for corner in corners]} for corners in world.polygons]
-    return {kind: entries for kind, entries in content.items() if entries}
-
-
-def _decimals(values: Iterable[np.float32]) -> list[float]:
-    """float32 values as the shortest decimals that read back as the same float32."""
-    shortest = [float(str(value)) for value in values]
-    # Reading a decimal by way of float64 may round twice; the exact value never does.
-    return [number if np.float32(number) == value else float(value) for number, value in zip(shortest, values)]
 
 
 def _explain(error: ValidationError) -> str:
     """The first error, as one line: where, what was expected, what was found."""
     first = error.errors(include_url=False)[0]
-    names = tuple(part for part in first["loc"] if isinstance(part, str))
+    names = ["", *(part for part in first["loc"] if isinstance(part, str))]
     parts = [part for part in first["loc"] if part not in KINDS]
     where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts).lstrip(".")
-    if first["type"] == "extra_forbidden" and names[:-1] in PARTS:
-        message = f"unknown field; known are {', '.join(PARTS[names[:-1]].model_fields)}"
+    if first["type"] == "extra_forbidden":
+        message = f"unknown field; known are {', '.join(PARTS[names[-2]].model_fields)}"
     elif first["type"] == "missing":
         message = "this field is missing"
     elif first["type"] == "value_error":
         message = str(first["ctx"]["error"])
     else:
-        found = repr(first["input"])
-        message = (
-            f"{first['msg'][0].lower()}{first['msg'][1:]}, not {found if len(found) <= 60 else found[:57] + '...'}"
-        )
+        message = f"{first['msg'][0].lower()}{first['msg'][1:]}, not {shown(first['input'])}"
     return f"{where}: {message}" if where else message

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import positive_number, whole_number
-from d4orm_env.core.problem import MAX_HORIZON, Arrival, check_arrival
+from d4orm_env.core.problem_checks import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import get_model
 
@@ -124,11 +124,7 @@ STARTS_AND_GOALS, OBSTACLES, JITTER, WALLS = range(4)
 
 
 def bounded(value: SupportsFloat, name: str, *, zero_allowed: bool = False) -> float:
-    """``value`` as a positive number no larger than scenarios are.
-
-    Raises:
-        ValueError: If it is not a positive finite number, or beyond :data:`LARGEST`.
-    """
+    """``value`` as a positive number no larger than scenarios are, :data:`LARGEST`."""
     number = positive_number(value, name, zero_allowed=zero_allowed)
     if number > LARGEST:
         raise ValueError(f"{name} is {number:g}; scenarios take at most {LARGEST:g}")
@@ -136,11 +132,7 @@ def bounded(value: SupportsFloat, name: str, *, zero_allowed: bool = False) -> f
 
 
 def require_plane(settings: Settings) -> None:
-    """Check that a scenario of the plane is asked for robots of the plane.
-
-    Raises:
-        ValueError: If not.
-    """
+    """Check that a scenario of the plane is asked for robots of the plane."""
     if settings.team.dimension != 2:
         raise ValueError(
             f"scenario {settings.scenario!r} is planar and model {settings.model!r} is not; "
@@ -149,11 +141,7 @@ def require_plane(settings: Settings) -> None:
 
 
 def grid_size(value: object, name: str) -> tuple[int, int]:
-    """Columns and rows from what was given for them.
-
-    Raises:
-        ValueError: If it is not two whole numbers, or too many squares.
-    """
+    """Columns and rows from what was given for them: two whole numbers, and not too many squares."""
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise ValueError(f"{name} must be two whole numbers, columns and rows, not {value!r}")
     columns, rows = (whole_number(count, name, 1, MAX_COUNT) for count in value)

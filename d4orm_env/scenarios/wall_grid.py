@@ -1,15 +1,20 @@
-"""Squares side by side, with walls between some of them: what rooms and mazes are made of."""
+"""Squares side by side, with walls between some of them: rooms with doors, and mazes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from d4orm_env.core.arrays import positive_number
 from d4orm_env.core.lazy import LazyModule
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.free_space import Mask
+from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
+from d4orm_env.scenarios.well_formed import lattice_step, populate, reach_of
 
 sparse: Any = LazyModule("scipy.sparse")
 csgraph: Any = LazyModule("scipy.sparse.csgraph")
@@ -39,9 +44,6 @@ def draw_openings(random: np.random.Generator, columns: int, rows: int, share: f
     """Random openings: a spanning tree, and that share of all other walls.
 
     Paths are no longer than in half of some other drawings, so that one horizon suits every seed.
-
-    Raises:
-        ValueError: If they do all the same, however often they are drawn.
     """
     longest = _usual_longest(columns, rows, share)
     for _ in range(TRIES):
@@ -110,3 +112,66 @@ def default_squares(number: float, least: int) -> tuple[int, int]:
     """Columns and rows of the smallest square plan of at least that many squares."""
     side = max(least, int(np.ceil(np.sqrt(number))))
     return side, side
+
+
+def rooms(
+    settings: Settings,
+    *,
+    rooms: Sequence[int] | None = None,
+    room_size: float = 2.5,
+    door_width: float = 0.8,
+    extra_doors: float = 0.3,
+) -> Problem:
+    """A grid of rooms with doors between them; starts and goals anywhere in them.
+
+    As many doors as it takes to get from each room to each other, and some more. Walls, doors, starts and goals are set
+    by the seed.
+
+    Args:
+        settings: The common arguments.
+        rooms: Number of rooms, ``(columns, rows)``; by default 3 x 3, or enough for one to every second robot.
+        room_size: Side of a room [m].
+        door_width: Width of the doors [m].
+        extra_doors: Share of the walls without a door that get one all the same.
+    """
+    require_plane(settings)
+    columns, rows = default_squares(settings.num_robots / 2, 3) if rooms is None else grid_size(rooms, "rooms")
+    side, width = bounded(room_size, "room_size"), bounded(door_width, "door_width")
+    share = positive_number(extra_doors, "extra_doors", zero_allowed=True, most=1.0)
+    if width > side:
+        raise ValueError(f"door_width is {width:g}; it must be at most the room_size, which is {side:g}")
+    step = lattice_step(settings, np.array([columns, rows]) * (side + WALL), ("door_width", width))
+    random = settings.generator(WALLS)
+    openings = draw_openings(random, columns, rows, share)
+    world = wall_world(openings, side, width, random)
+    travel = (openings.longest + 1) * (side + WALL)
+    return populate(settings, world, step, travel, "more rooms or a larger room_size")
+
+
+def maze(
+    settings: Settings, *, cells: Sequence[int] | None = None, corridor_width: float = 1.2, loops: float = 0.1
+) -> Problem:
+    """A maze of corridors; starts and goals anywhere where others get by, which is in dead ends if it is narrow.
+
+    Walls, starts and goals are set by the seed.
+
+    Args:
+        settings: The common arguments.
+        cells: Size of the maze in widths of a corridor, ``(columns, rows)``; by default square and large enough.
+        corridor_width: Width of the corridors [m].
+        loops: Share of the walls of a maze without loops that are left out.
+    """
+    require_plane(settings)
+    width = bounded(corridor_width, "corridor_width")
+    if cells is None:
+        # Where two robots cannot pass each other, every place takes a dead end.
+        is_wide = width > 1.1 * (2 * reach_of(settings) + settings.spacing + settings.goal_radius)
+        cells = default_squares((2.5 if is_wide else 12) * settings.num_robots, 6)
+    columns, rows = grid_size(cells, "cells")
+    share = positive_number(loops, "loops", zero_allowed=True, most=1.0)
+    step = lattice_step(settings, np.array([columns, rows]) * (width + WALL), ("corridor_width", width))
+    random = settings.generator(WALLS)
+    openings = draw_openings(random, columns, rows, share)
+    world = wall_world(openings, width, width, random)
+    travel = (openings.longest + 1) * (width + WALL)
+    return populate(settings, world, step, travel, "more cells or a larger corridor_width")

@@ -96,17 +96,11 @@ class _Placing:
 def draw_places(
     random: np.random.Generator, space: FreeSpace, groups: Sequence[tuple[Mask | None, int]], separation: float
 ) -> Points:
-    """Random places, far enough apart that a robot gets from each to each while robots are on all others.
+    """Random places ``(P, d)``, far enough apart that a robot gets from each to each while robots are on all others.
 
-    Args:
-        random: Generator of the draws.
-        space: The region.
-        groups: Of each group of places the part of the region that they are drawn from, or ``None`` for all of it,
-            and their number.
-        separation: Distance that robots which pass by keep to a place [m].
-
-    Returns:
-        ``(P, d)`` group by group; fewer than asked for if there is no room.
+    Each of the ``groups`` has the part of the region that its places are drawn from, or ``None`` for all of it, and
+    their number. Robots that pass by keep the ``separation`` to a place [m]. There are fewer than asked for if there is
+    no room.
     """
     placing = _Placing(space.inside, separation / space.step, sum(number for _, number in groups))
     for part, number in groups:
@@ -135,13 +129,7 @@ def reach_of(settings: Settings) -> float:
 def lattice_step(settings: Settings, sides: ArrayLike, passage: tuple[str, float] | None = None) -> float:
     """Step of a lattice that is fine enough for the robots, and for the narrowest passage wherever it is [m].
 
-    Args:
-        settings: The robots.
-        sides: ``(d,)`` of the world [m].
-        passage: Name and width of the narrowest passage [m].
-
-    Raises:
-        ValueError: If the passage is too narrow; the message says what would do.
+    The world has these ``sides`` ``(d,)``, and the narrowest passage a name and a width [m].
     """
     lengths = np.asarray(sides)
     step = max(settings.spacing / 4, root(float(lengths.prod()) / ENOUGH_POINTS, len(lengths)))
@@ -193,11 +181,7 @@ def with_obstacles(settings: Settings, world: World, places: Points | None = Non
 def draw_team(
     settings: Settings, space: FreeSpace, remedy: str, exchange: tuple[float, float] | None = None
 ) -> tuple[Points, Points]:
-    """``(K, d)`` random starts and goals; see :func:`populate`.
-
-    Raises:
-        ValueError: If they do not fit.
-    """
+    """``(K, d)`` random starts and goals; see :func:`populate`."""
     random = settings.generator(STARTS_AND_GOALS)
     count = settings.num_robots
     # A robot may dock anywhere within the goal radius.
@@ -210,9 +194,7 @@ def draw_team(
         groups = [(x < exchange[0], count), (x > exchange[1], count)]
         # On either side the starts of one half and the goals of the other.
         half = (count + 1) // 2
-        number = np.concatenate(
-            [number[:half], number[count + half :], number[count : count + half], number[half:count]]
-        )
+        number = np.r_[:half, count + half : 2 * count, count : count + half, half:count]
     most = 0
     for _ in range(ROUNDS):
         places = draw_places(random, space, groups, separation)

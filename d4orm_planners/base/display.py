@@ -16,11 +16,10 @@ from d4orm_env.core.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from d4orm_env.render import notebook, pictures, replay
+    from d4orm_env.render import pictures, replay
     from d4orm_env.render.denoising_frames import Denoising
     from d4orm_env.render.replay import Replay, ReplayMotion
 else:
-    notebook = LazyModule("d4orm_env.render.notebook")
     pictures = LazyModule("d4orm_env.render.pictures")
     replay = LazyModule("d4orm_env.render.replay")
 
@@ -50,7 +49,7 @@ class DisplayMixin:
         return f"{type(self).__name__}: {self.title}\n  {joined(self.key_figures)}"
 
     def _repr_html_(self: _HasMotion) -> str:
-        return notebook.motion_html(self.problem, self.trajectory, self.title, self.key_figures)
+        return pictures.motion_html(self.problem, self.trajectory, self.title, self.key_figures)
 
     def plot(self: _HasMotion, axes: Axes | None = None) -> Axes:
         """Draw the motion with matplotlib; see :func:`d4orm_env.render.pictures.plot`.

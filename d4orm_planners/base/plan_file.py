@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import replaced_when_done, require_file
+from d4orm_env.core.files import ArrayArchive, replaced_when_done, require_file
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.rollout import rollout
-from d4orm_env.scenarios.schema import describe, parse
+from d4orm_env.scenarios.problem_files import describe
+from d4orm_env.scenarios.schema import parse
 from d4orm_env.verify import verify
 from d4orm_planners.base.candidate import failed_robots
 from d4orm_planners.base.machine import Provenance

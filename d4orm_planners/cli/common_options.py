@@ -19,9 +19,8 @@ from d4orm_planners.base.episode import physics_module
 from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
 
 if TYPE_CHECKING:
-    from d4orm_env.core.disturbance_events import DisturbanceEvents
     from d4orm_env.core.problem import Problem
-    from d4orm_env.core.trajectory import Trajectory
+    from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 
 T = TypeVar("T")
 

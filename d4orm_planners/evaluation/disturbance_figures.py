@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.disturbances.disturbance_registry import find_level, name_of_kind
+from d4orm_env.disturbances.disturbance_registry import find_level, name_of
 from d4orm_env.render.style import own_style
 from d4orm_planners.evaluation.summary import SuccessRate
 from d4orm_planners.evaluation.tables import target
@@ -86,7 +86,7 @@ def quantity_of(disturbance: str) -> Quantity:
         return Quantity(disturbance, "")
     fixed = ", ".join(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
                       for name, value in level.fixed.items())  # fmt: skip
-    kind = name_of_kind(level.kind)
+    kind = name_of(level.kind)
     known = _QUANTITIES.get(f"{kind}.{level.attribute}")
     quantity = known or Quantity(f"{kind}: {level.attribute}".replace("_", " "), "")
     return quantity._replace(name=f"{quantity.name} ({fixed})") if fixed else quantity

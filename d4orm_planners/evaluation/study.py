@@ -12,8 +12,7 @@ from typing import Any, TypeAlias, TypeVar
 from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances import Disturbance
-from d4orm_env.disturbances.chosen import at_work, checked_disturbances
-from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.disturbances.disturbance import AnyDisturbance, at_work, checked_disturbances
 from d4orm_env.disturbances.disturbance_registry import attributes_of, disturbance_at
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST
-from d4orm_env.core.problem import MAX_HORIZON, Problem
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import MAX_HORIZON
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.world import World
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig

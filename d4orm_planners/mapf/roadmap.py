@@ -10,7 +10,8 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_env.paths.shortest_paths import in_space, lay_lattice
+from d4orm_env.paths.lattice import lay_lattice
+from d4orm_env.paths.shortest_paths import in_space
 from d4orm_env.paths.spaces import Space, free_lines, make_space
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells

@@ -16,7 +16,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.scenarios import list_scenarios
 from d4orm_env.scenarios.problem_files import scenario_text
-from d4orm_env.scenarios.scenario_registry import SCENARIOS
+from d4orm_env.scenarios.problems import SCENARIOS
 from d4orm_env.scenarios.schema import parse
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.play import edits

@@ -15,9 +15,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 from stable_baselines3.common.vec_env import VecNormalize
 
-from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_planners.rl.curve import Evaluation, write_curve
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 

@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.archives import ArrayArchive
 from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.team import Team
-from d4orm_env.scenarios.problems import is_scenario_file
-from d4orm_env.scenarios.scenario_registry import SCENARIOS
+from d4orm_env.scenarios.problems import SCENARIOS, is_scenario_file
 from d4orm_planners.base.policy import Policy, robot_indices
 from d4orm_planners.rl.features import Features
 

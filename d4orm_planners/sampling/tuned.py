@@ -1,6 +1,6 @@
 """Tuned settings of D4orm and its rivals: the preset ``"tuned"``.
 
-From ``python -m examples.studies.tune_rivals --candidates 27 --seeds 4``: 27 settings each, the preset ``"paper"``
+From ``python -m examples.studies tune_rivals --candidates 27 --seeds 4``: 27 settings each, the preset ``"paper"``
 among them, on four teams of 8 and 16 robots with seeds from 100 on. A third of the settings went on to twice the
 seeds, and a third of these to four times as many. The trials are in
 ``examples/studies/data/tuning.parquet``, the table in ``docs/tables/tuning.md``. A method

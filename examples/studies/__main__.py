@@ -1,8 +1,10 @@
-"""Make the tables and figures of the docs from the trials in ``examples/studies/data``: what ``make results`` runs.
+"""Run a study; or make the tables and figures of the docs from the trials in ``examples/studies/data``.
 
-    python -m examples.studies --out docs/tables
+    python -m examples.studies                        # what there is
+    python -m examples.studies lifelong --minutes 1   # a study; --help tells its options
+    python -m examples.studies all --out docs/tables  # what `make results` runs
 
-All in one process: to import what a study needs takes longer than most of the tables.
+All tables are made in one process: to import what a study needs takes longer than most of them.
 """
 
 from __future__ import annotations
@@ -14,13 +16,20 @@ from unittest.mock import patch
 
 import matplotlib.pyplot as plt
 from examples.outputs import argument_parser
+from examples.studies.comparisons import COMPARISONS
+from examples.studies.comparisons import main as compare
 
+from d4orm_env.core.errors import unknown
 from d4orm_planners.cli.app import main as d4orm
 
-DATA = Path(__file__).parent / "data"
-STUDIES = (
+FOLDER = Path(__file__).parent
+DATA = FOLDER / "data"
+SHARED = ("comparisons",)
+"""Modules that are no studies."""
+NAMES = tuple(sorted({*COMPARISONS, "paper", *(path.stem for path in FOLDER.glob("[a-z]*.py"))} - {*SHARED}))
+WITH_TRIALS = (
     "ablation", "amswarm_gaps", "contact_penalty", "credit_by_update", "disturbance_study", "fewer_samples",
-    "gradient_dilution", "head_to_head", "imitate_expert", "lifelong", "multimodality", "multimodality_team",
+    "gradient_dilution", "head_to_head", "imitate_expert", "lifelong", "multimodality",
     "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners", "tuned_rivals", "warm_start",
     "zero_shot",
 )  # fmt: skip
@@ -30,39 +39,46 @@ TIMED = ("big-teams", "coarseness", "ipopt")
 FIGURES = ("amswarm", "nodes", "noise-schedule", "robustness", "selections", "team-size", *TIMED)
 
 
-def run(module: str, *arguments: object) -> None:
-    """Run a script of this folder, as from the command line."""
-    with patch.object(sys, "argv", [module, *map(str, arguments)]):
-        status = import_module(f"examples.studies.{module}").main()
+def run(name: str, *arguments: object) -> None:
+    """Run a study with arguments as those of the command line; exit if it fails."""
+    with patch.object(sys, "argv", [f"python -m examples.studies {name}", *map(str, arguments)]):
+        status = compare(name) if name in COMPARISONS else import_module(f"examples.studies.{name}").main()
     plt.close("all")
     if status:
-        raise SystemExit(f"{module} ended with exit status {status}")
+        raise SystemExit(status)
 
 
-def main() -> int:
-    """Make them all."""
+def make_all() -> None:
+    """Make all tables and figures."""
     out = argument_parser(__doc__).parse_args().out
     run("one_dimension", "--out", out)
+    run("multimodality", "--team", 8, "--trials", DATA / "multimodality_team.parquet", "--out", out)
     run("tune_rivals", "--trials", DATA / "tuning.parquet", "--out", out)
-    for study in STUDIES:
+    for study in WITH_TRIALS:
         run(study, "--trials", DATA / f"{study}.parquet", "--out", out)
     run("training_seeds", "--curves", DATA / "training_curves.csv", "--out", out)
     for figure in FIGURES:
         times = () if figure in TIMED else ("--no-times",)
-        run("paper.__main__", figure, "--trials", DATA / f"{figure}.parquet", *times, "--out", out)
+        run("paper", figure, "--trials", DATA / f"{figure}.parquet", *times, "--out", out)
+    older = ("--trials", DATA / "algorithm_4.parquet", "--no-times", "--out", out / "algorithm_4")
     for figure in ("big-teams", "coarseness"):
-        run(
-            "paper.__main__",
-            figure,
-            "--trials",
-            DATA / "algorithm_4.parquet",
-            "--no-times",
-            "--out",
-            out / "algorithm_4",
-        )
+        run("paper", figure, *older)
     d4orm(["leaderboard", str(DATA / "leaderboard.parquet"), "--out", str(out / "leaderboard.md")])
-    return 0
+
+
+def main() -> None:
+    """List the studies, run one, or make everything."""
+    name, *arguments = sys.argv[1:] or ["--help"]
+    if name == "all":
+        with patch.object(sys, "argv", ["python -m examples.studies all", *arguments]):
+            make_all()
+    elif name in NAMES:
+        run(name, *arguments)
+    elif name in ("-h", "--help"):
+        print(f"{__doc__}\nStudies: {', '.join(NAMES)}")
+    else:
+        sys.exit(str(unknown("study", name, NAMES)))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,6 +1,6 @@
 """Ablation of D4orm-C2F's measures against disturbances: each left out by itself, and all of them left out.
 
-    python -m examples.studies.ablation --seeds 30 --out ablation
+    python -m examples.studies ablation --seeds 30 --out ablation
 
 Eight robots on the circle, on random places and in rooms, each measure under the disturbance that it is there for. The
 table has how many trials succeeded and in how many anybody touched anything, with all measures and without, how likely
@@ -12,16 +12,14 @@ it is that both are equally good (McNemar, paired by seed), and how much longer 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from examples.outputs import save_table, study_trials, trials_parser
-from examples.studies import AS_IN_THE_PAPER
+from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 from examples.studies.disturbance_study import (
     DISTURBANCES,
-    FIRST_SEED,
     NOTHING,
     ROBOTS,
     SCENARIOS,
@@ -116,7 +114,7 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
     return rows
 
 
-def main() -> int:
+def main() -> None:
     """Run the study and write the table."""
     arguments = trials_parser(__doc__, seeds=30).parse_args()
     size = (SCENARIOS, tuple(MEANT_FOR), arguments.seeds)
@@ -124,8 +122,3 @@ def main() -> int:
         size = (SCENARIOS[:1], tuple(MEANT_FOR)[:1], 1)
     trials = study_trials(arguments, "ablation", studies(*size))
     save_table(rows_of(by_cell(trials)), arguments.out / "ablation.csv")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """Factorial of credit and update, on four teams: who gets the credit, and how samples become an update.
 
-    python -m examples.studies.credit_by_update --seeds 50 --out factorial
+    python -m examples.studies credit_by_update --seeds 50 --out factorial
 
 Credit: samples are weighted by the reward of the team, of the group that a robot was in conflict with, of the robot, or
 of robot and team in turn; and by that of the group with contacts that cost twice as much, as much as they cost the two
@@ -13,18 +13,17 @@ the cell and D4orm with the same credit are equally good (McNemar on solutions, 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import plt, save_figure, save_table, study_trials, trials_parser
+from examples.outputs import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
 
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import wilson_interval
 
 TEAMS = (("paper_circle", 8), ("paper_circle", 16), ("paper_random", 16), ("paper_heterogeneous", 8))
 CREDITS: dict[str, dict[str, Any]] = {
@@ -82,14 +81,12 @@ def by_team(trials: Iterable[Trial]) -> dict[str, Cells]:
 def rows_of(team: str, cells: Cells) -> list[dict[str, Any]]:
     """A row per cell."""
     rows = []
-    for update, credit in ((update, credit) for update in UPDATES for credit in CREDITS):
+    for update, credit in product(UPDATES, CREDITS):
         trials = cells[update, credit]
-        solved = sum(map(is_solved, trials))
-        lower, upper = wilson_interval(solved, len(trials))
         test = paired(trials, cells[REFERENCE, credit], penalised_steps, is_solved)
         rows.append(
-            {"team": team, "update": update, "credit": credit, "solved": f"{solved} of {len(trials)}",
-             "interval": f"{lower:.0%} to {upper:.0%}", "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
+            {"team": team, "update": update, "credit": credit, **solved_columns(trials),
+             "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
              "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
         )  # fmt: skip
     return rows
@@ -119,17 +116,11 @@ def draw(teams: dict[str, Cells], path: Path) -> None:
     save_figure(figure, path)
 
 
-def main() -> int:
+def main() -> None:
     """Run every cell on every team, write the table and draw the curves."""
     arguments = trials_parser(__doc__, seeds=50).parse_args()
     size = (TEAMS[:1], 1, TINY) if arguments.quick else (TEAMS, arguments.seeds, BUDGET)
     found = by_team(study_trials(arguments, "credit_by_update", studies(*size)))
-    save_table(
-        [row for team, cells in found.items() for row in rows_of(team, cells)], arguments.out / "credit_by_update.csv"
-    )
+    rows = [row for team, cells in found.items() for row in rows_of(team, cells)]
+    save_table(rows, arguments.out / "credit_by_update.csv")
     draw(found, arguments.out / "credit_by_update.png")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

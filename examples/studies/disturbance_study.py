@@ -1,6 +1,6 @@
 """Success of controllers with eight robots under ten disturbances, and in another physics.
 
-    python -m examples.studies.disturbance_study --seeds 50 --out disturbance_study
+    python -m examples.studies disturbance_study --seeds 50 --out disturbance_study
 
 D4orm-C2F beside a plan of D4orm-D executed open loop, ORCA and PPO, each with the same seeds, on the circle, on random
 places and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all; and on the circle and
@@ -13,7 +13,6 @@ folder one by one, and a call that was broken off, or one with more seeds or sce
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
@@ -21,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import plt, save_figure, save_table, study_trials, trials_parser
-from examples.studies import AS_IN_THE_PAPER
+from examples.outputs import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 
 from d4orm_env.disturbances import (
     Bias,
@@ -39,12 +38,9 @@ from d4orm_env.disturbances import (
 )
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.evaluation.summary import wilson_interval
 from d4orm_planners.evaluation.trials import Condition
 
 ROBOTS = 8
-FIRST_SEED = 1000
-"""Seeds 0 to 49 were looked at while D4orm-C2F was improved."""
 SCENARIOS = ("circle", "random", "rooms")
 POLICIES: dict[str, dict[str, Any]] = {"d4orm-c2f": {"refine": "sync"}, "hybrid": {}, "orca": {}, "ppo": {}}
 DISTURBANCES: dict[str, Disturbance[Any]] = {
@@ -110,10 +106,10 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
     """A row per cell."""
     rows = []
     for (scenario, policy, disturbance), trials in cells.items():
-        lower, upper = wilson_interval(sum(trial.success for trial in trials), len(trials))
         rows.append(
             {"scenario": scenario, "policy": policy, "disturbance": disturbance, "trials": len(trials),
-             "succeeded": sum(trial.success for trial in trials), "interval": f"{lower:.0%} to {upper:.0%}",
+             "succeeded": sum(trial.success for trial in trials),
+             "interval": solved_columns(trials, lambda trial: trial.success)["interval"],
              "touched": sum(trial.collided > 0 for trial in trials),
              "late": sum(not (trial.success or trial.collided or trial.error) for trial in trials),
              "errors": sum(bool(trial.error) for trial in trials)}
@@ -159,7 +155,7 @@ def draw(cells: Cells, path: Path) -> None:
     save_figure(figure, path)
 
 
-def main() -> int:
+def main() -> None:
     """Run the study, write the table and draw the heat map."""
     parser = trials_parser(__doc__, seeds=50)
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=SCENARIOS)
@@ -172,8 +168,3 @@ def main() -> int:
     save_table(overview(cells), arguments.out / "disturbance_overview.csv")
     save_table(rows_of(cells), arguments.out / "disturbance_study.csv")
     draw(cells, arguments.out / "disturbance_study.png")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """Dilution of each robot's signal in the team's common reward, and the effect of a reward of its own.
 
-    python -m examples.studies.gradient_dilution --seeds 20
+    python -m examples.studies gradient_dilution --seeds 20
 
 One iteration of the paper's denoising (1024 samples, 100 steps) for teams of 1 to 64 robots that cross a circle. Robots
 do not see each other, so every robot has the same easy task whatever the size of the team, and what differs is whose
@@ -189,7 +189,3 @@ def main() -> None:
     rows = study_rows(arguments, "gradient_dilution", partial(measure, *settings))
     save_table(summary(rows), arguments.out / "gradient_dilution.csv")
     draw(rows, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

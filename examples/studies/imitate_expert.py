@@ -1,7 +1,7 @@
 """Imitation of a planner: a network learns what D4orm-C2F does, first by cloning, then by DAgger, then by PPO.
 
-    python -m examples.studies.imitate_expert --seeds 3
-    python -m examples.studies.imitate_expert --trials examples/studies/data/imitate_expert.parquet
+    python -m examples.studies imitate_expert --seeds 3
+    python -m examples.studies imitate_expert --trials examples/studies/data/imitate_expert.parquet
 
 The clone sees what the expert's own drives led to, and on its own comes into places where the expert never was. DAgger
 lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
@@ -13,18 +13,16 @@ file that it wrote before. The same from the command line: ``d4orm train imitati
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import require, save_table, study_parser, study_rows
+from examples.outputs import require, save_table, study_parser, study_rows, success_of_seeds
 
 require("rl", "stable_baselines3", "tensorboard")
 
-from d4orm_planners.evaluation.summary import mean_interval
 from d4orm_planners.rl.curve import Evaluation
 from d4orm_planners.rl.imitation import ImitationSettings, imitate
 from d4orm_planners.rl.training import TrainingSettings, train
@@ -85,28 +83,20 @@ def summary(rows: Rows) -> list[dict[str, object]]:
 
 def _point(way: str, point: Rows) -> dict[str, object]:
     ends = [100 * row["success"] for row in point]
-    success, lower, upper = mean_interval(ends)
     errors = [row["imitation_error"] for row in point if row["imitation_error"] is not None]
     return {
         "learned by": way,
         "moments or robot-steps": f"{np.mean([row['steps'] for row in point]):,.0f}",
         "seeds": len(point),
-        "success": f"{success:.0f}%",
-        "95% interval": "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%",
-        "least, most": f"{min(ends):.0f}%, {max(ends):.0f}%",
+        **success_of_seeds(ends),
         "travel time [s]": f"{np.mean([row['travel_time'] for row in point]):.2f}",
         "imitation error": f"{np.mean(errors):.2f}" if errors else "",
     }
 
 
-def main() -> int:
+def main() -> None:
     """Learn, or read curves, and write what came of it."""
     arguments = study_parser(__doc__, seeds=3).parse_args()
     seeds, quick, out = (1 if arguments.quick else arguments.seeds), arguments.quick, arguments.out / "imitation"
     rows = study_rows(arguments, "imitate_expert", lambda: measure(seeds, out, quick))
     save_table(summary(rows), arguments.out / "imitate_expert.csv")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

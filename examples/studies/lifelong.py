@@ -1,8 +1,8 @@
 """Robots that get a new goal whenever they arrive, under D4orm-C2F, for some minutes of simulated time.
 
-    python -m examples.studies.lifelong --minutes 1
-    python -m examples.studies.lifelong --minutes 10 --seeds 10
-    python -m examples.studies.lifelong --minutes 5 --scenario warehouse --num-robots 32
+    python -m examples.studies lifelong --minutes 1
+    python -m examples.studies lifelong --minutes 10 --seeds 10
+    python -m examples.studies lifelong --minutes 5 --scenario warehouse --num-robots 32
 
 The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, a robot
 would accelerate to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
@@ -160,7 +160,3 @@ def main() -> None:
 
     drives = study_rows(arguments, "lifelong", measure)
     save_table([summary(drives)], arguments.out / "lifelong.csv")
-
-
-if __name__ == "__main__":
-    main()

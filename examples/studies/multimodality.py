@@ -1,6 +1,7 @@
 """Kinds of solution that a planner finds: two robots swap places around an obstacle (the paper's appendix A).
 
-    python -m examples.studies.multimodality --seeds 100
+    python -m examples.studies multimodality --seeds 100
+    python -m examples.studies multimodality --team 8 --seeds 30
 
 One solve per planner and seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of
 robot 1 about the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in
@@ -8,16 +9,24 @@ which order the two robots and the obstacle lie from top to bottom as they pass 
 The other two are cyclic (robot 0 above the obstacle, the obstacle above robot 1, robot 1 above robot 0): a robot must
 weave, and pass the other on one side before it passes the obstacle on the other. The signs do not tell how often a
 robot goes round.
+
+With ``--team`` a whole team changes places on a circle, the appendix's harder problem: robots meet pairwise, and pass
+each other on one side or the other. A plan's class is the sign of the angle that each robot sweeps around each other
+one, 28 signs with eight robots. The table has how many seeds were solved, how many classes the solutions are of, how
+many pairs of solutions are of the same class, and how far apart two solutions are (root mean square distance of the
+robots' places over time, mean over all pairs). The plot has all solutions along the directions in which they differ
+most.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
-from examples.outputs import plt, require, save_figure, save_table, study_parser, study_rows
+from examples.outputs import count, plt, require, save_figure, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 require("ipopt", "casadi")
@@ -113,22 +122,18 @@ def draw(problem: Problem, found: dict[Signature, list[np.ndarray]], out: Any) -
     figure = plt.figure(figsize=(10.5, 0.8 + 1.45 * max(rows, 2)), layout="constrained")
     grid = figure.add_gridspec(rows, 4, width_ratios=[1.15, 1.15, 1, 1])
     scatter = figure.add_subplot(grid[:, :2])
-    points, shares = principal_components([plan for plans in found.values() for plan in plans])
-    first = 0
-    for number, (signs, plans) in enumerate(found.items()):
+    styles = [
+        {"marker": "o", "color": colour, "markersize": 4.5, "alpha": 0.75, "label": name}
+        for name, colour in map(CLASSES.__getitem__, found)
+    ]
+    parts = draw_components(scatter, list(found.values()), styles)
+    for number, (part, (signs, plans)) in enumerate(zip(parts, found.items(), strict=True)):
         name, colour = CLASSES[signs]
-        part = points[first : first + len(plans)]
-        first += len(plans)
-        scatter.plot(*part.T, "o", color=colour, markersize=4.5, alpha=0.75, markeredgewidth=0, label=name)
         panel = figure.add_subplot(grid[number // 2, 2 + number % 2])
         typical = plans[int(((part - part.mean(axis=0)) ** 2).sum(axis=1).argmin())]
         draw_plan(panel, problem, typical, colour)
         panel.set_title(f"{name}: {len(plans)} plan{'s'[: len(plans) > 1]}", fontsize=9, color=colour)
-    scatter.set(
-        xlabel=f"first principal component [m], {shares[0]:.0%} of the variance",
-        ylabel=f"second principal component [m], {shares[1]:.0%} of the variance",
-    )
-    scatter.set_title(f"{len(points)} solutions in {len(found)} classes", fontsize=10)
+    scatter.set_title(f"{sum(map(len, parts))} solutions in {len(found)} classes", fontsize=10)
     scatter.set_aspect("equal", adjustable="datalim")
     scatter.legend(title="top to bottom", loc="best", handletextpad=0.1)
     save_figure(figure, out / "multimodality.png")
@@ -165,11 +170,68 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return table
 
 
+def team_signature(positions: np.ndarray) -> tuple[bool, ...]:
+    """Return, for every pair of robots of a plan ``(T, K, 2)``, whether the one goes round the other anticlockwise."""
+    pairs = combinations(range(positions.shape[1]), 2)
+    return tuple(winding(positions[:, second] - positions[:, first]) > 0 for first, second in pairs)
+
+
+def row_of(label: str, rows: Sequence[Row]) -> dict[str, Any]:
+    """The table's row of a planner."""
+    plans = solutions(rows, label)
+    paths = [path_of(plan) for plan in plans]
+    classes, pairs = [team_signature(path) for path in paths], list(combinations(range(len(plans)), 2))
+    same = sum(classes[one] == classes[other] for one, other in pairs)
+    apart = [np.sqrt(((paths[one] - paths[other]) ** 2).sum(axis=2).mean()) for one, other in pairs]
+    times = [plan["travel_time"] for plan in plans]
+    return {
+        "planner": label,
+        "solved": f"{len(plans)} of {sum(row['planner'] == label for row in rows)}",
+        "classes": len(set(classes)),
+        "pairs of one class": f"{same / len(pairs):.0%}" if pairs else "-",
+        "distance [m]": f"{np.mean(apart):.2f}" if pairs else "-",
+        "travel time [s]": f"{np.mean(times):.2f}" if times else "-",
+    }
+
+
+def draw_components(axes: Any, groups: Sequence[Sequence[np.ndarray]], styles: Sequence[dict[str, Any]]) -> list[Any]:
+    """Groups of plans along the principal components of all of them together; the points ``(S, 2)`` of each group."""
+    points, shares = principal_components([path for paths in groups for path in paths])
+    parts = np.split(points, np.cumsum([len(paths) for paths in groups])[:-1])
+    for part, style in zip(parts, styles, strict=True):
+        axes.plot(*part.T, linestyle="none", markeredgewidth=0, **style)
+    names = zip(("first", "second"), shares)
+    labels = [f"{name} principal component [m], {share:.0%} of the variance" for name, share in names]
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    return parts
+
+
+def draw_teams(rows: Sequence[Row], out: Any) -> None:
+    """All planners' solutions along the principal components of all of them together."""
+    groups = [[path_of(plan) for plan in solutions(rows, label)] for label in PLANNERS]
+    figure, axis = plt.subplots(figsize=(5.5, 4.5), layout="constrained")
+    markers = zip("o^s", PLANNERS, strict=True)
+    draw_components(
+        axis, groups, [{"marker": mark, "label": label, "alpha": 0.7, "markersize": 5} for mark, label in markers]
+    )
+    axis.legend()
+    save_figure(figure, out / "multimodality_team.png")
+
+
 def main() -> None:
-    """Solve with every planner and seed, count the classes, write the table and the plot of D4orm's."""
+    """Solve with every planner and seed, count the classes, write the table and the plot."""
     parser = study_parser(__doc__, seeds=100)
     parser.add_argument("--radius", type=float, default=0.5, help="of the obstacle [m]")
+    parser.add_argument("--team", type=count, metavar="ROBOTS", help="so many on a circle instead, and no obstacle")
     arguments = parser.parse_args()
+    if arguments.team:
+        seeds, num_robots = (4, 3) if arguments.quick else (arguments.seeds, arguments.team)
+        problem = make_problem("paper_circle", num_robots=num_robots)
+        plans = partial(solve, problem, seeds, max_iterations=20, time_limit=120)
+        rows = study_rows(arguments, "multimodality_team", plans)
+        save_table([row_of(label, rows) for label in PLANNERS], arguments.out / "multimodality_team.csv")
+        draw_teams(rows, arguments.out)
+        return
     seeds = min(arguments.seeds, 8) if arguments.quick else arguments.seeds
     problem = crossing(arguments.radius)
     rows = study_rows(arguments, "multimodality", partial(solve, problem, seeds, max_iterations=10))
@@ -177,7 +239,3 @@ def main() -> None:
     paths = [path_of(row) for row in solutions(rows, "d4orm")]
     found = {signs: [path for path in paths if signature(path) == signs] for signs in CLASSES}
     draw(problem, {signs: members for signs, members in found.items() if members}, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

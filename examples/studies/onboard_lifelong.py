@@ -1,6 +1,6 @@
 """Six ground robots, each a process with its own node of D-D4orm on a zenoh network, that get new goals for ever.
 
-    python -m examples.studies.onboard_lifelong --minutes 2
+    python -m examples.studies onboard_lifelong --minutes 2
 
 This is the paper's on-robot demonstration (section VIII) with a simulated world: the world tells all robots where they
 are, and each robot commands its own body. While they drive, the robots plan on from where they will be; every one draws
@@ -23,13 +23,11 @@ import tempfile
 from pathlib import Path
 
 from examples.outputs import argument_parser, count, require, save_figure, save_gif, save_table
-from examples.studies.onboard.crew import RobotProcesses, free_endpoints
-from examples.studies.onboard.log import COLUMNS, Log
 from examples.studies.onboard.mission import TICK, Mission
-from examples.studies.onboard.picture import draw
-from examples.studies.onboard.results import Row, film, robot_rows, run_row, timeline
+from examples.studies.onboard.results import Row, draw, film, robot_rows, run_row, timeline
 from examples.studies.onboard.robot import Robot
-from examples.studies.onboard.world import World
+from examples.studies.onboard.thinking import COLUMNS, Log
+from examples.studies.onboard.world import RobotProcesses, World, free_endpoints
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.d_d4orm.transport import LocalNetwork
@@ -148,7 +146,3 @@ def write(world: World, rows: list[Row], out: Path, seconds: float) -> None:
     until = record.began[min(round(SHOWN / TICK), record.steps - 1)] - record.began[0]
     save_figure(draw(rows, world.problem.num_robots, until), out / "onboard_lifelong_timeline.png")
     save_gif(film(world.problem, record, seconds), out / "onboard_lifelong.gif", TICK)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """MPPI against MBD in one dimension: what annealing the noise does (the paper's illustration, section IV-A).
 
-    python -m examples.studies.one_dimension
+    python -m examples.studies one_dimension
 
 Both maximise the same function with many local maxima, with the same softmax over the same number of samples a step.
 MPPI samples with one standard deviation throughout, small or large; MBD's falls along the diffusion schedule: it looks
@@ -100,7 +100,3 @@ def main() -> None:
         )
     save_table(rows, arguments.out / "one_dimension.csv")
     draw(shown, scales, best, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

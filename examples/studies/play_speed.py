@@ -1,8 +1,8 @@
 """Speed of `d4orm play`: control loops, frames that are sent and drawn, and from a drop to the new plan.
 
-    python -m examples.studies.play_speed --seconds 30
-    python -m examples.studies.play_speed --seconds 30 --browser
-    python -m examples.studies.play_speed --minutes 20 --browser
+    python -m examples.studies play_speed --seconds 30
+    python -m examples.studies play_speed --seconds 30 --browser
+    python -m examples.studies play_speed --minutes 20 --browser
 
 A team with lifelong goals is driven live, and somebody looks at it: a client that draws nothing, or with `--browser`
 headless Chromium, which without a graphics processor draws on the processor that plans. Where Chromium runs, the time
@@ -184,7 +184,3 @@ def main() -> None:
     parser.add_argument("--drops", type=int, default=5)
     parser.add_argument("--browser", action="store_true", help="measure in headless Chromium")
     measure(parser.parse_args())
-
-
-if __name__ == "__main__":
-    main()

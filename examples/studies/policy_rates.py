@@ -1,6 +1,6 @@
 """Success rates of the package's learned policies, on instances that no training saw.
 
-    python -m examples.studies.policy_rates --seeds 100
+    python -m examples.studies policy_rates --seeds 100
 
 Seeds from 30000 on, of which the first 100 were never trained on, nor was any file chosen by them. Noise is that on the
 controls, of a standard deviation of 0.2. Each cell has successes with Wilson's 95% interval and the mean travel time of
@@ -140,7 +140,3 @@ def main() -> None:
     for table in dict.fromkeys(table for _, table, _ in FILES.values()):
         if lines := table_of(rows, table):
             save_table(lines, out / f"{table}.csv")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Read what `d4orm evaluate` stored with pandas: a table by policy and scenario, and success by deadline for planning.
 
     d4orm evaluate --policy d4orm,orca --scenario circle,random --num-robots 8 --seeds 20 --out evaluation
-    python -m examples.studies.read_results --results evaluation
+    python -m examples.studies read_results --results evaluation
 
 Without `--results` it makes a small evaluation of its own. `--format` chooses which of the files is read; all hold the
 same rows, described in docs/evaluation.md. Needs pandas, pyarrow for Parquet, and pyrvo for its own evaluation.
@@ -96,7 +96,3 @@ def main() -> None:
     ]
     save_table(rows, arguments.out / "read_results.csv")
     draw(folder, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Planning time of D4orm-D by team size at constant density.
 
-    python -m examples.studies.scaling --seeds 3
-    python -m examples.studies.scaling --seeds 1 --num-robots 2000
+    python -m examples.studies scaling --seeds 3
+    python -m examples.studies scaling --seeds 1 --num-robots 2000
 
 Random starts and goals on a square with 1.5625 square metres per robot: 10 m x 10 m for 64 of them.
 """
@@ -89,7 +89,3 @@ def main() -> None:
     rows = summary(study_rows(arguments, "scaling", plans))
     save_table(rows, arguments.out / "scaling.csv")
     draw(rows, arguments.out)
-
-
-if __name__ == "__main__":
-    main()

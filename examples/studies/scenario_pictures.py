@@ -1,11 +1,10 @@
 """Draw the paper's scenarios, those with walls, and a map from a file: the pictures of docs/scenarios.md.
 
-python -m examples.studies.scenario_pictures
+python -m examples.studies scenario_pictures
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ SCENARIOS: dict[str, dict[str, Any]] = {
 }
 
 
-def main() -> int:
+def main() -> None:
     """One picture per scenario, with everybody at the start."""
     parser = argument_parser(__doc__)
     parser.add_argument("--num-robots", "--robots", type=count, default=8)
@@ -48,8 +47,3 @@ def main() -> int:
             problem, standing, arguments.out / f"scenario_{name}.png", title=f"{name}, {problem.num_robots} robots"
         )
         print(f"wrote {path}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

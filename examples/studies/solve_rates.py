@@ -1,9 +1,9 @@
 """Success, time and quality of the planners on their problems: tables of the README and of the planners' pages.
 
-    python -m examples.studies.solve_rates --seeds 20
-    python -m examples.studies.solve_rates --seeds 5 --sets few --planner mmd
-    python -m examples.studies.solve_rates --seeds 20 --sets paper --planner d4orm --preset paper
-    python -m examples.studies.solve_rates --sets big --planner hybrid --improve 3
+    python -m examples.studies solve_rates --seeds 20
+    python -m examples.studies solve_rates --seeds 5 --sets few --planner mmd
+    python -m examples.studies solve_rates --seeds 20 --sets paper --planner d4orm --preset paper
+    python -m examples.studies solve_rates --sets big --planner hybrid --improve 3
 
 Random instances differ by seed; those of the AMSwarm comparison have their starts jittered by 5 mm. Every plan that
 counts as solved has passed ``verify()``. Iterations and seconds are those to the first solution, compilation not
@@ -220,7 +220,3 @@ def main() -> None:
         columns = ("team", "planner", "solved", "first plan [s] (median, most)", "travel time [s]", "least [s]")
         table = [{name: row[name] for name in columns} for row in summary(shown)]
         save_table(table, arguments.out / "solve_rates.csv")
-
-
-if __name__ == "__main__":
-    main()

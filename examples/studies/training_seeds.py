@@ -1,7 +1,7 @@
 """Reinforcement learning with several seeds: curves of PPO and SAC with 95% intervals of the mean (Student's t).
 
-    python -m examples.studies.training_seeds --seeds 3
-    python -m examples.studies.training_seeds --curves examples/studies/data/training_curves.csv
+    python -m examples.studies training_seeds --seeds 3
+    python -m examples.studies training_seeds --curves examples/studies/data/training_curves.csv
 
 Trains every learner with every seed, one after another: about three hours of one core. Broken off, it goes on where it
 was. With ``--curves`` it trains nothing, and makes table and picture of a file that it wrote before.
@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from examples.outputs import COLOURS, argument_parser, count, plt, require, save_figure, save_table
+from examples.outputs import COLOURS, argument_parser, count, plt, require, save_figure, save_table, success_of_seeds
 
 require("rl", "stable_baselines3", "tensorboard")
 
@@ -95,15 +94,12 @@ def summary(rows: Rows) -> list[dict[str, object]]:
     for learner, stages in by_learner(rows).items():
         last, every = stages[max(stages)], [row for stage in stages.values() for row in stage]
         ends = [100 * float(row["success"]) for row in last]
-        success, lower, upper = mean_interval(ends)
         minutes = sum(float(row["seconds"]) for row in every) / len(last) / 60
         row = {
             "learner": learner,
             "seeds": len(last),
             "robot-steps": f"{max(stages) / 1e6:.1f} million",
-            "success in the end": f"{success:.0f}%",
-            "95% interval": "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%",
-            "least, most": f"{min(ends):.0f}%, {max(ends):.0f}%",
+            **success_of_seeds(ends, "success in the end"),
             "travel time [s]": f"{np.mean([float(one['travel_time']) for one in last]):.2f}",
             "minutes each": f"{minutes:.0f}",
             "environment's share": f"{np.mean([float(one['env_share']) for one in every]):.0%}",
@@ -131,7 +127,7 @@ def draw(rows: Rows, path: Path) -> None:
     save_figure(figure, path)
 
 
-def main() -> int:
+def main() -> None:
     """Train, or read curves; write the curves, a table of their ends and the picture."""
     parser = argument_parser(__doc__)
     parser.add_argument("--seeds", type=count, default=3, help="trainings per learner")
@@ -150,8 +146,3 @@ def main() -> int:
             rows = list(csv.DictReader(file))
     save_table(summary(rows), arguments.out / "training_seeds.csv")
     draw(rows, arguments.out / "training_seeds.png")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

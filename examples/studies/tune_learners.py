@@ -1,6 +1,6 @@
 """PPO and SAC tuned with the same budget: how good the settings are that the package trains with.
 
-    python -m examples.studies.tune_learners --candidates 7
+    python -m examples.studies tune_learners --candidates 7
 
 Both have the settings of `training_seeds.py` in crowds and so many drawn at random from a space of their own. Each is
 trained for a first look, and the better third twice as long, from nothing and with another seed (successive halving:
@@ -13,16 +13,14 @@ and makes the table of a file that it wrote before.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from examples.outputs import count, save_table, study_parser, study_rows
 from examples.studies.training_seeds import LEARNERS, QUICK
-from examples.studies.tune_rivals import FIRST_SEED, KEPT, Between, OneOf, Settings
+from examples.studies.tune_rivals import FIRST_SEED, KEPT, Between, OneOf, Settings, candidates
 
 from d4orm_planners.rl.training import TrainingSettings, train
 
@@ -42,13 +40,6 @@ SPACES: Mapping[str, Mapping[str, Between | OneOf]] = {
 }  # fmt: skip
 
 
-def candidates(learner: str, number: int) -> list[Settings]:
-    """Nothing but what the learner has, and settings drawn from its space."""
-    random = np.random.default_rng([FIRST_SEED, *learner.encode()])
-    drawn = [{name: part.draw(random) for name, part in SPACES[learner].items()} for _ in range(number - 1)]
-    return [{}, *drawn]
-
-
 def with_settings(training: TrainingSettings, settings: Settings) -> TrainingSettings:
     """A training with other settings of its learner."""
     others = {name: value for name, value in settings.items() if name != "learning_rate"}
@@ -61,7 +52,7 @@ def with_settings(training: TrainingSettings, settings: Settings) -> TrainingSet
 
 def tune(learner: str, number: int, quick: bool, out: Path) -> list[dict[str, Any]]:
     """A row per training."""
-    training, chosen, rows = TRAININGS[learner], dict(enumerate(candidates(learner, number))), []
+    training, chosen, rows = TRAININGS[learner], dict(enumerate(candidates(learner, number, SPACES[learner]))), []
     if quick:
         training = replace(training, **{**QUICK, "stages": 1}, mixture=("random 2", "circle 2"))
     for turn, longer in enumerate(LONGER):
@@ -98,7 +89,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, object]]:
     return table
 
 
-def main() -> int:
+def main() -> None:
     """Tune both, or one, and write what was tried."""
     parser = study_parser(__doc__)
     parser.add_argument("--candidates", type=count, default=7, help="settings tried per learner, its own included")
@@ -115,8 +106,3 @@ def main() -> int:
         ],
     )
     save_table(summary(rows), arguments.out / "tune_learners.csv")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

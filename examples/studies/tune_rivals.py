@@ -1,6 +1,6 @@
 """Tune D4orm and its rivals, each with the same budget: where the preset "tuned" comes from.
 
-    python -m examples.studies.tune_rivals --candidates 27 --seeds 4 --out tuning
+    python -m examples.studies tune_rivals --candidates 27 --seeds 4 --out tuning
 
 Every method has its preset "paper" and so many settings drawn at random from its own space. All of them meet four teams
 with the same seeds; the better third meets twice as many, and a third of that four times as many (successive halving:
@@ -14,7 +14,6 @@ in `examples/studies/data/`.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,10 +71,10 @@ SPACES: Mapping[str, Mapping[str, Between | OneOf]] = {
 }  # fmt: skip
 
 
-def candidates(method: str, number: int) -> list[Settings]:
-    """The preset as it is, and settings drawn from the method's space."""
+def candidates(method: str, number: int, space: Mapping[str, Between | OneOf]) -> list[Settings]:
+    """Nothing but what the method has, and settings drawn from a space of its own."""
     random = np.random.default_rng([FIRST_SEED, *method.encode()])
-    drawn = [{name: part.draw(random) for name, part in SPACES[method].items()} for _ in range(number - 1)]
+    drawn = [{name: part.draw(random) for name, part in space.items()} for _ in range(number - 1)]
     return [{}, *drawn]
 
 
@@ -103,7 +102,7 @@ def run(method: str, chosen: Sequence[Settings], seeds: int, budget: int, out: P
 
 def tune(method: str, number: int, seeds: int, budget: int, out: Path) -> list[Trial]:
     """Run all rounds of a method; the trials of all settings, each of its last round, which has those before."""
-    chosen = candidates(method, number)
+    chosen = candidates(method, number, SPACES[method])
     trials: list[Trial] = []
     for turn in range(ROUNDS):
         found = run(method, chosen, seeds << turn, budget, out)
@@ -153,7 +152,7 @@ def shortlist(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def main() -> int:
+def main() -> None:
     """Tune all methods, or some, and write what was tried."""
     parser = study_parser(__doc__)
     parser.add_argument("--candidates", type=count, default=27, help="settings tried per method, the preset included")
@@ -170,8 +169,3 @@ def main() -> int:
     rows = rows_of(trials)
     save_table(rows, arguments.out / "tuning.csv")
     save_table(shortlist(rows), arguments.out / "tuning_best.csv")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """Warm start by a learned policy: what the team does by it is where the search of a planner begins.
 
-    python -m examples.studies.warm_start --seeds 20
+    python -m examples.studies warm_start --seeds 20
 
 Every instance is planned for twice by each planner, with nothing to begin with and from an episode of the policy "ppo"
 that comes with the package, whose time is counted. Then D4orm-C2F drives, its first coarse plan made from nothing and
@@ -92,7 +92,3 @@ def main() -> None:
         chosen = ("hybrid", "d4orm-c2f"), (("random", 4),), 2
     rows = study_rows(arguments, "warm_start", partial(measure, *chosen))
     save_table(summary(rows), arguments.out / "warm_start.csv")
-
-
-if __name__ == "__main__":
-    main()

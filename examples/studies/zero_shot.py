@@ -1,6 +1,6 @@
 """Crazyflies in crazyflow, a physics that planners know nothing of: open loop from the defaults, and closed loop.
 
-    python -m examples.studies.zero_shot --seeds 20
+    python -m examples.studies zero_shot --seeds 20
 
 Teams of `robot="crazyflie"`, with its radius, limits and margin: a swap of ten among obstacles, a circle of eight in a
 slab of 0.5 m, and ten that rise from a grid to a figure of eight, in an order drawn anew. Plans of `hybrid` are sampled
@@ -147,7 +147,3 @@ def main() -> None:
     for row in rows:
         groups[row["scenario"], row["condition"]].append(row)
     save_table([row_of(*key, group) for key, group in groups.items()], arguments.out / "zero_shot.csv")
-
-
-if __name__ == "__main__":
-    main()

@@ -16,7 +16,7 @@ import pytest
 from d4orm_env import make_problem, rollout
 from d4orm_env.engine import worlds
 from d4orm_env.engine.compiling import OPTIONS
-from d4orm_env.paths import looking, wavefront
+from d4orm_env.paths import lattice, looking, wavefront
 from d4orm_planners.baselines.amswarm.alternation import alternate
 from d4orm_planners.cli.warmup import sample_once
 from d4orm_planners.engine import average as averaging
@@ -67,7 +67,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "softmax", softmax._softmax
     yield "spread", wavefront._spread
     yield "look", looking.look
-    yield "settle", wavefront.settle_nodes
+    yield "settle", lattice.settle_nodes
     yield "drive", straight_kernel("differential_drive")
     yield "search", search_kernel("differential_drive")
     yield "meetings", path_index._count_meetings

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import LARGEST, SMALLEST
-from d4orm_env.core.problem import MAX_TIME_STEP, MIN_TIME_STEP, Problem
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import MAX_TIME_STEP, MIN_TIME_STEP
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.envs.inputs import MAX_ACTION

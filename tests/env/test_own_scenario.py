@@ -15,7 +15,7 @@ from registry_support import forgetting
 
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0, register_scenario, save_problem
 from d4orm_env.scenarios import describe_scenario, list_scenarios, load_problem
-from d4orm_env.scenarios.scenario_registry import SCENARIOS
+from d4orm_env.scenarios.problems import SCENARIOS
 from d4orm_planners import OpenLoop, evaluate, make_planner, run_episode
 from d4orm_planners.cli.app import main
 

@@ -16,7 +16,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.scenarios import describe_scenario, list_scenarios, make_problem
 from d4orm_env.scenarios.generators import fibonacci_sphere
 from d4orm_env.scenarios.layout import default_horizon
-from d4orm_env.scenarios.scenario_registry import SCENARIOS
+from d4orm_env.scenarios.problems import SCENARIOS
 
 OPEN = ("circle", "sphere", "random", "four_obstacles", "heterogeneous", "swap")
 PAPER = ("paper_circle", "paper_sphere", "paper_random", "paper_heterogeneous", "paper_obstacles")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from d4orm_env import Problem, Team, World, make_problem
 from d4orm_env.paths import shortest_paths
+from d4orm_env.paths.lattice import lay_lattice
 from d4orm_env.paths.spaces import make_space
 from d4orm_env.scenarios.grid_map import GridMap
 from d4orm_planners import make_planner
@@ -83,7 +84,7 @@ def joined(problem: Problem, fineness: float) -> np.ndarray:
 
 def test_a_lattice_says_how_far_apart_its_points_are() -> None:
     problem = alone(World(lower=[0, 0], upper=[100, 100]), (1, 1), (99, 99))
-    lattice = shortest_paths.lay_lattice(problem, None, 0.2, 0.5, 1000)
+    lattice = lay_lattice(problem, None, 0.2, 0.5, 1000)
     assert len(lattice.places) <= 1000
     assert 3.0 < lattice.step < 3.5
     assert np.diff(np.unique(lattice.places[:, 0])) == pytest.approx(lattice.step)
@@ -93,7 +94,7 @@ def test_blocked_points_do_not_make_a_lattice_coarse() -> None:
     # A corridor 1 m wide along a wall of 99 m.
     world = World(boxes=[[0, 1, 100, 100]], lower=[0, 0], upper=[100, 100])
     problem = alone(world, (1, 0.5), (99, 0.5))
-    lattice = shortest_paths.lay_lattice(problem, make_space(problem), 0.2, 0.1, 10_000)
+    lattice = lay_lattice(problem, make_space(problem), 0.2, 0.1, 10_000)
     assert lattice.step == 0.1
     assert len(lattice.nodes) > 900_000
     assert 5000 < len(lattice.places) < 10_000
@@ -104,7 +105,7 @@ def test_blocked_points_do_not_make_a_lattice_coarse() -> None:
 
 def test_a_lattice_gets_as_coarse_as_its_free_points_require() -> None:
     problem = alone(World(boxes=[[40, 40, 60, 60]], lower=[0, 0], upper=[100, 100]), (1, 1), (99, 99))
-    lattice = shortest_paths.lay_lattice(problem, make_space(problem), 0.2, 0.1, 10_000)
+    lattice = lay_lattice(problem, make_space(problem), 0.2, 0.1, 10_000)
     assert 8000 < len(lattice.places) <= 10_000
     assert 0.95 < lattice.step < 1.1
 

@@ -39,7 +39,6 @@ def onboard() -> Any:
         yield SimpleNamespace(
             course=importlib.import_module("examples.studies.onboard.course"),
             mission=importlib.import_module("examples.studies.onboard.mission"),
-            wire=importlib.import_module("examples.studies.onboard.wire"),
         )
 
 
@@ -149,7 +148,7 @@ def test_too_little_time_to_agree_is_refused(onboard: Any) -> None:
 
 
 def test_messages_are_the_same_after_they_were_sent(onboard: Any) -> None:
-    wire = onboard.wire
+    wire = onboard.mission
     tick = wire.Tick(3, [0.1, float(np.float32(0.1))], [2], ["a", ""], [0.5, 0.0])
     command = wire.Command(3, 1, [0.25, -1.0], "a", 0.5, "b")
     assert wire.decode(wire.encode(tick), wire.Tick) == tick
@@ -164,8 +163,8 @@ def test_messages_are_the_same_after_they_were_sent(onboard: Any) -> None:
 
 @given(data=st.binary(max_size=64) | st.text(max_size=64).map(str.encode))
 def test_whatever_else_arrives_is_no_message(onboard: Any, data: bytes) -> None:
-    assert onboard.wire.decode(data, onboard.wire.Tick) is None
-    assert onboard.wire.decode(b'{"kind": "Tick", "number": ' + data, onboard.wire.Tick) is None
+    assert onboard.mission.decode(data, onboard.mission.Tick) is None
+    assert onboard.mission.decode(b'{"kind": "Tick", "number": ' + data, onboard.mission.Tick) is None
 
 
 def timeline(out: Path) -> list[dict[str, str]]:
@@ -207,7 +206,7 @@ def test_the_others_drive_on_when_a_robot_is_killed(tmp_path: Path) -> None:
 def test_ctrl_c_ends_all_processes_and_writes_what_there_is(tmp_path: Path) -> None:
     pytest.importorskip("zenoh")
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "examples.studies.onboard_lifelong", "--robots", "2", "--out", str(out)]
+    command = [sys.executable, "-m", "examples.studies", "onboard_lifelong", "--robots", "2", "--out", str(out)]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     process = subprocess.Popen(
         command,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from examples.outputs import study_trials
-from examples.studies.paper.__main__ import main
+from examples.studies.paper import main
 from examples.studies.paper.figure import Figure, Group, Section, grouped
 from examples.studies.paper.figure_report import markdown, write_figure
 from examples.studies.paper.numbers import METRICS, first_solution, measured
@@ -59,7 +59,7 @@ def run(figure: Figure, out: Path, seeds: int) -> list[Group]:
 
 @pytest.fixture
 def paper(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Runs ``python -m examples.studies.paper`` inside ``tmp_path``; gives exit status, output and errors."""
+    """Runs ``python -m examples.studies paper`` inside ``tmp_path``; gives exit status, output and errors."""
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments: str) -> tuple[int, str, str]:

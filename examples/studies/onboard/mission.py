@@ -1,11 +1,13 @@
-"""Settings of the world and every robot: the same for all."""
+"""Settings of the world and every robot, the same for all, and their messages in every tick."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from typing import Literal, TypeVar
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from d4orm_env import Problem, Team, World
 from d4orm_env.scenarios import make_problem
@@ -97,3 +99,72 @@ class Mission:
         meeting_point = getattr(self, part)
         where = {"listen": (meeting_point,)} if listen else {"connect": (meeting_point,)}
         return ZenohTransport(ZenohSettings(namespace=f"{self.namespace}/{part}", **where))
+
+
+MAX_BYTES = 2**20
+
+
+_STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+"""Messages are checked when they are read: nothing is unpickled, and nothing else is taken for one."""
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Message of the world to all robots.
+
+    Attributes:
+        number: Ticks since the start; -1 for the last message, which ends the run.
+        state: The joint state, see :mod:`d4orm_env.envs.joint_state`.
+        lost: Robots that have been given up; they stand where they stopped.
+        ballots: Plan that each robot announced last as its choice, ``""`` for none.
+        rewards: Rewards of those.
+    """
+
+    number: int
+    state: list[float]
+    lost: list[int]
+    ballots: list[str]
+    rewards: list[float]
+    kind: Literal["Tick"] = "Tick"
+    __pydantic_config__ = _STRICT
+
+
+@dataclass(frozen=True)
+class Command:
+    """Message of a robot in a tick.
+
+    Attributes:
+        number: The tick.
+        robot: Its number.
+        control: ``(m,)``.
+        ballot: Digest of the plan that it would take over next, ``""`` for none.
+        reward: Its reward.
+        executing: Digest of the plan that it executes.
+    """
+
+    number: int
+    robot: int
+    control: list[float]
+    ballot: str
+    reward: float
+    executing: str
+    kind: Literal["Command"] = "Command"
+    __pydantic_config__ = _STRICT
+
+
+END = Tick(-1, [], [], [], [])
+
+Word = TypeVar("Word", Tick, Command)
+
+
+def encode(word: Tick | Command) -> bytes:
+    """A message as bytes."""
+    return json.dumps(asdict(word)).encode()
+
+
+def decode(data: bytes, kind: type[Word]) -> Word | None:
+    """A message of that kind; ``None`` for one of another kind, or anything else."""
+    try:
+        return TypeAdapter(kind).validate_json(data) if len(data) <= MAX_BYTES else None
+    except ValidationError:
+        return None

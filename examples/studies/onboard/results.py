@@ -1,18 +1,23 @@
-"""Results: tables and an animation from the records of the world and the robots."""
+"""Results: tables, an animation, and the timeline as a picture, from the records of the world and the robots."""
 
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
-from examples.studies.onboard.log import COLUMNS
+from examples.studies.onboard.thinking import COLUMNS
 from examples.studies.onboard.world import Record
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from d4orm_env import Problem
 from d4orm_env.render import FrameRenderer
+from d4orm_env.render.panels import robot_colors
 
 Row = dict[str, Any]
 
@@ -125,3 +130,135 @@ def film(problem: Problem, record: Record, seconds: float) -> list[Any]:
 
 def _median(values: Any) -> str:
     return f"{np.median(values):.0f}" if len(values) else ""
+
+
+INK, FAINT = "#1F2937", "#B8BEC7"
+HEIGHT = 0.5
+"""Height of a bar, where robots are 1 apart."""
+
+
+def draw(rows: Sequence[Row], num_robots: int, seconds: float) -> Any:
+    """The figure.
+
+    Args:
+        rows: The timeline.
+        num_robots: Number of robots.
+        seconds: Part of the run that is shown below.
+    """
+    figure, (above, below) = plt.subplots(
+        2, 1, figsize=(9.5, 2.4 + 0.75 * num_robots), layout="constrained", height_ratios=(1.25, 1)
+    )
+    number = telling_round(rows)
+    if number is None:
+        above.text(0.5, 0.5, "no round has ended", ha="center", transform=above.transAxes)
+    else:
+        draw_round(above, rows, number, num_robots)
+    draw_run(below, rows, num_robots, seconds)
+    return figure
+
+
+def telling_round(rows: Sequence[Row]) -> int | None:
+    """The round with the most to see: of those whose plan was taken over, that with the most choices of another's."""
+    agreed = {row["round"] for row in rows if row["event"] == "takes over"}
+    choices = Counter(
+        row["round"] for row in rows if row["event"] == "selected" and row["of"] != row["robot"] and row["round"] > 1
+    )
+    return max(agreed, key=lambda number: (choices[number], -number), default=None)
+
+
+def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> None:
+    """Bars for iterations, lines for messages; the black ones are the candidates that were gone on from."""
+    own = [row for row in rows if row["round"] == number]
+    start = min(row["time"] for row in own if row["event"] == "begins")
+    colors = robot_colors(num_robots)
+    made = makers(rows)
+
+    def ms(seconds: float) -> float:
+        return 1000 * (seconds - start)
+
+    sent = {(row["robot"], row["message"]): row for row in own if row["event"] == "sent"}
+    told: set[tuple[int, str]] = set()
+    for row in own:
+        message = sent.get((row["of"], row["message"])) if row["event"] in ("received", "selected") else None
+        if message is None or row["of"] == row["robot"]:
+            continue
+        if row["event"] == "received":
+            # That a plan is told again is not shown.
+            if (row["robot"], row["plan"]) not in told:
+                axes.plot(
+                    [ms(message["time"]), ms(row["time"])], [row["of"], row["robot"]], color=FAINT, lw=0.7, zorder=1
+                )
+            told.add((row["robot"], row["plan"]))
+        else:
+            axes.plot([ms(message["time"]), ms(row["time"])], [row["of"], row["robot"]], color=INK, lw=1.4, zorder=4)
+            axes.plot(ms(row["time"]), row["robot"], "o", color=INK, ms=3.5, zorder=5)
+    for row in own:
+        if row["event"] == "computed":
+            span = [(ms(row["time"]), ms(row["until"]) - ms(row["time"]))]
+            style = {
+                "facecolor": colors[row["robot"]],
+                "edgecolor": "white",
+                "hatch": None if row["solved"] else "////",
+            }
+            axes.broken_barh(span, (row["robot"] - HEIGHT / 2, HEIGHT), zorder=2, **style)
+    first = {event: {} for event in ("announces", "takes over")}
+    for row in own:
+        if row["event"] in first and row["plan"]:
+            first[row["event"]].setdefault(row["robot"], ms(row["time"]))
+    for robot, time in first["announces"].items():
+        axes.plot(time, robot, "D", color="white", mec=INK, ms=5, zorder=6)
+    for robot, time in first["takes over"].items():
+        axes.plot(time, robot, ">", color=INK, ms=7, zorder=6)
+    plans = {row["plan"] for row in own if row["event"] == "takes over"}
+    maker = {made.get(plan) for plan in plans}
+    whose = f"robot {maker.pop()}" if len(maker) == 1 and None not in maker else "an unknown robot"
+    axes.set(
+        xlabel="time since the round began [ms]",
+        ylabel="robot",
+        title=f"Round {number}: the plan of {whose} is taken over",
+    )
+    _rows_of(axes, num_robots)
+    axes.legend(
+        handles=[
+            Patch(facecolor="#6B7280", label="computing"),
+            Patch(facecolor="#6B7280", edgecolor="white", hatch="////", label="no solution yet"),
+            Line2D([], [], color=FAINT, label="candidate sent"),
+            Line2D([], [], color=INK, marker="o", ms=3.5, label="gone on from"),
+            Line2D([], [], color="white", marker="D", mec=INK, ms=5, label="announces"),
+            Line2D([], [], color="none", marker=">", mfc=INK, mec=INK, ms=7, label="takes over"),
+        ],
+        ncols=6, loc="upper center", bbox_to_anchor=(0.5, -0.16), fontsize=8,
+    )  # fmt: skip
+
+
+def draw_run(axes: Any, rows: Sequence[Row], num_robots: int, seconds: float) -> None:
+    """Draw what every robot computed, when it reached a goal, and when plans were taken over."""
+    colors = robot_colors(num_robots)
+    shown = [row for row in rows if 0 <= row["time"] <= seconds]
+    for row in shown:
+        if row["event"] == "computed":
+            span = [(row["time"], row["until"] - row["time"])]
+            axes.broken_barh(span, (row["robot"] - HEIGHT / 2, HEIGHT), color=colors[row["robot"]], lw=0, zorder=2)
+        elif row["event"] == "reaches its goal":
+            axes.plot(row["time"], row["robot"], "*", color="white", mec=INK, ms=9, mew=0.8, zorder=4)
+        elif row["event"] == "is given up":
+            axes.plot(row["time"], row["robot"], "X", color="#D0021B", ms=9, zorder=5)
+    for number in sorted({row["round"] for row in shown if row["event"] == "takes over"}):
+        times = [row["time"] for row in shown if row["event"] == "takes over" and row["round"] == number]
+        axes.axvline(float(np.median(times)), color=FAINT, lw=1, zorder=1)
+    axes.set(xlabel="time since the start [s]", ylabel="robot", xlim=(0, seconds))
+    _rows_of(axes, num_robots)
+    axes.legend(
+        handles=[
+            Patch(facecolor="#6B7280", label="computing"),
+            Line2D([], [], color="none", marker="*", mfc="white", mec=INK, ms=9, label="goal reached, a new one given"),
+            Line2D([], [], color=FAINT, label="a plan is taken over"),
+            Line2D([], [], color="none", marker="X", mfc="#D0021B", mec="#D0021B", ms=8, label="given up"),
+        ],
+        ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=8,
+    )  # fmt: skip
+
+
+def _rows_of(axes: Any, num_robots: int) -> None:
+    axes.set(yticks=range(num_robots), ylim=(num_robots - 0.4, -0.6))
+    axes.grid(axis="y", visible=False)

@@ -15,11 +15,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-from examples.studies.onboard import wire
 from examples.studies.onboard.course import Course, goals_to_plan_for, present_problem, warm_start
-from examples.studies.onboard.log import Log
-from examples.studies.onboard.mission import Mission
-from examples.studies.onboard.thinking import Agenda, Round
+from examples.studies.onboard.mission import END, Command, Mission, Tick, decode, encode
+from examples.studies.onboard.thinking import Agenda, Log, Round
 
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.d_d4orm.transport import Transport
@@ -55,7 +53,7 @@ class Robot:
         planner = self._mission.planning().node_planners(self._mission.robots)[self._number]
         planner.solve(self._problem, max_iterations=1)
 
-    def answer(self, tick: wire.Tick) -> wire.Command:
+    def answer(self, tick: Tick) -> Command:
         """Return the command of a tick."""
         joint = split_state(self._problem, tick.state)
         self._log.tick = tick.number
@@ -67,7 +65,7 @@ class Robot:
         self._choose(tick)
         control = self._course.controls_at(tick.number)[self._number]
         ballot, reward = ("", 0.0) if self._ballot is None else (self._ballot.digest, self._ballot.reward)
-        return wire.Command(tick.number, self._number, [float(u) for u in control], ballot, reward, self._course.digest)
+        return Command(tick.number, self._number, [float(u) for u in control], ballot, reward, self._course.digest)
 
     def end(self) -> None:
         """Stop planning."""
@@ -83,7 +81,7 @@ class Robot:
         self._log.note("stops", plan=self._course.digest)
         self._drop_round()
 
-    def _take_over(self, tick: wire.Tick) -> None:
+    def _take_over(self, tick: Tick) -> None:
         """Execute the new plan if every robot has announced the same one; else go on with what there is."""
         assert self._round is not None
         ballots = {tick.ballots[robot] for robot in range(self._mission.robots) if robot not in self._lost}
@@ -122,7 +120,7 @@ class Robot:
         agenda = Agenda(self._rounds, tuple(members), takeover, problem, guess)
         self._round = Round(agenda, self._mission, self._number, self._engine, self._team, self._log.observe)
 
-    def _choose(self, tick: wire.Tick) -> None:
+    def _choose(self, tick: Tick) -> None:
         """Announce the best plan known when thinking is over, and then the best of those that all have announced."""
         if self._round is None:
             return
@@ -148,15 +146,15 @@ def drive(mission: Mission, number: int, robot: Robot, world: Transport) -> None
     heard, last, answer = time.perf_counter(), -1, b""
     while time.perf_counter() - heard < mission.silence:
         for data in world.collect(LOOK):
-            tick = wire.decode(data, wire.Tick)
+            tick = decode(data, Tick)
             if tick is None:
                 continue
             heard = time.perf_counter()
             # Others that were given up, or a gap: this robot does not know the team's plan any more.
-            if tick == wire.END or number in tick.lost or tick.number > last + 1:
+            if tick == END or number in tick.lost or tick.number > last + 1:
                 return
             if tick.number == last + 1:
-                last, answer = tick.number, wire.encode(robot.answer(tick))
+                last, answer = tick.number, encode(robot.answer(tick))
             if tick.number == last:
                 world.publish(answer)
 

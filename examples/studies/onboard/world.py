@@ -1,15 +1,20 @@
-"""The simulated world: it tells all robots where they are, and moves them as they command."""
+"""The simulated world, which moves all robots as they command, and the processes of the robots."""
 
 from __future__ import annotations
 
+import os
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
-from examples.studies.onboard import wire
-from examples.studies.onboard.mission import Mission
+from examples.studies.onboard.mission import END, Command, Mission, Tick, decode, encode
 
 from d4orm_env import navigation_v0
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -86,7 +91,7 @@ class World:
         self._env.step(dict.fromkeys(self.agents, np.zeros(self.problem.control_size, np.float32)))
         self._env.reset(seed=mission.seed)
         self._lost: set[int] = set()
-        self._commands: dict[int, wire.Command] = {}
+        self._commands: dict[int, Command] = {}
 
     def await_robots(self, check: Callable[[], None]) -> None:
         """Wait for the first answer of every robot.
@@ -125,7 +130,7 @@ class World:
     def end(self) -> None:
         """Tell the robots that it is over."""
         for _ in range(FAREWELLS):
-            self._robots.publish(wire.encode(wire.END))
+            self._robots.publish(encode(END))
             time.sleep(FAREWELL)
         self._env.close()
 
@@ -135,7 +140,7 @@ class World:
         former = [self._commands.get(robot) for robot in range(len(self.agents))]
         ballots = ["" if command is None else command.ballot for command in former]
         rewards = [0.0 if command is None else command.reward for command in former]
-        question = wire.encode(wire.Tick(tick, state, sorted(self._lost), ballots, rewards))
+        question = encode(Tick(tick, state, sorted(self._lost), ballots, rewards))
         deadline, again = time.perf_counter() + seconds, 0.0
         while missing := {robot for robot in range(len(self.agents)) if self._is_awaited(robot, tick)}:
             now = time.perf_counter()
@@ -145,7 +150,7 @@ class World:
                 self._robots.publish(question)
                 again = now + AGAIN
             for data in self._robots.collect(min(again, deadline) - now):
-                self._take(wire.decode(data, wire.Command), tick)
+                self._take(decode(data, Command), tick)
         return missing
 
     @property
@@ -156,7 +161,7 @@ class World:
     def _is_awaited(self, robot: int, tick: int) -> bool:
         return robot not in self._lost and (robot not in self._commands or self._commands[robot].number != tick)
 
-    def _take(self, command: wire.Command | None, tick: int) -> None:
+    def _take(self, command: Command | None, tick: int) -> None:
         if command is None or command.number != tick or not 0 <= command.robot < len(self.agents):
             return
         if command.robot not in self._lost and len(command.control) == self.problem.control_size:
@@ -174,3 +179,69 @@ class World:
         record.reached.append(np.array([infos[agent]["arrived"] for agent in self.agents]))
         record.collided.append(np.array([infos[agent]["collided"] for agent in self.agents]))
         record.joints.append(split_state(self.problem, self._env.state()))
+
+
+GRACE = 15.0
+"""Seconds that a robot has to end by itself."""
+
+
+class RobotProcesses:
+    """A process for every robot, which ends with the block at the latest.
+
+    Args:
+        mission: Their settings.
+        folder: Folder of their logs.
+    """
+
+    def __init__(self, mission: Mission, folder: Path) -> None:
+        self.logs = [folder / f"robot_{robot}.csv" for robot in range(mission.robots)]
+        self.killed: set[int] = set()
+        path = folder / "mission.json"
+        path.write_text(mission.written())
+        root = str(Path(__file__).resolve().parents[3])
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
+        }
+        command = [sys.executable, "-m", "examples.studies.onboard.robot", str(path)]
+        self._processes: list[subprocess.Popen[bytes]] = []
+        for robot, log in enumerate(self.logs):
+            self._processes.append(subprocess.Popen([*command, str(robot), str(log)], env=environment))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        deadline = time.perf_counter() + (GRACE if kind is None else 0.0)
+        for process in self._processes:
+            try:
+                process.wait(max(deadline - time.perf_counter(), 0))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def check(self) -> None:
+        """Raise ``RuntimeError`` if a robot has ended before its time."""
+        for robot, process in enumerate(self._processes):
+            if process.poll() is not None:
+                raise RuntimeError(f"the process of robot_{robot} has ended with status {process.returncode}")
+
+    def kill(self, robot: int) -> None:
+        """End one at once, as if its battery had run out."""
+        self.killed.add(robot)
+        self._processes[robot].kill()
+
+    def statuses(self) -> list[int | None]:
+        """Exit statuses, ``None`` for who still runs."""
+        return [process.poll() for process in self._processes]
+
+
+def free_endpoints(number: int) -> list[str]:
+    """Endpoints on loopback that nobody listens at."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(number)]
+    ports = [one.getsockname()[1] for one in sockets]
+    for one in sockets:
+        one.close()
+    return [f"tcp/127.0.0.1:{port}" for port in ports]

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from d4orm_planners.base.planner_registry import list_planners
 from d4orm_planners.evaluation.store import Trial, TrialKey
@@ -141,11 +141,7 @@ class Figure:
         return [(section.title, study) for section in self.sections for study in section.studies(seeds)]
 
     def only(self, titles: Sequence[str] = (), labels: Sequence[str] = ()) -> Figure:
-        """A part of the figure.
-
-        Args:
-            titles: The sections to keep; all if empty.
-            labels: The policies to keep; all if empty.
+        """A part of the figure: sections of these titles, and policies of these labels, or all where none are given.
 
         Raises:
             ValueError: For a title or label that it does not have.
@@ -165,15 +161,8 @@ class Figure:
         return replace(self, sections=tuple(kept))
 
 
-@dataclass(frozen=True)
-class Group:
-    """Trials of one policy on one scenario, team size and level of noise.
-
-    Attributes:
-        section: Title of the section.
-        label: Name there of the policy with its settings.
-        trials: One per seed.
-    """
+class Group(NamedTuple):
+    """Trials, one per seed, of one policy on one scenario, team size and level of noise; its section and its label."""
 
     section: str
     label: str

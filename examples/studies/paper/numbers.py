@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from examples.studies.paper.figure import TIMES, Figure, Group
@@ -17,52 +18,31 @@ from d4orm_planners.evaluation.summary import Compared
 
 @dataclass(frozen=True, kw_only=True)
 class Measured(Compared):
-    """One policy on one problem. All but counts, quartiles and reward is over the successes, see
-    :func:`first_solution`.
+    """One policy on one problem; all but counts, quartiles and reward over the successes, see :func:`first_solution`.
 
-    Attributes:
-        section: Title of the section.
-        runtime: Median seconds to the first solution over all trials, of which those that failed count as never, which
-            ``None`` is.
-        runtime_lower: Lower quartile, likewise.
-        runtime_upper: Upper quartile, likewise.
-        runtime_mean: Mean over the successes; ``None`` without any, as all below.
-        runtime_deviation: Standard deviation; 0 for one success.
-        first_steps: Median denoising steps to the first solution over all trials, likewise.
-        first_steps_lower: Lower quartile.
-        first_steps_upper: Upper quartile.
-        iterations: Mean over the successes; ``None`` for policies that execute no plan.
-        reward: Mean over all trials of the last best plan's reward per step of the horizon and robot; ``None`` without
-            plans.
-        travel_time: Mean arrival time [s].
-        makespan: Mean of the latest arrival time [s].
-        jerk: Mean squared jerk [m^2/s^6].
-        nodes: Nodes that plan; 1 unless the planner is a distributed one.
-        messages: Mean number of candidates that nodes sent, each to all others; ``None`` for other planners, as below.
-        message_bytes: Mean of their length together.
-        waiting_share: Mean share of the nodes' time that they waited for each other.
-        step_time: Mean seconds of a control loop; ``None`` for policies that execute a plan.
+    Quartiles are over all trials, of which those that failed count as never, which ``None`` is. ``None`` is also a mean
+    without successes, and what a policy has none of.
     """
 
-    section: str
-    runtime: float | None
-    runtime_lower: float | None
+    section: str  # title of the section
+    runtime: float | None  # seconds to the first solution, median
+    runtime_lower: float | None  # and quartiles
     runtime_upper: float | None
     runtime_mean: float | None
-    runtime_deviation: float | None
-    first_steps: float | None
-    first_steps_lower: float | None
+    runtime_deviation: float | None  # standard deviation; 0 for one success
+    first_steps: float | None  # denoising steps to the first solution, median
+    first_steps_lower: float | None  # and quartiles
     first_steps_upper: float | None
-    iterations: float | None
-    reward: float | None
-    travel_time: float | None
-    makespan: float | None
-    jerk: float | None
-    nodes: int
-    messages: float | None
-    message_bytes: float | None
-    waiting_share: float | None
-    step_time: float | None
+    iterations: float | None  # none of policies that execute no plan
+    reward: float | None  # of the last best plan, per step of the horizon and robot, over all trials
+    travel_time: float | None  # mean arrival time [s]
+    makespan: float | None  # latest arrival time [s]
+    jerk: float | None  # mean squared [m^2/s^6]
+    nodes: int  # that plan; 1 unless the planner is a distributed one
+    messages: float | None  # candidates that nodes sent, each to all others
+    message_bytes: float | None  # their length together
+    waiting_share: float | None  # of the nodes' time that they waited for each other
+    step_time: float | None  # seconds of a control loop; none of policies that execute a plan
 
 
 def is_time(name: str) -> bool:
@@ -99,28 +79,18 @@ def measured(group: Group) -> Measured:
         values = [value for trial, _ in solved if (value := getattr(trial, name)) is not None]
         return float(np.mean(values)) if values else None
 
+    means = ("iterations", "travel_time", "makespan", "messages", "message_bytes", "waiting_share")
     return Measured(
         **vars(Compared.of(trials, len(solved), group.label)),
         section=group.section,
-        runtime=runtime,
-        runtime_lower=lower,
-        runtime_upper=upper,
-        runtime_mean=average,
-        runtime_deviation=deviation,
-        first_steps=steps,
-        first_steps_lower=fewer,
-        first_steps_upper=more,
-        iterations=mean("iterations"),
+        runtime=runtime, runtime_lower=lower, runtime_upper=upper, runtime_mean=average, runtime_deviation=deviation,
+        first_steps=steps, first_steps_lower=fewer, first_steps_upper=more,
         reward=float(np.mean(rewards)) if rewards else None,
-        travel_time=mean("travel_time"),
-        makespan=mean("makespan"),
         jerk=mean("mean_squared_jerk"),
         nodes=_nodes(trials[0]),
-        messages=mean("messages"),
-        message_bytes=mean("message_bytes"),
-        waiting_share=mean("waiting_share"),
         step_time=_step_time([trial for trial, _ in solved]),
-    )
+        **{name: mean(name) for name in means},
+    )  # fmt: skip
 
 
 def _quartiles(times: Sequence[float | None]) -> tuple[float | None, ...]:
@@ -152,14 +122,8 @@ def _nodes(trial: Trial) -> int:
     return trial.num_robots if nodes is None else int(nodes)
 
 
-@dataclass(frozen=True)
-class Metric:
-    """A number in the tables.
-
-    Attributes:
-        title: With its unit.
-        text: Writes it.
-    """
+class Metric(NamedTuple):
+    """A number in the tables: its title, with its unit, and what writes it."""
 
     title: str
     text: Callable[[Measured], str]
@@ -181,16 +145,13 @@ def _success(row: Measured) -> str:
     return f"{row.successes} of {row.trials} ({row.lower:.0%} to {row.upper:.0%})"
 
 
-def _runtime(row: Measured) -> str:
-    quartiles = (row.runtime_lower, row.runtime, row.runtime_upper)
-    lower, middle, upper = (NEVER if seconds is None else f"{seconds:.2f}" for seconds in quartiles)
-    return "-" if not row.successes else f"{middle} ({lower}-{upper})"
+def _spread(name: str, digits: int) -> Callable[[Measured], str]:
+    def text(row: Measured) -> str:
+        quartiles = (getattr(row, name + end) for end in ("_lower", "", "_upper"))
+        lower, middle, upper = (NEVER if value is None else f"{value:.{digits}f}" for value in quartiles)
+        return f"{middle} ({lower}-{upper})" if row.successes else "-"
 
-
-def _steps(row: Measured) -> str:
-    quartiles = (row.first_steps_lower, row.first_steps, row.first_steps_upper)
-    lower, middle, upper = (NEVER if steps is None else f"{steps:.0f}" for steps in quartiles)
-    return "-" if not row.successes else f"{middle} ({lower}-{upper})"
+    return text
 
 
 def _mean_runtime(row: Measured) -> str:
@@ -199,9 +160,9 @@ def _mean_runtime(row: Measured) -> str:
 
 METRICS: Mapping[str, Metric] = MappingProxyType({
     "success": Metric("success", _success),
-    "runtime": Metric("runtime, s", _runtime),
+    "runtime": Metric("runtime, s", _spread("runtime", 2)),
     "mean_runtime": Metric("runtime, s", _mean_runtime),
-    "first_steps": Metric("denoising steps", _steps),
+    "first_steps": Metric("denoising steps", _spread("first_steps", 0)),
     "iterations": Metric("iterations", _number("iterations", 1)),
     "reward": Metric("reward", _number("reward", 3)),
     "travel_time": Metric("travel time, s", _number("travel_time", 2)),

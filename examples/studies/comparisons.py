@@ -1,0 +1,293 @@
+"""Settings of the sampling planners compared on the same instances: a table each.
+
+    python -m examples.studies head_to_head --seeds 20 --out head_to_head
+
+Columns are those of :func:`examples.outputs.first_solutions`: success with its 95% interval (Wilson), the mean number
+of denoising steps to the first solution, a trial without one counting twice the budget (PAR-2), the mean travel time of
+the solutions, and how likely it is that a row and the reference are equally good (McNemar on solutions, Wilcoxon on
+steps, paired by seed).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from examples.outputs import first_solutions, save_table, solved_columns, study_trials, trials_parser
+from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
+from examples.studies.tune_rivals import TEAMS as TUNED_ON
+
+from d4orm_planners import make_planner
+from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
+from d4orm_planners.evaluation.store import Trial
+from d4orm_planners.evaluation.study import Study
+from d4orm_planners.sampling.tuned import TUNED
+
+Settings = Mapping[str, dict[str, Any]]
+"""Settings of policies by their labels."""
+PAPER, AUTHORS = {"preset": "paper"}, {"preset": "authors"}
+
+
+class Block(NamedTuple):
+    """Settings on one team, and the label of those that they are compared with there.
+
+    Attributes:
+        scenario: Name of the scenario.
+        num_robots: Size of the team.
+        settings: Settings whose rows are shown.
+        reference: Label of what they are compared with, theirs or another block's of the scenario.
+        seeds: Most seeds.
+        model: Model of the robots; the scenario's own by default.
+    """
+
+    scenario: str
+    num_robots: int
+    settings: Settings
+    reference: str
+    seeds: int = 50
+    model: str | None = None
+
+    def has(self, trial: Trial) -> bool:
+        """Check whether a trial is of this team."""
+        same = (trial.scenario.partition(" (")[0], trial.num_robots) == (self.scenario, self.num_robots)
+        return same and self.model in (None, trial.model)
+
+
+class Comparison(NamedTuple):
+    """What is compared, and its table.
+
+    Attributes:
+        about: A description for ``--help``.
+        column: Head of the column of labels.
+        blocks: ``budget -> blocks``, rows of which follow each other; the budget is one of ``budgets``.
+        budgets: Denoising steps of a trial, where settings depend on it, and in the quick version.
+        quick: Settings of the quick version.
+        quick_robots: Its team size; ``None`` is one block as it is.
+        first_seed: Of every row; no default was chosen by seeds from ``FIRST_SEED`` on.
+        team: Format of the name of a team, of a trial's attributes.
+        rows: Makes the rows of a block.
+        study: Further arguments of the studies.
+        mark: What the reference is called in addition.
+    """
+
+    about: str
+    column: str
+    blocks: Callable[[int], Sequence[Block]]
+    budgets: tuple[int, int] = (0, 0)
+    quick: dict[str, Any] = {"max_iterations": 1, "num_steps": 20}  # noqa: RUF012 - never changed
+    quick_robots: int | None = 2
+    first_seed: int = FIRST_SEED
+    team: str = "{0.scenario}, {0.num_robots} robots"
+    rows: Callable[[str, str, dict[str, list[Trial]], str], list[dict[str, Any]]] = first_solutions
+    study: Mapping[str, Any] = {}
+    mark: str = ""
+
+    def blocks_of(self, quick: bool) -> list[Block]:
+        """The blocks, or those of the quick version."""
+        blocks = list(self.blocks(self.budgets[quick]))
+        if not quick:
+            return blocks
+        if self.quick_robots is None:
+            return [blocks[0]._replace(seeds=1)]
+        changed = {"num_robots": self.quick_robots, "seeds": 1}
+        small: list[Block] = []
+        for block in blocks:
+            settings = {label: own | self.quick for label, own in block.settings.items()}
+            if (less := block._replace(settings=settings, **changed)) not in small:  # teams may have differed in size
+                small.append(less)
+        return small
+
+
+def credits_and_penalties(budget: int) -> list[Block]:
+    """Four teams of 16, D4orm's defaults but for ``credit`` and ``penalty``, at most 20 iterations."""
+    penalties = {"team": (1.0,), "robot": (1.0, 2.0), "alternate": (1.0, 2.0), "group": (1.0, 2.0, 3.0)}
+    settings = {
+        f"{credit}, {penalty:g}": d4orm(credit=credit, penalty=penalty)
+        for credit, each in penalties.items()
+        for penalty in each
+    }
+    teams = (("paper_circle", "holonomic2d"), ("paper_circle", "differential_drive"), ("paper_heterogeneous", None),
+             ("paper_obstacles", "holonomic2d"))  # fmt: skip
+    return [Block(scenario, 16, settings, "group, 2", model=model) for scenario, model in teams]
+
+
+def d4orm(policy: str = "d4orm", max_iterations: int = 20, **settings: Any) -> dict[str, Any]:
+    """Settings of a planner on the CPU, at most 20 iterations unless said."""
+    return {"policy": policy, "engine": "cpu", "max_iterations": max_iterations, **settings}
+
+
+def differences(budget: int) -> list[Block]:
+    """The preset with one setting of the defaults in turn, and the defaults with one of the preset's."""
+    groups = {"credit": "group", "penalty": 2.0}
+    preset = {
+        "preset paper": d4orm(**PAPER),
+        "preset, clipped between iterations": d4orm(**PAPER, clip_between_iterations=True),
+        "preset, random start": d4orm(**PAPER, random_start=True),
+        "preset, 256 samples": d4orm(**PAPER, num_samples=256),
+        "preset, small weights dropped": d4orm(**PAPER, weight_cutoff=1e-3),
+        "preset, by groups with contacts that cost both": d4orm(**PAPER, **groups),
+    }
+    defaults = {
+        "defaults": d4orm(),
+        "defaults, not clipped between iterations": d4orm(clip_between_iterations=False),
+        "defaults, random start": d4orm(random_start=True),
+        "defaults, 1024 samples throughout": d4orm(num_samples=1024, late_samples=1.0),
+        "defaults, all weights kept": d4orm(weight_cutoff=0.0),
+        "defaults, by the team's reward": d4orm(credit="team", penalty=1.0),
+    }
+    return [
+        Block(scenario, num_robots, settings, reference)
+        for scenario, num_robots in (("paper_circle", 16), ("paper_obstacles", 12))
+        for reference, settings in (("preset paper", preset), ("defaults", defaults))
+    ]
+
+
+def presets_head_to_head(budget: int) -> list[Block]:
+    """D4orm and D4orm-D by their presets and defaults; and what one difference, or a higher penalty, does."""
+    by_preset = {
+        name: {f"{name}, authors": d4orm(name, **AUTHORS), f"{name}, paper": d4orm(name, **PAPER),
+               f"{name}, ours": d4orm(name)}
+        for name in ("d4orm", "d4orm-d")
+    }  # fmt: skip
+    penalties = {f"d4orm, paper, penalty of {value:g}": d4orm(**PAPER, penalty=value) for value in (2.0, 4.0)}
+    taken_back: dict[str, dict[str, Any]] = {
+        "authors, penalty once a step": {"penalty_per_pair": False},
+        "authors, penalty of 1 throughout": {"penalty_rise": 0.0},
+        "authors, controls of the probe kept": {"reset_after_probe": False},
+        "authors, never clipped": {"clip_after": None},
+        "authors, straight start": {"start": "straight"},
+        "paper, penalty per pair": {**PAPER, "penalty_per_pair": True},
+    }
+    one_less = {label: d4orm("d4orm-d", **AUTHORS | own) for label, own in taken_back.items()}
+    return [
+        Block("paper_circle", 16, by_preset["d4orm"], "d4orm, authors", 20),
+        Block("paper_circle", 16, penalties, "d4orm, paper", 10),
+        Block("paper_circle", 16, by_preset["d4orm-d"], "d4orm-d, authors", 20),
+        Block("paper_circle", 16, one_less, "d4orm-d, authors", 10),
+        Block("paper_random", 64, by_preset["d4orm-d"], "d4orm-d, authors", 5),
+        Block("paper_obstacles", 16, by_preset["d4orm-d"], "d4orm-d, authors", 10),
+    ]
+
+
+def tuned_rivals(budget: int) -> list[Block]:
+    """Every preset by its label, with as many iterations as the budget has room for."""
+    chosen: dict[str, dict[str, Any]] = {"d4orm, defaults": {"policy": "d4orm"}}
+    for method, tuned in TUNED.items():
+        for preset in ("paper", "tuned") if tuned else ("paper",):
+            if (method, preset) != ("mbd", "paper"):
+                chosen[f"{method}, {preset}"] = {"policy": method, "preset": preset}
+    for settings in chosen.values():
+        name, own = settings["policy"], {key: value for key, value in settings.items() if key != "policy"}
+        num_steps = min(make_planner(name, **own).config.num_steps, budget)
+        iterations = 1 if name == "mbd" else budget // num_steps
+        settings |= {"engine": "cpu", "num_steps": num_steps, "max_iterations": iterations}
+    teams = (*TUNED_ON, ("paper_circle", 16))
+    return [Block(scenario, num_robots, chosen, "d4orm, tuned") for scenario, num_robots in teams]
+
+
+def steps_and_samples(budget: int) -> list[Block]:
+    """8 and 16 robots on the circle, at most 8 iterations of so many steps and samples."""
+    alike = {"late_samples": 1.0}
+    chosen: Settings = {
+        "100 x 1024": {**alike, "num_samples": 1024},
+        "100 x 256": alike,
+        "100 x 128": {**alike, "num_samples": 128},
+        "70 x 256": {**alike, "num_steps": 70},
+        "50 x 256": {**alike, "num_steps": 50},
+        "50 x 512": {**alike, "num_steps": 50, "num_samples": 512},
+        "100 x 256, the last 40% with 128": {"late_steps": 0.4},
+        "100 x 256, the last 40% with 64": {"late_steps": 0.4, "late_samples": 0.25},
+        "100 x 256, the last 70% with 128 (default)": {},
+        "100 x 256, the last 70% with 64": {"late_samples": 0.25},
+    }
+    settings = {label: d4orm(max_iterations=8, **own) for label, own in chosen.items()}
+    return [Block("circle", robots, settings, "100 x 256, the last 70% with 128 (default)") for robots in (8, 16)]
+
+
+def samples_needed(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
+    """A row per setting: the samples drawn until the first solution, where a trial without one counts twice."""
+
+    def samples(trial: Trial) -> float:
+        config = json.loads(trial.config)
+        each = config["num_samples"] * (1 - config["late_steps"] * (1 - config["late_samples"]))
+        return float(penalised_steps(trial) * each)
+
+    rows = []
+    for label, trials in groups.items():
+        quartiles = np.percentile([samples(trial) for trial in trials], (25, 50, 75)) / 1000
+        travel = [trial.travel_time for trial in trials if is_solved(trial) and trial.travel_time is not None]
+        rows.append(
+            {"robots": team, column: label, **solved_columns(trials), "1000 samples": f"{quartiles[1]:.0f}",
+             "quartiles": f"{quartiles[0]:.0f}-{quartiles[2]:.0f}",
+             "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
+             "p (samples)": f"{paired(trials, groups[reference], samples).cost_p:.2g}"}
+        )  # fmt: skip
+    return rows
+
+
+def with_iterations(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
+    """:func:`first_solutions`, and the mean number of iterations of the successes."""
+    rows = []
+    for row in first_solutions(team, column, groups, reference):
+        solved = [
+            trial.iterations for trial in groups[row[column]] if is_solved(trial) and trial.iterations is not None
+        ]
+        rows.append(dict(list(row.items())[:4]) | {"iterations": f"{np.mean(solved):.1f}" if solved else "-"} | row)
+    return rows
+
+
+COMPARISONS: Mapping[str, Comparison] = {
+    "contact_penalty": Comparison(
+        "Whose reward samples are weighted by, and what a contact costs in it, against the defaults.",
+        "credit, penalty", credits_and_penalties, team="{0.scenario}, {0.model}",
+        mark=" (default)",
+    ),
+    "paper_differences": Comparison(
+        "Each difference between the paper's D4orm and this project's defaults, one at a time.", "settings", differences
+    ),
+    "head_to_head": Comparison(
+        "The paper as written, its authors' published code re-implemented, and this project's defaults.",
+        "planner", presets_head_to_head, quick={"max_iterations": 2, "num_steps": 10, "num_samples": 64},
+        first_seed=0, rows=with_iterations,
+    ),
+    "tuned_rivals": Comparison(
+        "D4orm and its rivals as the paper has them and tuned with the same effort, on seeds that no tuning has seen. "
+        "A trial has 2000 denoising steps, of 1024 samples but for the defaults, which draw 256 and later 128; MBD has "
+        "its one run, of as many steps as it was tuned with.",
+        "method", tuned_rivals, budgets=(2000, 20), quick_robots=None, first_seed=0,
+    ),
+    "fewer_samples": Comparison(
+        "Samples until D4orm's first solution with fewer steps, fewer samples, or fewer while the noise is small: "
+        "median, quartiles, and how likely a row and the defaults need equally many (Wilcoxon, paired by seed).",
+        "steps x samples", steps_and_samples, quick={"max_iterations": 1}, team="{0.num_robots}", rows=samples_needed,
+        study={"scenario_settings": AS_IN_THE_PAPER},
+    ),
+}  # fmt: skip
+"""Every comparison by its name."""
+
+
+def main(name: str) -> None:
+    """Run a comparison, and write its table."""
+    compared = COMPARISONS[name]
+    arguments = trials_parser(f"{compared.about}\n\n{__doc__}", seeds=50).parse_args()
+    blocks = compared.blocks_of(arguments.quick)
+    studies = [
+        Study(
+            policies=block.settings, scenarios=(block.scenario,), num_robots=(block.num_robots,), model=block.model,
+            seeds=range(compared.first_seed, compared.first_seed + min(arguments.seeds, block.seeds)), **compared.study,
+        )
+        for block in blocks
+    ]  # fmt: skip
+    trials = study_trials(arguments, name, studies)
+    rows = []
+    for block in blocks:
+        own = [trial for trial in trials if block.has(trial)]
+        labels = dict.fromkeys((*block.settings, block.reference))
+        groups = {label: found for label in labels if (found := [trial for trial in own if trial.label == label])}
+        made = compared.rows(compared.team.format(own[0]), compared.column, groups, block.reference)
+        for row in made:
+            if (label := row[compared.column]) in block.settings:
+                rows.append(row | {compared.column: label + compared.mark * (label == block.reference)})
+    save_table(rows, arguments.out / f"{name}.csv")
