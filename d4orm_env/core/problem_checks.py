@@ -87,23 +87,27 @@ def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
                 f"{what} of robot_{robot} is {state.tolist()}; a {model.name} has {model.state_size} components, "
                 f"so set the padding after them to zero"
             )
-        speed = float(np.linalg.norm(state[list(model.speed_indices)])) if model.speed_indices else 0.0
-        limit = float(team.max_speed[robot])
-        if speed > limit * (1 + 1e-5):
-            raise ValueError(f"{what} speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
-        for index, column in model.state_limits:
-            value, limit = float(state[index]), float(limits[robot, column])
-            if abs(value) > limit * (1 + 1e-5):
-                raise ValueError(
-                    f"{what} {model.state_names[index]} of robot_{robot} is {value:g}, "
-                    f"above its {model.limit_names[column]} of {limit:g}"
-                )
+        _check_state_limits(model, limits[robot], state, f"{what} {{}} of robot_{robot} is ")
         for index in model.angles:
             if abs(float(state[index])) > MAX_HEADING:
                 raise ValueError(
                     f"{what} {model.state_names[index]} of robot_{robot} is {state[index]:g} rad; it must be at most "
                     f"{MAX_HEADING:g} in magnitude, so take whole turns off"
                 )
+
+
+def _check_state_limits(model: Model, limits: FloatArray, state: FloatArray, where: str) -> None:
+    """Refuse a state ``(n,)`` beyond a limit; ``where`` says whose it is, with a gap for the component."""
+    lower, backwards = dict(model.lower_limits), model.lower_bounds(limits)
+    for column, components in model.limited_components.items():
+        values, limit, bound = state[components], float(limits[column]), column
+        if len(values) == 1 and values[0] < 0:
+            limit, bound = float(backwards[column]), lower.get(column, column)
+        size = float(np.linalg.norm(values))
+        if size > limit * (1 + 1e-5):
+            name, unit = ("speed", " m/s") if column == SPEED else (model.state_names[components[0]], "")
+            known = "limit" if bound == SPEED else model.limit_names[bound]
+            raise ValueError(f"{where.format(name)}{size:g}{unit}, above its {known} of {limit:g}{unit}")
 
 
 def unwound_states(team: Team, states: FloatArray) -> FloatArray:

@@ -188,11 +188,19 @@ class Team(Frozen):
     @cached_property
     def control_limits(self) -> FloatArray:
         """``(K, m)`` largest magnitude of each control component; zero on padding."""
-        bound = np.zeros((self.num_robots, self.control_size), np.float32)
+        limits = np.abs(self.control_bounds).max(axis=0)
+        limits.setflags(write=False)
+        return limits
+
+    @cached_property
+    def control_bounds(self) -> FloatArray:
+        """``(2, K, m)`` lowest and highest value of each control component; zero on padding."""
+        bounds = np.zeros((2, self.num_robots, self.control_size), np.float32)
         for robot, (model, limits) in enumerate(zip(self.robot_models, self.limits, strict=True)):
-            bound[robot, : model.control_size] = limits[list(model.control_limits)]
-        bound.setflags(write=False)
-        return bound
+            bounds[0, robot, : model.control_size] = -model.lower_bounds(limits)[list(model.control_limits)]
+            bounds[1, robot, : model.control_size] = limits[list(model.control_limits)]
+        bounds.setflags(write=False)
+        return bounds
 
     @cached_property
     def control_units(self) -> FloatArray:

@@ -22,6 +22,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.core.yaml_text import read_yaml
+from d4orm_env.dynamics.models import get_model
 from d4orm_env.footprints import Box, Disc, Footprint
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ _INTEGRATOR1: dict[str, Any] = {"dynamics": "integrator1_2d", "max_vel": 0.5, "s
 _INTEGRATOR2: dict[str, Any] = {
     "dynamics": "integrator2_2d", "max_vel": 0.5, "max_acc": 2.0, "shape": "sphere", "radius": 0.1,
 }  # fmt: skip
+_UNICYCLE2: dict[str, Any] = _UNICYCLE1 | {"dynamics": "unicycle2", "max_acc_abs": 0.25, "max_angular_acc": 0.25}
 _SPHERE = _UNICYCLE1 | {"shape": "sphere", "min_angular_vel": -2.0, "max_angular_vel": 2.0}
 
 MODELS: dict[str, dict[str, Any]] = {
@@ -51,6 +53,8 @@ MODELS: dict[str, dict[str, Any]] = {
     "unicycle_first_order": _UNICYCLE1,
     "unicycle_first_order_0": _UNICYCLE1,
     "unicycle_first_order_0_sphere": _SPHERE,
+    "unicycle2_v0": _UNICYCLE2,
+    "unicycle_second_order_0": _UNICYCLE2,
     "integrator1_2d_v0": _INTEGRATOR1,
     "single_integrator": _INTEGRATOR1,
     "single_integrator_0": _INTEGRATOR1,
@@ -61,7 +65,7 @@ MODELS: dict[str, dict[str, Any]] = {
 """Robot types and their parameters, as in dynobench's ``models`` and db-CBS's ``robots.cpp``."""
 
 DYNAMICS = {
-    "unicycle1": "unicycle", "integrator1_2d": "velocity2d", "integrator2_2d": "holonomic2d",
+    "unicycle1": "unicycle1", "unicycle2": "unicycle2", "integrator1_2d": "velocity2d", "integrator2_2d": "holonomic2d",
     "integrator2_3d": "holonomic3d",
 }  # fmt: skip
 """Their dynamics and our models."""
@@ -97,13 +101,14 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     robots, environment = content["robots"], content["environment"]
     types = [robot["type"] for robot in robots]
     _check_types(types, models)
-    parameters = [models[name] for name in types]
-    names = tuple(DYNAMICS[own["dynamics"]] for own in parameters)
+    parameters = [_symmetric(models[name]) | models[name] for name in types]
+    names = tuple(map(_model, parameters))
     team = Team(
         names,
         max_speed=[own["max_vel"] for own in parameters],
-        max_acceleration=[own.get("max_acc", 1.0) for own in parameters],
+        max_acceleration=[own.get("max_acc") or own.get("max_acc_abs") or 1.0 for own in parameters],
         max_turn_rate=[own.get("max_angular_vel", 1.0) for own in parameters],
+        own_limits=_own_limits(parameters, names),
         footprint=[_footprint(own) for own in parameters],
     )
     start, goal = np.zeros((2, team.num_robots, team.state_size))
@@ -140,9 +145,37 @@ def _check_types(types: list[Any], models: Mapping[str, dict[str, Any]]) -> None
                 f"robot type {name}: dynamics {shown(own.get('dynamics'))} has no model here; "
                 f"there are {', '.join(DYNAMICS)}"
             )
-        for least, most in (("min_vel", "max_vel"), ("min_angular_vel", "max_angular_vel")):
-            if least in own and own[least] != -own[most]:
-                raise ValueError(f"robot type {name}: {least} is {own[least]:g}; limits here are symmetric, -{most}")
+        for least in ("min_vel", "min_angular_vel"):
+            if own.get(least, -1.0) >= 0:
+                raise ValueError(f"robot type {name}: {least} is {own[least]:g}; it must be negative, for robots rest")
+
+
+def _symmetric(own: Mapping[str, Any]) -> dict[str, float]:
+    """The lower limits of a type whose parameters give none."""
+    return {f"min_{name}": -own[f"max_{name}"] for name in ("vel", "angular_vel") if f"max_{name}" in own}
+
+
+def _model(own: Mapping[str, Any]) -> str:
+    """The name of our model; the unicycle has limits for both directions only where they are not symmetric."""
+    name = DYNAMICS[own["dynamics"]]
+    return "unicycle" if name == "unicycle1" and own.items() >= _symmetric(own).items() else name
+
+
+OWN_LIMITS = {
+    "max_reverse_speed": ("min_vel", -1), "max_right_turn_rate": ("min_angular_vel", -1),
+    "max_turn_acceleration": ("max_angular_acc", 1),
+}  # fmt: skip
+"""Limits that our models have for themselves: their parameter, and its sign."""
+
+
+def _own_limits(parameters: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[float]]:
+    """``(K,)`` values by name; one where a robot has no such limit."""
+    known = [{limit.name for limit in get_model(name).own_limits} for name in names]
+    return {
+        limit: [sign * own[theirs] if limit in has else 1.0 for own, has in zip(parameters, known, strict=True)]
+        for limit, (theirs, sign) in OWN_LIMITS.items()
+        if any(limit in has for has in known)
+    }
 
 
 def _footprint(own: Mapping[str, Any]) -> Footprint:
@@ -168,7 +201,7 @@ def _world(environment: Mapping[str, Any], team: Team) -> World:
 
 def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
     """The lines of a result file: states and actions of every robot, until it rests at its goal for good."""
-    known = {ours: theirs for theirs, ours in DYNAMICS.items()}
+    known = {ours: theirs for theirs, ours in DYNAMICS.items()} | {"unicycle": "unicycle1"}
     yield "result:"
     for robot, model in enumerate(problem.team.robot_models):
         if model.name not in known:
