@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, shown
-from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
+from d4orm_env.core.footprint_arrays import Body, FootprintArrays, as_arrays
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint
@@ -132,7 +132,13 @@ class Team(Frozen):
     @cached_property
     def all_footprint_arrays(self) -> FootprintArrays:
         """The same, discs too: for teams that others have other footprints than."""
-        return as_arrays(self.footprint, [model.heading_index for model in self.robot_models])
+        return as_arrays(self.bodies)
+
+    @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """The robots' bodies, and then those of their trailers."""
+        robots = zip(self.footprint, self.robot_models, strict=True)
+        return tuple(Body(robot, shape, model.heading_index, 0.0) for robot, (shape, model) in enumerate(robots))
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):

@@ -15,7 +15,7 @@ from jax import Array
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.footprint_contacts import BISECTIONS
+from d4orm_env.engine.convex_cores import BISECTIONS
 
 Given: TypeAlias = Array | FloatArray | np.float32
 """Numbers of the problem: inside a compiled function they are traced."""
