@@ -15,7 +15,7 @@ from numba.cpython.unsafe import numbers
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.compiling import ONE, ZERO, compiled
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.convex_cores import (
     CORNERS,
     ball_meets_box,
@@ -157,7 +157,7 @@ def _refine_cores(
     return sure
 
 
-@compiled
+@inlined
 def refine_chunk(
     f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, reach: np.float32, dimension: int,
     places: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
@@ -181,7 +181,10 @@ def refine_chunk(
             if left == NOWHERE:
                 return touch
             if f.rectangles[i, 0] >= ZERO and f.rectangles[j, 0] >= ZERO:
-                touch |= rectangles_within(f, i, j, left, reach, places, a, b, poses, p, q, buffer)
+                one = (f.rectangles[i, 0], f.rectangles[i, 1], f.rectangles[i, 2])
+                its = (f.rectangles[j, 0], f.rectangles[j, 1], f.rectangles[j, 2])
+                total = f.rounding[i] + f.rounding[j] + reach
+                touch |= rectangles_within(one, its, left, total, places, a, b, poses, p, q, buffer)
             else:
                 touch |= _refine_cores(f, i, j, left, reach, places, a, b, poses, p, q, buffer)
             j = np.int64(f.following[j])
@@ -189,7 +192,7 @@ def refine_chunk(
     return touch
 
 
-@compiled
+@inlined
 def refine_pair(
     f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, reach: np.float32, dimension: int,
     places: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,

@@ -12,7 +12,6 @@ from typing import TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Whole
-from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.engine.compiling import ZERO, compiled
 from d4orm_env.engine.simd import CHUNK, TILE, chunk_at_most, use_wide_registers
 
@@ -87,14 +86,11 @@ def _corners_distance2(
 
 @compiled
 def rectangles_within(
-    f: FootprintArrays, i: Whole, j: Whole, near: np.uint64, reach: np.float32,
+    one: Rectangle, other: Rectangle, near: np.uint64, total: np.float32,
     places: FloatArray, a: Whole, b: Whole, poses: FloatArray, p: Whole, q: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
-    """Return where, of the first ``CHUNK`` samples, those ``near``, bodies ``i`` and ``j`` are within ``reach``."""
+    """Return where, of the first ``CHUNK`` samples, those ``near``, two rectangles are within ``total``."""
     use_wide_registers()
-    one = (f.rectangles[i, 0], f.rectangles[i, 1], f.rectangles[i, 2])
-    other = (f.rectangles[j, 0], f.rectangles[j, 1], f.rectangles[j, 2])
-    total = f.rounding[i] + f.rounding[j] + reach
     for s in range(CHUNK):
         buffer[s] = _apart(one, other, _offset(one, other, places, a + s, b + s, poses, p + s, q + s))
     sure, possible = chunk_at_most(buffer, 0, ZERO) & near, chunk_at_most(buffer, 0, total) & near

@@ -212,6 +212,14 @@ def _count(digits: int, k: Whole, step: int, touch: np.uint64, near: NDArray[np.
     near[digits - 1, k, step] |= touch
 
 
+@inlined
+def _undecided(f: FootprintArrays | None, digits: int, both: np.uint64, chunk: int, touch: np.uint64) -> np.uint64:
+    """Leave out of ``touch`` where both robots are known to be near something, if one thing counts as much as two."""
+    if f is None:
+        return touch
+    return touch & ~(both >> np.uint64(chunk)) if digits == 1 else touch
+
+
 @compiled
 def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, poses: FloatArray, s: Scratch) -> None:
     """Count robots within the margin of those on their lists."""
@@ -229,6 +237,7 @@ def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, poses: 
                     a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
                     touch = _near_pair(reach, a, b, dimension, places)
                     f, begin = arrays.footprints, pose_of(step) + chunk
+                    touch = _undecided(f, digits, s.near[0, k, step] & s.near[0, other, step], chunk, touch)
                     touch = refine_chunk(
                         f, k, other, touch, margin, dimension, places, a, b, poses, POSES, begin, s.buffer
                     )
