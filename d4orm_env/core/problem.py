@@ -186,8 +186,9 @@ class Problem(Frozen):
         check_turning(team, self.dt, self.goal_radius)
         check_tolerances(self.goal_heading_tolerance)
         at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, self.goal_heading)
-        for what, positions, headings in (("start", places, team.headings(self.start)), ("goal", self.goal, at_goals)):
-            fault = check_places(team, self.world, what, positions, self.margin, headings)
+        goals = np.column_stack([self.goal, at_goals]).astype(np.float64)
+        for what, positions, poses in (("start", places, team.body_poses(self.start)), ("goal", self.goal, goals)):
+            fault = check_places(team, self.world, what, positions, self.margin, poses)
             if fault:
                 warnings.warn(
                     f"problem {self.name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=3

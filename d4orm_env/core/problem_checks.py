@@ -167,7 +167,7 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
 
 
 def check_places(
-    team: Team, world: World, what: str, places: FloatArray, margin: float, headings: FloatArray | None = None
+    team: Team, world: World, what: str, places: FloatArray, margin: float, poses: Floats | None = None
 ) -> str:
     """Refuse starts or goals (``what``) ``(K, d)`` outside the world, or that touch something.
 
@@ -177,8 +177,8 @@ def check_places(
         what: "start" or "goal".
         places: Where they are [m].
         margin: The margin [m].
-        headings: ``(K,)`` what turns their footprints [rad], NaN where it is not known: such a footprint counts as the
-            disc within it. All are unknown by default.
+        poses: Of their bodies, ``(F, d + 1)`` or without the trailers ``(K, d + 1)``; the heading is NaN where it is
+            not known [rad]: such a footprint counts as the disc within it. All are unknown by default.
 
     Returns:
         What is nearest within the margin, for an error or a warning: the empty string if nothing is.
@@ -186,9 +186,11 @@ def check_places(
     radius = team.radius.astype(np.float64)
     gaps = world.clearance(places) - radius
     shaped = bool(team.shapes)
-    poses = np.column_stack([places, np.full(len(places), np.nan) if headings is None else headings]).astype(np.float64)
+    if poses is None:
+        poses = np.column_stack([places.astype(np.float64), np.full(len(places), np.nan)])
+    bodies = [[i for i in range(len(poses)) if team.bodies[i].robot == robot] for robot in range(len(places))]
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
-        gaps[robot] = world_gap(world, team.footprint[robot], poses[robot])
+        gaps[robot] = min(world_gap(world, team.bodies[i].footprint, poses[i]) for i in bodies[robot])
     for robot in np.flatnonzero(gaps <= 0):
         raise ValueError(
             f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an "
@@ -197,8 +199,15 @@ def check_places(
     first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
-        gap_of = [pair_gap(team.footprint[i], poses[i], team.footprint[j], poses[j]) for i, j in pairs]
-        between = np.array(gap_of, np.float64)
+        gap_of = (
+            min(
+                pair_gap(team.bodies[i].footprint, poses[i], team.bodies[j].footprint, poses[j])
+                for i in bodies[one]
+                for j in bodies[other]
+            )
+            for one, other in pairs
+        )
+        between = np.fromiter(gap_of, np.float64)
     overlapping = np.flatnonzero(between <= 0)
     if len(overlapping):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]

@@ -13,6 +13,7 @@ from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
+from d4orm_env.dynamics.car_with_trailers import CARS_WITH_TRAILERS
 from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
 from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
@@ -28,7 +29,7 @@ from d4orm_env.dynamics.velocity2d import VELOCITY2D
 
 _BUILT_IN = (
     HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR, UNICYCLE1, UNICYCLE2, HOLONOMIC2D_JERK,
-    HOLONOMIC3D_DRAG,
+    HOLONOMIC3D_DRAG, *CARS_WITH_TRAILERS,
 )  # fmt: skip
 
 MODEL_CODES: dict[str, int] = {model.name: code for code, model in enumerate(_BUILT_IN)}
@@ -117,8 +118,12 @@ def _admit(name: str, model: object) -> Model:
 
 def _check_attributes(model: Model) -> None:
     n, m, num_limits = model.state_size, model.control_size, len(model.limit_names)
-    indices = (*model.speed_indices, *(index for index, _ in model.state_limits), *model.angles)
-    columns = (*model.control_limits, *(column for _, column in model.state_limits), *chain(*model.lower_limits))
+    indices = (*model.speed_indices, *(index for index, _ in (*model.state_limits, *model.trailers)), *model.angles)
+    columns = (
+        *model.control_limits,
+        *(column for _, column in (*model.state_limits, *model.trailers)),
+        *chain(*model.lower_limits),
+    )
     name = model.name
     checks = (
         (

@@ -207,7 +207,9 @@ class Model:
             norm.
         lower_limits: ``(column, column of its own)`` for limits that hold for positive values only, such as a speed
             forwards: the second one's bounds the magnitude of negative values, such as a speed backwards.
-        own_angles: State components other than the heading that are angles, such as a trailer's: to them, as to the
+        trailers: ``(state component of its hitch angle, column of its hitch's length)`` of each trailer, from the front
+            on. A hitch angle is what a trailer's heading lags behind that of the body before it.
+        own_angles: State components other than the heading that are angles: to them, as to the
             heading, a whole turn makes no difference, so that they do not wind up.
     """
 
@@ -222,6 +224,7 @@ class Model:
     own_limits: tuple[Limit, ...] = ()
     state_limits: tuple[tuple[int, int], ...] = ()
     lower_limits: tuple[tuple[int, int], ...] = ()
+    trailers: tuple[tuple[int, int], ...] = ()
     own_angles: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:

@@ -47,16 +47,18 @@ def place_bodies(f: FootprintArrays, k: Whole, w: FloatArray, poses: FloatArray,
     while i >= 0:
         o, column, hitch = i * stride + begin, f.heading[i], f.hitch[i]
         if column >= 0:
-            row = w[column * TILE : (column + 1) * TILE]
             for s in range(TILE):
-                poses[o + s] = cosine(row[s])
+                poses[o + s] = cosine(w[column * TILE + s])
             for s in range(TILE):
-                poses[o + TILE + s] = sine(row[s])
+                poses[o + TILE + s] = sine(w[column * TILE + s])
         else:
             poses[o : o + TILE], poses[o + TILE : o + 2 * TILE] = ONE, ZERO
         if i == k:
             poses[o + 2 * TILE : o + 4 * TILE] = ZERO
         else:
+            for s in range(TILE):  # it lags behind the body before it by the hitch angle
+                c, t, x, y = poses[before + s], poses[before + TILE + s], poses[o + s], poses[o + TILE + s]
+                poses[o + s], poses[o + TILE + s] = c * x + t * y, t * x - c * y
             for s in range(2 * TILE):
                 poses[o + 2 * TILE + s] = poses[before + 2 * TILE + s] - hitch * poses[o + s]
         before, i = o, np.int64(f.following[i])

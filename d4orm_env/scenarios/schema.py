@@ -11,14 +11,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from d4orm_env import footprints
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Arrival, Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
-from d4orm_env.footprints import Disc
+from d4orm_env.footprints import Disc, Footprint
+from d4orm_env.scenarios.footprint_entries import described, parsed
 from d4orm_env.scenarios.scenario_registry import SCENARIOS
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
@@ -318,7 +318,7 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     footprint = team.footprint[robot]
     shape = {"radius": team.radius[[robot]]} if isinstance(footprint, Disc) else {}
     if not shape:
-        entry["footprint"] = footprints.described(footprint)
+        entry["footprint"] = described(footprint)
     for name in (*shape, "max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
     if not np.isnan(problem.goal_heading[robot]):
@@ -331,8 +331,8 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     return entry
 
 
-def _footprint(entry: RobotEntry) -> footprints.Footprint:
-    return Disc(entry.radius) if entry.footprint is None else footprints.parsed(entry.footprint)
+def _footprint(entry: RobotEntry) -> Footprint:
+    return Disc(entry.radius) if entry.footprint is None else parsed(entry.footprint)
 
 
 def _describe_world(problem: Problem) -> dict[str, object]:

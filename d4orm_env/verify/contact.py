@@ -175,10 +175,10 @@ class Pairs(Watch):
     """Robots against each other: in every stretch those that it takes close enough to matter."""
 
     def __init__(self, robot: Indices, radius: Floats) -> None:
-        names = [f"robot_{index}" for index in range(len(radius))]
+        names = [f"robot_{index}" for index in range(int(robot.max()) + 1)]
         nobody = np.empty(0, np.intp)
         super().__init__("robot contact", robot, names, nobody, nobody)
-        self._radius = radius[robot]
+        self._radius = radius
 
     def select(self, stretch: Stretch) -> None:
         lower, upper = stretch.path.min(axis=(0, 1)), stretch.path.max(axis=(0, 1))
@@ -232,7 +232,7 @@ class Static(Watch):
     def __init__(self, kind: str, robot: Indices, radius: Floats, names: Sequence[str]) -> None:
         rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))
         super().__init__(kind, robot, names, rows, columns)
-        self._radius = radius[robot[rows]]
+        self._radius = radius[rows]
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
         distance = self.distance(stretch.path[steps, 0, self.rows[pairs]], self.columns[pairs])
