@@ -8,23 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Ints
+from d4orm_env.core.bodies import Body
 from d4orm_env.footprints import MAX_CORNERS, Disc, Ellipsoid, Footprint, Planar, Polygon
-
-
-class Body(NamedTuple):
-    """A rigid body of a robot: its own one, or a trailer.
-
-    Attributes:
-        robot: Number of the robot.
-        footprint: What it covers.
-        heading: Number of the state component that turns it, or ``None`` for none.
-        hitch: Distance of a trailer's reference point behind that of the body before it [m]; zero for the robot itself.
-    """
-
-    robot: int
-    footprint: Footprint
-    heading: int | None
-    hitch: float
 
 
 class FootprintArrays(NamedTuple):

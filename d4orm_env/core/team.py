@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, shown
-from d4orm_env.core.footprint_arrays import Body, FootprintArrays, as_arrays
+from d4orm_env.core.bodies import Body, body_poses, find_bodies
+from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint, Train
@@ -160,13 +160,7 @@ class Team(Frozen):
     @cached_property
     def bodies(self) -> tuple[Body, ...]:
         """The robots' bodies, and then those of their trailers."""
-        robots, trailers, hitches = [], [], iter(self.hitches)
-        for robot, (shape, model) in enumerate(zip(self.footprint, self.robot_models, strict=True)):
-            front, others = (shape.front, shape.trailers) if isinstance(shape, Train) else (shape, ())
-            robots.append(Body(robot, front, model.heading_index, 0.0))
-            for footprint, (component, _) in zip(others, model.trailers, strict=True):
-                trailers.append(Body(robot, footprint, component, next(hitches)))
-        return (*robots, *trailers)
+        return find_bodies(self.footprint, self.robot_models, self.hitches)
 
     @cached_property
     def hitches(self) -> tuple[float, ...]:
@@ -176,24 +170,7 @@ class Team(Frozen):
 
     def body_poses(self, states: FloatArray) -> Floats:
         """``(..., F, d + 1)`` reference points and headings of the bodies in states ``(..., K, n)``."""
-        d, last = self.dimension, dict[int, int]()
-        poses = np.zeros((*states.shape[:-2], len(self.bodies), d + 1))
-        for i, body in enumerate(self.bodies):
-            column = body.heading
-            turn: Floats = (
-                np.zeros(states.shape[:-2]) if column is None else states[..., body.robot, column].astype(np.float64)
-            )
-            if body.robot in last:
-                before = poses[..., last[body.robot], :]
-                turn = before[..., d] - turn
-                sine, cosine = portable.sin_cos(turn)
-                poses[..., i, 0] = before[..., 0] - body.hitch * cosine
-                poses[..., i, 1] = before[..., 1] - body.hitch * sine
-            else:
-                poses[..., i, :d] = states[..., body.robot, :d]
-            poses[..., i, d] = turn
-            last[body.robot] = i
-        return poses
+        return body_poses(self.bodies, states, self.dimension)
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):

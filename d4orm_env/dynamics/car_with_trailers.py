@@ -28,7 +28,7 @@ from d4orm_env.dynamics.robot_model import (
     turn_towards,
 )
 
-MAX_REVERSE_SPEED, MAX_STEERING, WHEELBASE, HITCH_1, HITCH_2, HITCH_3 = (OWN_LIMITS + i for i in (0, 1, 2, 3, 5, 7))
+MAX_STEERING, MAX_REVERSE_SPEED, WHEELBASE, HITCH_1, HITCH_2, HITCH_3 = (OWN_LIMITS + i for i in (0, 1, 2, 3, 5, 7))
 """Of a hitch the largest angle, in the next column its length."""
 
 
@@ -112,8 +112,8 @@ def _car(derivative: Callable[..., Vector], limit_state: Callable[..., Vector], 
             derivative, _limit_control, limit_state, _velocity, _rest, first_order_approach, _track
         ),
         own_limits=(
-            Limit("max_reverse_speed", 0.5),
             Limit("max_steering", 0.6, most=1.5),
+            Limit("max_reverse_speed", 0.5),
             Limit("wheelbase", 0.3),
             *chain(*map(_hitch_limits, numbers)),
         ),

@@ -22,7 +22,7 @@ from d4orm_env.engine.choice import get_engine
 JAX_OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 LIMITS = (2.0, 1.0, 0.5)
 """Speed, acceleration, turn rate: all different, so that none can stand for another."""
-CAR_LIMITS = (*LIMITS, 0.6, 1.5, 0.25)
+CAR_LIMITS = (*LIMITS, 0.6, 1.5, 0.25, 0.5, 0.4, 0.6, 0.45, 0.7, 0.5)
 """And steering, steering rate and wheelbase; what other models have for themselves takes the same numbers."""
 
 
@@ -40,6 +40,9 @@ def test_the_registry_is_consistent() -> None:
         "unicycle2": (2, 5, 2),
         "holonomic2d_jerk": (2, 6, 2),
         "holonomic3d_drag": (3, 6, 3),
+        "car_with_1_trailer": (2, 4, 2),
+        "car_with_2_trailers": (2, 5, 2),
+        "car_with_3_trailers": (2, 6, 2),
     }
     assert tuple(MODELS) == tuple(MODEL_CODES) == tuple(sizes)
     assert list(MODEL_CODES.values()) == list(range(len(sizes)))
@@ -85,6 +88,9 @@ def test_an_unknown_model_is_named_with_those_there_are() -> None:
         ("unicycle1", (1, 2, math.pi / 6), (4, 5), (4 * math.sqrt(0.75), 2, 5), (4 * math.sqrt(0.75), 2)),
         ("unicycle2", (1, 2, math.pi / 2, 3, 4), (5, 6), (0, 3, 4, 5, 6), (0, 3)),
         ("holonomic2d_jerk", (1, 2, 3, 4, 5, 6), (7, 8), (3, 4, 5, 6, 7, 8), (3, 4)),
+        # Backwards at 0.5 m/s with sin(pi / 6) = 1/2, over 0.4 m.
+        ("car_with_1_trailer", (1, 2, 0, math.pi / 6), (-0.5, 0), (-0.5, 0, 0, 0.625), (-0.5, 0)),
+        ("car_with_1_trailer", (1, 2, 0, 0), (0.5, math.pi / 4), (0.5, 0, 2, 2), (0.5, 0)),
         # A drag of 0.6 / s.
         ("holonomic3d_drag", (1, 2, 3, 10, 20, -5), (7, 8, 9), (10, 20, -5, 1, -4, 12), (10, 20, -5)),
     ],
@@ -114,6 +120,7 @@ def test_derivatives_and_velocities(name: str, x: Any, u: Any, derivative: Any, 
         ("unicycle1", (-3.0, 0.7), (-0.6, 0.5)),  # backwards it has limits of its own
         ("unicycle1", (3.0, -2.0), (2.0, -1.5)),
         ("unicycle2", (-3.0, 2.0), (-1.0, 0.25)),
+        ("car_with_2_trailers", (-3.0, 2.0), (-1.5, 0.6)),
         ("holonomic2d_jerk", (3.0, 4.0), (0.36, 0.48)),
     ],
 )
@@ -135,6 +142,7 @@ def test_control_limits(name: str, u: Any, limited: Any) -> None:
         ("car", (7.0, 8.0, 9.0, 1.5, -0.7), (7.0, 8.0, 9.0, 1.5, -0.6)),
         ("unicycle2", (7.0, 8.0, 9.0, -2.5, 0.7), (7.0, 8.0, 9.0, -0.6, 0.5)),
         ("unicycle2", (7.0, 8.0, 9.0, 2.5, -1.6), (7.0, 8.0, 9.0, 2.0, -1.5)),
+        ("car_with_3_trailers", (7.0, 8.0, 9.0, 1.0, -1.0, 0.3), (7.0, 8.0, 9.0, 0.5, -0.6, 0.3)),
         ("holonomic2d_jerk", (7.0, 8.0, 3.0, -4.0, 3.0, 4.0), (7.0, 8.0, 1.2, -1.6, 0.6, 0.8)),
     ],
 )
@@ -152,6 +160,7 @@ def test_speed_limits(name: str, x: Any, limited: Any) -> None:
         ("unicycle", (1, 2, 3), (1, 2, 3)),
         ("car", (1, 2, 3, 4, 5), (1, 2, 3, 0, 5)),
         ("unicycle2", (1, 2, 3, 4, 5), (1, 2, 3, 0, 0)),
+        ("car_with_2_trailers", (1, 2, 3, 4, 5), (1, 2, 3, 4, 5)),
         ("holonomic2d_jerk", (1, 2, 3, 4, 5, 6), (1, 2, 0, 0, 0, 0)),
     ],
 )
