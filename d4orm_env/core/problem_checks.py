@@ -199,15 +199,7 @@ def check_places(
     first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
-        gap_of = (
-            min(
-                pair_gap(team.bodies[i].footprint, poses[i], team.bodies[j].footprint, poses[j])
-                for i in bodies[one]
-                for j in bodies[other]
-            )
-            for one, other in pairs
-        )
-        between = np.fromiter(gap_of, np.float64)
+        between = np.array([_least_gap(team, poses, bodies[one], bodies[other]) for one, other in pairs], np.float64)
     overlapping = np.flatnonzero(between <= 0)
     if len(overlapping):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]
@@ -226,6 +218,12 @@ def check_places(
     if gap > margin:
         return ""
     return f"the {what} of robot_{least} is {gap:.3g} m from {nearest}, and the margin is {margin:g} m"
+
+
+def _least_gap(team: Team, poses: Floats, some: list[int], others: list[int]) -> float:
+    """Least signed gap between bodies of these numbers [m]."""
+    pairs = ((i, j) for i in some for j in others)
+    return min(pair_gap(team.bodies[i].footprint, poses[i], team.bodies[j].footprint, poses[j]) for i, j in pairs)
 
 
 def _size(team: Team, robot: int) -> str:
