@@ -7,16 +7,16 @@ heading of the robot; a robot without a heading keeps it along x. All lengths ar
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, shown
-from d4orm_env.core.errors import unknown
 
-__all__ = ["Box", "Capsule", "Disc", "Ellipsoid", "Footprint", "Polygon"]
+__all__ = ["Box", "Capsule", "Disc", "Ellipsoid", "Footprint", "Polygon", "Train"]
 
 MAX_CORNERS = 8
 """Most corners of a polygon."""
@@ -271,32 +271,38 @@ class Ellipsoid(Footprint):
         return min(self.x, self.y, self.z)
 
 
-KINDS: dict[str, type[Footprint]] = {kind.__name__.lower(): kind for kind in (Disc, Box, Capsule, Polygon, Ellipsoid)}
-"""Footprints by their names in files."""
+@dataclass(frozen=True, init=False)
+class Train(Footprint):
+    """A robot with trailers, each a planar footprint about its own reference point: a trailer's axle.
 
-
-def described(footprint: Footprint) -> dict[str, Any]:
-    """The content of a file that means a footprint; the inverse of :func:`parsed`."""
-    fields = asdict(footprint)  # type: ignore[call-overload] # all are dataclasses
-    if "corners" in fields:
-        fields["corners"] = [list(corner) for corner in fields["corners"]]
-    return {"shape": type(footprint).__name__.lower()} | fields
-
-
-def parsed(content: object) -> Footprint:
-    """The footprint that a file means, such as ``{"shape": "box", "length": 0.5, "width": 0.25}``.
+    Attributes:
+        front: Of the robot itself.
+        trailers: From the front on.
 
     Raises:
-        ValueError: If the shape is unknown, or a size is missing, unknown or out of range.
+        ValueError: If one of them is no planar footprint, or there are no trailers.
     """
-    if not isinstance(content, dict) or not isinstance(content.get("shape"), str):
-        example = "{shape: box, length: 0.5, width: 0.25}"
-        raise ValueError(f"footprint must be a mapping such as {example}, not {shown(content)}")
-    kind = KINDS.get(content["shape"])
-    if kind is None:
-        raise unknown("footprint", content["shape"], KINDS)
-    sizes = {name: value for name, value in content.items() if name != "shape"}
-    try:
-        return kind(**sizes)
-    except TypeError as error:
-        raise ValueError(f"footprint {content['shape']}: {error}") from None
+
+    front: Disc | Planar
+    trailers: tuple[Disc | Planar, ...]
+
+    def __init__(self, front: Disc | Planar, trailers: Sequence[Disc | Planar]) -> None:
+        for footprint in (front, *trailers):
+            if not isinstance(footprint, Disc | Planar):
+                raise ValueError(f"Train is made of planar footprints such as Box(0.5, 0.25), not {shown(footprint)}")
+        if not trailers:
+            raise ValueError("trailers of Train are none; give one footprint each, or leave Train out")
+        object.__setattr__(self, "front", front)
+        object.__setattr__(self, "trailers", tuple(trailers))
+
+    @property
+    def outer_radius(self) -> float:
+        """That of the front; how far the trailers reach follows from their hitches, see :attr:`Team.radius`."""
+        return self.front.outer_radius
+
+    @property
+    def inner_radius(self) -> float:
+        return self.front.inner_radius
+
+    def outline(self) -> Floats:
+        return self.front.outline()

@@ -65,10 +65,11 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
     def _make_spaces(self) -> None:
         layout = self._simulation.setup.layout
-        limit = self.problem.team.control_limits.max(axis=0)
+        lowest, highest = self.problem.team.control_bounds
+        low, high = lowest.min(axis=0), highest.max(axis=0)
         box = gymnasium.spaces.Box
         self.observation_spaces = {agent: box(layout.low, layout.high) for agent in self.possible_agents}
-        self.action_spaces = {agent: box(-limit, limit) for agent in self.possible_agents}
+        self.action_spaces = {agent: box(low, high) for agent in self.possible_agents}
         self.state_space = box(*self._simulation.state_bounds)
 
     @property

@@ -37,13 +37,17 @@ def touching(team: Team, states: FloatArray, among: NDArray[np.intp], rounding: 
 
     Gaps of no more than ``rounding`` count as none [m].
     """
-    d, headings = team.dimension, team.headings(states)
-    poses = np.column_stack([states[:, :d], headings]).astype(np.float64)
-    footprints = team.footprint
+    d, poses, bodies = team.dimension, team.body_poses(states), team.bodies
+    numbers = [[i for i, body in enumerate(bodies) if body.robot == robot] for robot in range(team.num_robots)]
     partners: dict[int, list[int]] = {}
     for one, other in combinations(among.tolist(), 2):
         apart = np.linalg.norm(poses[one, :d] - poses[other, :d]) - team.radius[one] - team.radius[other]
-        if apart <= rounding and pair_gap(footprints[one], poses[one], footprints[other], poses[other]) <= rounding:
+        gaps = (
+            pair_gap(bodies[i].footprint, poses[i], bodies[j].footprint, poses[j])
+            for i in numbers[one]
+            for j in numbers[other]
+        )
+        if apart <= rounding and min(gaps) <= rounding:
             partners.setdefault(one, []).append(other)
             partners.setdefault(other, []).append(one)
     return partners

@@ -78,10 +78,11 @@ def check_physics(problem: Problem) -> list[str]:
     check_turning(team, problem.dt, problem.goal_radius)
     check_tolerances(problem.goal_heading_tolerance)
     at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, problem.goal_heading)
+    goals = np.column_stack([problem.goal, at_goals]).astype(np.float64)
     faults = [
-        check_places(team, problem.world, what, positions, problem.margin, headings)
-        for what, positions, headings in (
-            ("start", places, team.headings(problem.start)), ("goal", problem.goal, at_goals)
+        check_places(team, problem.world, what, positions, problem.margin, poses)
+        for what, positions, poses in (
+            ("start", places, team.body_poses(problem.start)), ("goal", problem.goal, goals)
         )
     ]  # fmt: skip
     return [fault for fault in faults if fault]
@@ -146,23 +147,27 @@ def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
                 f"{what} of robot_{robot} is {state.tolist()}; a {model.name} has {model.state_size} components, "
                 f"so set the padding after them to zero"
             )
-        speed = float(np.linalg.norm(state[list(model.speed_indices)])) if model.speed_indices else 0.0
-        limit = float(team.max_speed[robot])
-        if speed > limit * (1 + 1e-5):
-            raise ValueError(f"{what} speed of robot_{robot} is {speed:g} m/s, above its limit of {limit:g} m/s")
-        for index, column in model.state_limits:
-            value, limit = float(state[index]), float(limits[robot, column])
-            if abs(value) > limit * (1 + 1e-5):
-                raise ValueError(
-                    f"{what} {model.state_names[index]} of robot_{robot} is {value:g}, "
-                    f"above its {model.limit_names[column]} of {limit:g}"
-                )
+        _check_state_limits(model, limits[robot], state, f"{what} {{}} of robot_{robot} is ")
         for index in model.angles:
             if abs(float(state[index])) > MAX_HEADING:
                 raise ValueError(
                     f"{what} {model.state_names[index]} of robot_{robot} is {state[index]:g} rad; it must be at most "
                     f"{MAX_HEADING:g} in magnitude, so take whole turns off"
                 )
+
+
+def _check_state_limits(model: Model, limits: FloatArray, state: FloatArray, where: str) -> None:
+    """Refuse a state ``(n,)`` beyond a limit; ``where`` says whose it is, with a gap for the component."""
+    lower, backwards = dict(model.lower_limits), model.lower_bounds(limits)
+    for column, components in model.limited_components.items():
+        values, limit, bound = state[components], float(limits[column]), column
+        if len(values) == 1 and values[0] < 0:
+            limit, bound = float(backwards[column]), lower.get(column, column)
+        size = float(np.linalg.norm(values))
+        if size > limit * (1 + 1e-5):
+            name, unit = ("speed", " m/s") if column == SPEED else (model.state_names[components[0]], "")
+            known = "limit" if bound == SPEED else model.limit_names[bound]
+            raise ValueError(f"{where.format(name)}{size:g}{unit}, above its {known} of {limit:g}{unit}")
 
 
 def unwound_states(team: Team, states: FloatArray) -> FloatArray:
@@ -222,27 +227,29 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
 
 
 def check_places(
-    team: Team, world: World, what: str, places: FloatArray, margin: float, headings: FloatArray | None = None
+    team: Team, world: World, what: str, places: FloatArray, margin: float, poses: Floats | None = None
 ) -> str:
     """Refuse starts or goals (``what``) at ``places`` ``(K, d)`` outside the world, or that touch something.
 
-    Where a heading ``(K,)`` [rad] is NaN, as all are by default, the disc within a footprint counts for it. Returned is
-    what is nearest within the margin, for an error or a warning: the empty string if nothing is.
+    Where the heading of a body's pose is NaN [rad], as all are by default, the disc within its footprint counts for it;
+    ``poses`` are ``(F, d + 1)``, or without the trailers ``(K, d + 1)``. Returned is what is nearest within the margin,
+    for an error or a warning: the empty string if nothing is.
     """
     radius = team.radius.astype(np.float64)
     gaps = world.clearance(places) - radius
     shaped = bool(team.shapes)
-    poses = np.column_stack([places, np.full(len(places), np.nan) if headings is None else headings]).astype(np.float64)
+    if poses is None:
+        poses = np.column_stack([places.astype(np.float64), np.full(len(places), np.nan)])
+    bodies = [[i for i in range(len(poses)) if team.bodies[i].robot == robot] for robot in range(len(places))]
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
-        gaps[robot] = world_gap(world, team.footprint[robot], poses[robot])
+        gaps[robot] = min(world_gap(world, team.bodies[i].footprint, poses[i]) for i in bodies[robot])
     for robot in np.flatnonzero(gaps <= 0):
         where = f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an obstacle"
         raise ValueError(f"{where} or outside the bounds ({_size(team, int(robot))}); move it, or change the world")
     first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
-        gap_of = [pair_gap(team.footprint[i], poses[i], team.footprint[j], poses[j]) for i, j in pairs]
-        between = np.array(gap_of, np.float64)
+        between = np.array([_least_gap(team, poses, bodies[one], bodies[other]) for one, other in pairs], np.float64)
     if len(overlapping := np.flatnonzero(between <= 0)):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]
         pair = int(of_first[np.argmin(between[of_first])])
@@ -260,6 +267,12 @@ def check_places(
     if gap > margin:
         return ""
     return f"the {what} of robot_{least} is {gap:.3g} m from {nearest}, and the margin is {margin:g} m"
+
+
+def _least_gap(team: Team, poses: Floats, some: list[int], others: list[int]) -> float:
+    """Least signed gap between bodies of these numbers [m]."""
+    pairs = ((i, j) for i in some for j in others)
+    return min(pair_gap(team.bodies[i].footprint, poses[i], team.bodies[j].footprint, poses[j]) for i, j in pairs)
 
 
 def _size(team: Team, robot: int) -> str:

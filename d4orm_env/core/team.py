@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, shown
+from d4orm_env.core.bodies import Body, body_poses, find_bodies
 from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
-from d4orm_env.footprints import Disc, Footprint
+from d4orm_env.footprints import Disc, Footprint, Train
 
 DEFAULT_RADIUS = 0.15
 """Radius of a robot [m]."""
@@ -31,7 +32,8 @@ class Team(Frozen):
 
     Attributes:
         models: ``K`` model names.
-        radius: ``(K,)`` body radius [m]; of a footprint that is no disc, its outer radius.
+        radius: ``(K,)`` body radius [m]; of a footprint that is no disc, its outer radius, and with trailers how far
+            they may reach about the robot. Given to robots with trailers without footprints it is that of each body.
         max_speed: ``(K,)`` speed limit [m/s].
         max_acceleration: ``(K,)`` acceleration limit [m/s^2]; no use to a first-order robot.
         max_turn_rate: ``(K,)`` turn rate limit [rad/s]; of use to differential drives and unicycles. How far a robot
@@ -73,16 +75,20 @@ class Team(Frozen):
         self._set(models=tuple(models))
         for name, value in zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True):
             self._set(**{name: frozen_per_robot(value, name, len(models))})
-        self._set_footprints(radius, footprint)
         self._set(own_limits=self._complete_own_limits(own_limits))
+        self._set_footprints(radius, footprint)
 
     def _set_footprints(self, radius: ArrayLike | None, given: Footprint | Sequence[Footprint] | None) -> None:
         """Set shapes and radius, of which one follows from the other."""
-        count = len(self.models)
+        count, trailers = len(self.models), [len(model.trailers) for model in self.robot_models]
         if given is None:
             radii = frozen_per_robot(DEFAULT_RADIUS if radius is None else radius, "radius", count)
-            self._set(radius=radii, shapes=())
-            return
+            if not any(trailers):
+                self._set(radius=radii, shapes=())
+                return
+            discs = [Disc(size) for size in radii.tolist()]
+            given = [Train(disc, (disc,) * size) if size else disc for disc, size in zip(discs, trailers, strict=True)]
+            radius = None
         footprints = (given,) * count if isinstance(given, Footprint) else tuple(given)
         if len(footprints) != count:
             raise ValueError(f"footprint has {len(footprints)} entries for {count} robots; give one each, or one")
@@ -94,11 +100,27 @@ class Team(Frozen):
                     f"footprint of robot_{robot}, {footprint}, lies in {footprint.dimension} dimensions and the team "
                     f"moves in {self.dimension}; choose another"
                 )
-        radii = frozen_per_robot([footprint.outer_radius for footprint in footprints], "radius", count)
+            pulled = len(footprint.trailers) if isinstance(footprint, Train) else 0
+            if pulled != trailers[robot]:
+                raise ValueError(
+                    f"footprint of robot_{robot} has {pulled} trailers, and a {self.models[robot]} pulls "
+                    f"{trailers[robot]}; give such as Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
+                )
+        reach = [self._reach(robot, footprint) for robot, footprint in enumerate(footprints)]
+        radii = frozen_per_robot(reach, "radius", count)
         if radius is not None and (frozen_per_robot(radius, "radius", count) != radii).any():
             raise ValueError(f"radius {shown(radius)} is not that of the footprints, {radii.tolist()}; leave it out")
-        discs = all(isinstance(footprint, Disc) for footprint in footprints)
-        self._set(radius=radii, shapes=() if discs else footprints)
+        shaped = not all(isinstance(footprint, Disc) for footprint in footprints)
+        self._set(radius=radii, shapes=footprints if shaped else ())
+
+    def _reach(self, robot: int, footprint: Footprint) -> float:
+        """How far a robot's bodies may reach about its reference point [m]."""
+        reach, distance = footprint.outer_radius, 0.0
+        if isinstance(footprint, Train):
+            for trailer, (_, column) in zip(footprint.trailers, self.robot_models[robot].trailers, strict=True):
+                distance += float(self.limits[robot, column])
+                reach = max(reach, distance + trailer.outer_radius)
+        return reach
 
     def replace(self, **changes: object) -> Team:
         """A copy with some attributes changed, checked again; of radius and footprint, what is not given follows."""
@@ -116,7 +138,8 @@ class Team(Frozen):
     @property
     def inner_radius(self) -> Floats:
         """``(K,)`` radii of the discs or balls that the footprints cover however they turn [m]."""
-        return (self.all_footprint_arrays.inner if self.shapes else self.radius).astype(np.float64)
+        inner = self.all_footprint_arrays.inner[: self.num_robots] if self.shapes else self.radius
+        return inner.astype(np.float64)
 
     def headings(self, states: FloatArray) -> FloatArray:
         """``(..., K)`` what turns the robots' footprints in states ``(..., K, n)`` [rad]; zero without a heading."""
@@ -132,7 +155,22 @@ class Team(Frozen):
     @cached_property
     def all_footprint_arrays(self) -> FootprintArrays:
         """The same, discs too: for teams that others have other footprints than."""
-        return as_arrays(self.footprint, [model.heading_index for model in self.robot_models])
+        return as_arrays(self.bodies)
+
+    @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """The robots' bodies, and then those of their trailers."""
+        return find_bodies(self.footprint, self.robot_models, self.hitches)
+
+    @cached_property
+    def hitches(self) -> tuple[float, ...]:
+        """Lengths of the hitches of all trailers, robot by robot [m]."""
+        models = enumerate(self.robot_models)
+        return tuple(float(self.limits[robot, column]) for robot, model in models for _, column in model.trailers)
+
+    def body_poses(self, states: FloatArray) -> Floats:
+        """``(..., F, d + 1)`` reference points and headings of the bodies in states ``(..., K, n)``."""
+        return body_poses(self.bodies, states, self.dimension)
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):
@@ -188,11 +226,19 @@ class Team(Frozen):
     @cached_property
     def control_limits(self) -> FloatArray:
         """``(K, m)`` largest magnitude of each control component; zero on padding."""
-        bound = np.zeros((self.num_robots, self.control_size), np.float32)
+        limits = np.abs(self.control_bounds).max(axis=0)
+        limits.setflags(write=False)
+        return limits
+
+    @cached_property
+    def control_bounds(self) -> FloatArray:
+        """``(2, K, m)`` lowest and highest value of each control component; zero on padding."""
+        bounds = np.zeros((2, self.num_robots, self.control_size), np.float32)
         for robot, (model, limits) in enumerate(zip(self.robot_models, self.limits, strict=True)):
-            bound[robot, : model.control_size] = limits[list(model.control_limits)]
-        bound.setflags(write=False)
-        return bound
+            bounds[0, robot, : model.control_size] = -model.lower_bounds(limits)[list(model.control_limits)]
+            bounds[1, robot, : model.control_size] = limits[list(model.control_limits)]
+        bounds.setflags(write=False)
+        return bounds
 
     @cached_property
     def control_units(self) -> FloatArray:

@@ -9,6 +9,7 @@ from d4orm_env.dynamics.robot_model import (
     Model,
     ModelFunctions,
     Ops,
+    between,
     clip,
     control_scale,
     first_order_approach,
@@ -20,6 +21,6 @@ from d4orm_env.dynamics.robot_model import (
 )
 
 __all__ = [
-    "ACCELERATION", "OWN_LIMITS", "SPEED", "TURN_RATE", "Limit", "Model", "ModelFunctions", "Ops", "clip",
+    "ACCELERATION", "OWN_LIMITS", "SPEED", "TURN_RATE", "Limit", "Model", "ModelFunctions", "Ops", "between", "clip",
     "control_scale", "first_order_approach", "norm_scale", "planar_approach", "share", "stopping_speed", "turn_towards",
 ]  # fmt: skip

@@ -13,16 +13,24 @@ from d4orm_env.core.arrays import shown
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
+from d4orm_env.dynamics.car_with_trailers import CARS_WITH_TRAILERS
 from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
 from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
+from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
 from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D
+from d4orm_env.dynamics.holonomic3d_drag import HOLONOMIC3D_DRAG
 from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
 from d4orm_env.dynamics.source_digest import pieces
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.dynamics.unicycle import UNICYCLE
+from d4orm_env.dynamics.unicycle1 import UNICYCLE1
+from d4orm_env.dynamics.unicycle2 import UNICYCLE2
 from d4orm_env.dynamics.velocity2d import VELOCITY2D
 
-_BUILT_IN = (HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR)
+_BUILT_IN = (
+    HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR, UNICYCLE1, UNICYCLE2, HOLONOMIC2D_JERK,
+    HOLONOMIC3D_DRAG, *CARS_WITH_TRAILERS,
+)  # fmt: skip
 
 MODEL_CODES: dict[str, int] = {model.name: code for code, model in enumerate(_BUILT_IN)}
 """The engines' number of each model, given when it is registered or loaded from another package."""
@@ -110,8 +118,12 @@ def _admit(name: str, model: object) -> Model:
 
 def _check_attributes(model: Model) -> None:
     n, m, num_limits = model.state_size, model.control_size, len(model.limit_names)
-    indices = (*model.speed_indices, *(index for index, _ in model.state_limits), *model.angles)
-    columns = (*model.control_limits, *(column for _, column in model.state_limits))
+    indices = (*model.speed_indices, *(index for index, _ in (*model.state_limits, *model.trailers)), *model.angles)
+    columns = (
+        *model.control_limits,
+        *(column for _, column in (*model.state_limits, *model.trailers)),
+        *chain(*model.lower_limits),
+    )
     name = model.name
     checks = (
         (

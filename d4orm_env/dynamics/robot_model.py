@@ -59,6 +59,9 @@ class Number(Protocol):
 N = TypeVar("N", bound=Number)
 """Numbers of one library."""
 
+L = TypeVar("L", FloatArray, list[float])
+"""A robot's limits."""
+
 Vector: TypeAlias = tuple[Number, ...]
 """A state, a control, limits, a place or a velocity."""
 
@@ -200,8 +203,13 @@ class Model:
         functions: The scalar-style functions.
         own_limits: Limits beyond the three that all models have, from column :data:`OWN_LIMITS` on.
         state_limits: ``(state component, column of the limits)`` for components other than speeds that
-            :attr:`ModelFunctions.limit_state` bounds.
-        own_angles: State components other than the heading that are angles, such as a trailer's: to them, as to the
+            :attr:`ModelFunctions.limit_state` bounds. Components with the same column share it as the limit of their
+            norm.
+        lower_limits: ``(column, column of its own)`` for limits that hold for positive values only, such as a speed
+            forwards: the second one's bounds the magnitude of negative values, such as a speed backwards.
+        trailers: ``(state component of its hitch angle, column of its hitch's length)`` of each trailer, from the front
+            on. A hitch angle is what a trailer's heading lags behind that of the body before it.
+        own_angles: State components other than the heading that are angles: to them, as to the
             heading, a whole turn makes no difference, so that they do not wind up.
     """
 
@@ -215,6 +223,8 @@ class Model:
     functions: ModelFunctions
     own_limits: tuple[Limit, ...] = ()
     state_limits: tuple[tuple[int, int], ...] = ()
+    lower_limits: tuple[tuple[int, int], ...] = ()
+    trailers: tuple[tuple[int, int], ...] = ()
     own_angles: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -247,6 +257,21 @@ class Model:
         return (*STANDARD_LIMITS, *(limit.name for limit in self.own_limits))
 
     @property
+    def limited_components(self) -> dict[int, list[int]]:
+        """State components by the column of the limits that bounds their norm."""
+        components = {SPEED: list(self.speed_indices)} if self.speed_indices else {}
+        for index, column in self.state_limits:
+            components.setdefault(column, []).append(index)
+        return components
+
+    def lower_bounds(self, limits: L) -> L:
+        """``(L,)`` magnitudes that bound negative values in place of the limits; see :attr:`lower_limits`."""
+        bounds = limits.copy()
+        for column, own in self.lower_limits:
+            bounds[column] = min(limits[own], limits[SPEED]) if column == SPEED else limits[own]
+        return bounds
+
+    @property
     def first_order(self) -> bool:
         """True if it takes any velocity at once, so that its state holds none."""
         return not self.speed_indices
@@ -269,8 +294,10 @@ class Model:
         """Sought among the states and controls at their limits, which is where models turn fastest."""
         bounds = dict(self.state_limits) | dict.fromkeys(self.speed_indices, SPEED)
 
+        lowest = self.lower_bounds(most)
+
         def ends(column: int | None) -> tuple[float, ...]:
-            return (0.0,) if column is None or (column == SPEED and not moving) else (-most[column], most[column])
+            return (0.0,) if column is None or (column == SPEED and not moving) else (-lowest[column], most[column])
 
         states = list(product(*(ends(bounds.get(i)) for i in range(self.state_size))))
         controls = list(product(*map(ends, self.control_limits)))
@@ -291,6 +318,11 @@ def control_scale(square: Number, limit: Number, ops: Ops) -> Number:
 
 def clip(value: Number, limit: Number, ops: Ops) -> Number:
     return ops.maximum(-limit, ops.minimum(limit, value))
+
+
+def between(value: Number, least: Number, most: Number, ops: Ops) -> Number:
+    """Return the value, or the bound that it is beyond."""
+    return ops.maximum(least, ops.minimum(most, value))
 
 
 def stopping_speed(distance: Number, limits: Vector, h: TimeStep, ops: Ops) -> Number:

@@ -50,6 +50,7 @@ for _function in (
     robot_model.norm_scale,
     robot_model.control_scale,
     robot_model.clip,
+    robot_model.between,
     robot_model.stopping_speed,
     robot_model.share,
     robot_model.planar_approach,

@@ -21,6 +21,7 @@ from d4orm_env.engine.tiles import (
     RobotMover,
     measure_goal_distance,
     motion_reader,
+    pose_rows,
     robot_mover,
 )
 from d4orm_env.engine.types import MOVED, RESET, SKIP, STEP, WorldBatch
@@ -135,7 +136,7 @@ def advance_worlds_kernel(
     ) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
-        w = aligned_zeros(num_robots * STRIDE)
+        w = aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE)
         near = np.empty((num_robots, 3), np.uint64)
         sensed = allocate_sensed(num_robots, 0, dimension, view)
         for index in range(tile_range[0], tile_range[1]):

@@ -283,20 +283,28 @@ def _add_turned(
 add_turned, add_turned_squares = _add_turned(1), _add_turned(2)
 
 
-@intrinsic
-def at_most(typing_context: TypingContext, w: Type, offset: Type, bound: Type) -> Instructions:
-    """Return the mask of ``w[offset:offset + TILE] <= bound``."""
+def _at_most_of(count: int) -> Callable[[FloatArray, Whole, np.float32], np.uint64]:
+    """``(w, offset, bound) -> mask``: where ``w[offset:offset + count] <= bound``."""
 
-    def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
-        array, start, limit = arguments
-        limit = _splat(builder, limit)
-        mask = ir.Constant(_MASK, 0)
-        for first in range(0, TILE, CHUNK):
-            values = _load(context, builder, signature.args[0], array, start, first)
-            mask = builder.or_(mask, _at_most(builder, first, values, limit))
-        return mask
+    @intrinsic
+    def at_most(typing_context: TypingContext, w: Type, offset: Type, bound: Type) -> Instructions:
+        def generate(
+            context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]
+        ) -> Value:
+            array, start, limit = arguments
+            limit = _splat(builder, limit)
+            mask = ir.Constant(_MASK, 0)
+            for first in range(0, count, CHUNK):
+                values = _load(context, builder, signature.args[0], array, start, first)
+                mask = builder.or_(mask, _at_most(builder, first, values, limit))
+            return mask
 
-    return types.uint64(w, types.int64, types.float32), generate
+        return types.uint64(w, types.int64, types.float32), generate
+
+    return at_most
+
+
+at_most, chunk_at_most = _at_most_of(TILE), _at_most_of(CHUNK)
 
 
 @intrinsic

@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, Whole
+from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
@@ -24,7 +24,7 @@ from d4orm_env.dynamics.models import MODEL_CODES, MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
-from d4orm_env.engine.footprint_contacts import refine_pair
+from d4orm_env.engine.footprint_contacts import POSE, place_bodies, refine_pair
 from d4orm_env.engine.simd import TILE, at_most, use_wide_registers, within_2, within_3
 from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_stepper
 from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
@@ -113,11 +113,17 @@ def near_pair(reach: np.float32, a: int, b: int, dimension: int, w: FloatArray) 
 
 
 @inlined
-def turn_row(f: FootprintArrays | None, k: Whole) -> Whole:
-    """Return where the row of the state component that turns the footprint of robot ``k`` begins; 0 without any."""
-    if f is None:
-        return 0
-    return k * STRIDE + (STATE + max(f.heading[k], 0)) * TILE
+def pose_rows(f: FootprintArrays | None) -> int:
+    """Return how many rows the poses of a team's bodies take; they are the last of the workspace."""
+    return 0 if f is None else POSE * f.heading.shape[0]
+
+
+@inlined
+def place_team(f: FootprintArrays | None, num_robots: int, w: FloatArray) -> None:
+    """Fill the poses of all bodies from the robots' states."""
+    if f is not None:
+        for k in range(num_robots):
+            place_bodies(f, k, w[k * STRIDE + STATE * TILE : (k + 1) * STRIDE], w, POSE * TILE, num_robots * STRIDE)
 
 
 @inlined
@@ -125,13 +131,13 @@ def mark_pairs(
     arrays: ProblemArrays, extra: np.float32, w: FloatArray, buffer: FloatArray, near: NDArray[np.uint64]
 ) -> None:
     """Flag every two robots closer than their footprints plus ``extra``; ``buffer`` is two rows to overwrite."""
+    f, poses = arrays.footprints, arrays.radius.shape[0] * STRIDE
     for k in range(1, arrays.radius.shape[0]):
         for other in range(k):
             reach = arrays.radius[k] + arrays.radius[other] + extra
             a, b, dimension = k * STRIDE, other * STRIDE, arrays.goal.shape[1]
             touch = near_pair(reach, a, b, dimension, w)
-            f, turn_a, turn_b = arrays.footprints, turn_row(arrays.footprints, k), turn_row(arrays.footprints, other)
-            touch = refine_pair(f, arrays, k, other, touch, extra, dimension, w, a, b, w, turn_a, turn_b, buffer)
+            touch = refine_pair(f, k, other, touch, extra, dimension, w, a, b, w, POSE * TILE, poses, buffer)
             near[k, ROBOT] |= touch
             near[other, ROBOT] |= touch
 

@@ -13,7 +13,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import reward
 from d4orm_env.engine import obstacles
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
-from d4orm_env.engine.footprint_contacts import angle_of, bodies_within, refine_static
+from d4orm_env.engine.footprint_contacts import POSE, meets_body, refine_static
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
     BUFFER,
@@ -28,7 +28,7 @@ from d4orm_env.engine.tiles import (
     STATE,
     STRIDE,
     mark_pairs,
-    turn_row,
+    place_team,
 )
 from d4orm_env.engine.types import ObservationInputs, WorldBatch
 
@@ -105,9 +105,11 @@ def _meets_body(
     dimension, place = arrays.goal.shape[1], k * STRIDE + STATE * TILE + s
     x, y = body[0] - w[place], body[1] - w[place + TILE]
     z = body[2] - w[place + 2 * TILE] if dimension == 3 else ZERO
-    angle, buffer = angle_of(f, k, w, turn_row(f, k) + s), w[k * STRIDE + BUFFER * TILE : k * STRIDE + ROWS * TILE]
-    radius = body[2 * dimension]
-    return bodies_within(f, k, arrays.radius[k], angle, f, -1, radius, ZERO, x, y, z, dimension == 2, extra, buffer)
+    buffer, poses = w[k * STRIDE + BUFFER * TILE : k * STRIDE + ROWS * TILE], arrays.radius.shape[0] * STRIDE + s
+    return meets_body(
+        f, k, arrays.radius[k], w, POSE * TILE, poses, f, -1, body[2 * dimension], w, x, y, z, dimension == 2, extra,
+        buffer,
+    )  # fmt: skip
 
 
 @inlined
@@ -143,6 +145,8 @@ def check_contacts(
 ) -> None:
     """Complete the flags of contacts and margin violations of the worlds of a tile, then compute the rewards."""
     num_robots, count = arrays.radius.shape[0], min(TILE, worlds.state.shape[0] - first)
+    poses = num_robots * STRIDE
+    place_team(arrays.footprints, num_robots, w)
     for k in range(num_robots):
         near[k, ROBOT] = near[k, OBSTACLE] = near[k, DYNAMIC] = NOWHERE
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
@@ -154,7 +158,7 @@ def check_contacts(
             places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
             touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
             f = arrays.footprints
-            touch = refine_static(f, arrays, k, touch, extra, places, 0, w, turn_row(f, k), buffer)
+            touch = refine_static(f, arrays, k, touch, extra, places, w, POSE * TILE, poses, buffer)
             near[k, OBSTACLE] |= touch
         _mark_bodies(arrays, worlds.bodies, first, extra, w, near)
         flags = worlds.collided if level == 0 else worlds.violated

@@ -21,7 +21,7 @@ from d4orm_env.engine.episodes import advance_worlds_kernel
 from d4orm_env.engine.observing import ObservationSpec, observe_worlds_kernel
 from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
-from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, robot_mover
+from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, pose_rows, robot_mover
 from d4orm_env.engine.types import ObservationInputs, WorldBatch
 from d4orm_env.engine.world_tiles import WorldArrays, check_contacts, load, load_world, store_world
 
@@ -39,7 +39,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
     def roll_out(arrays: ProblemArrays, moments: WorldArrays) -> None:
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
-        w = aligned_zeros(num_robots * STRIDE)
+        w = aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE)
         near = np.empty((num_robots, 3), np.uint64)
         lane = np.int64(0)  # a literal zero would compile what it is passed to once more
         state, docked = moments.state, moments.docked

@@ -109,11 +109,11 @@ class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
 def joint_spaces(setup: EnvSetup) -> tuple[gymnasium.Space[FloatArray], gymnasium.Space[FloatArray]]:
     """Spaces of the joint observation ``(K * D,)`` and of the joint action ``(K * m,)``."""
     team, layout = setup.problem.team, setup.layout
-    limits = team.control_limits
+    low, high = team.control_bounds
     # Padding has no limit of its own; a box must not be flat.
-    limits = np.where(limits > 0, limits, limits.max(axis=0)).ravel()
+    low, high = np.where(high > 0, low, low.min(axis=0)), np.where(high > 0, high, high.max(axis=0))
     observations = gymnasium.spaces.Box(np.tile(layout.low, team.num_robots), np.tile(layout.high, team.num_robots))
-    return observations, gymnasium.spaces.Box(-limits, limits)
+    return observations, gymnasium.spaces.Box(low.ravel(), high.ravel())
 
 
 def register_environments() -> None:

@@ -86,7 +86,7 @@ class TorchRLNavigation(EnvBase):
         info = self._composite({name: self._flag(*self._shape) for name in _INFO})
         seen = self._box(layout.low, layout.high)
         self.observation_spec = self._of_robots({"observation": seen, "info": info})
-        self.action_spec = self._of_robots({"action": self._box(-team.control_limits, team.control_limits)})
+        self.action_spec = self._of_robots({"action": self._box(*team.control_bounds)})
         self.reward_spec = self._of_robots({"reward": Unbounded((*self._shape, 1), device=self.device)})
         done = {name: self._flag(self._shape[0]) for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(done, shape=self.batch_size, device=self.device)

@@ -254,7 +254,11 @@ def _limits(team: Team) -> jax.Array:
     return jnp.stack(columns, axis=1)
 
 
-_STATIC = {Problem: ("horizon", "arrival", "name"), Team: ("models", "shapes"), World: ("dimension", "triangles")}
+_STATIC = {
+    Problem: ("horizon", "arrival", "name"),
+    Team: ("models", "shapes", "hitches"),
+    World: ("dimension", "triangles"),
+}
 
 
 def _register(kind: type) -> None:

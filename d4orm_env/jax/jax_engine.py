@@ -16,6 +16,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
@@ -28,7 +29,7 @@ from d4orm_env.engine.types import (
 )
 from d4orm_env.jax import jax_footprints as footprints
 from d4orm_env.jax.gpu_kernels import LANES, count_near, on_gpu
-from d4orm_env.jax.jax_footprints import MovingBodies
+from d4orm_env.jax.jax_footprints import MovingBodies, PlacedBodies
 from d4orm_env.jax.jax_motion import OPS, Given, Worlds, advance_worlds, roll_out
 
 BIT_OPS = noise.BitOps(
@@ -55,13 +56,22 @@ def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float3
         near = ((place[:, None] - place[None, :]) ** 2).sum(axis=2) <= reach2[..., None]
         if arrays.footprints is not None:
             bodies = footprints.place_robots(arrays.footprints, state, dimension)
-            near &= footprints.pairs_within(bodies, bodies, extra)
+            near &= _robots_within(arrays.footprints, bodies, arrays.footprints, bodies, extra, near.shape)
         return near.sum(axis=1, dtype=jnp.int32)
 
     if arrays.footprints is not None or state.shape[-1] < LANES:
         return count(state, reach2)
     counted: Array = on_gpu(partial(count_near, dimension), count, jax.lax.stop_gradient(state), reach2)
     return counted
+
+
+def _robots_within(
+    f: FootprintArrays | None, bodies: PlacedBodies, g: FootprintArrays | None, others: PlacedBodies,
+    extra: Array | np.float32, shape: tuple[int, ...],
+) -> Array:  # fmt: skip
+    """``(K, O, S)`` whether one of a robot's bodies is within ``extra`` of one of another's."""
+    touch = footprints.of_robots(f, footprints.pairs_within(bodies, others, extra), shape[0])
+    return jnp.moveaxis(footprints.of_robots(g, jnp.moveaxis(touch, 1, 0), shape[1]), 0, 1)
 
 
 def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, extra: Array | np.float32) -> Array:
@@ -73,7 +83,8 @@ def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, e
     near = gaps.sum(axis=2) <= (reach * reach)[..., None]
     if arrays.footprints is not None or others.footprints is not None:
         bodies = footprints.place_robots(arrays.footprints, state, d, arrays.radius)
-        near &= footprints.pairs_within(bodies, footprints.place_bodies(others), extra)
+        its = footprints.place_bodies(others)
+        near &= _robots_within(arrays.footprints, bodies, others.footprints, its, extra, near.shape)
     return near.sum(axis=1)
 
 

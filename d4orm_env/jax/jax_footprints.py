@@ -15,8 +15,9 @@ from jax import Array
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.footprint_contacts import BISECTIONS
+from d4orm_env.engine.convex_cores import BISECTIONS
 
+MAX_TRAILERS = 3
 Given: TypeAlias = Array | FloatArray | np.float32
 """Numbers of the problem: inside a compiled function they are traced."""
 
@@ -26,7 +27,7 @@ class MovingBodies(NamedTuple):
 
     Attributes:
         places: ``(O, d)``.
-        headings: ``(O,)``, or ``None`` where all are discs.
+        headings: ``(F,)`` of the bodies and their trailers, or ``None`` where all are discs.
         radius: ``(O,)`` outer radii.
         footprints: Theirs; ``None`` where all are discs.
     """
@@ -58,12 +59,43 @@ class PlacedBodies(NamedTuple):
 
 
 def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius: Given | None = None) -> PlacedBodies:
-    """Robots in ``state`` ``(K, n, S)``; discs of this ``radius`` ``(K,)`` if there are no footprints."""
+    """Bodies of robots in ``state`` ``(K, n, S)``; discs of this ``radius`` ``(K,)`` if there are no footprints."""
     place = jnp.moveaxis(state[:, :dimension], 1, 0)
     if f is None:
         return _discs(place, jnp.asarray(radius))
-    heading = state[jnp.arange(len(state)), jnp.maximum(jnp.asarray(f.heading), 0)]
-    return _bodies(f, place, jnp.where(jnp.asarray(f.heading)[:, None] >= 0, heading, 0))
+    robot, column = jnp.asarray(f.robot), jnp.asarray(f.heading)
+    turn = jnp.where(column[:, None] >= 0, state[robot, jnp.maximum(column, 0)], 0)
+    if len(column) == len(state):
+        return _bodies(f, place, turn)
+    heading = _lagging(f, turn)
+    return _bodies(f, place[:, robot] + _hitched(f, heading), heading)
+
+
+def _lagging(f: FootprintArrays, turn: Array) -> Array:
+    """``(F, S)`` headings of bodies from those of the robots and the hitch angles of the trailers."""
+    before, heading = jnp.asarray(f.before), turn
+    follows = (before != jnp.arange(len(before)))[:, None]
+    for _ in range(MAX_TRAILERS):
+        heading = jnp.where(follows, heading[before] - turn, turn)
+    return heading
+
+
+def _hitched(f: FootprintArrays, heading: Array) -> Array:
+    """``(2, F, S)`` reference points of bodies relative to those of their robots."""
+    before, hitch = jnp.asarray(f.before), jnp.asarray(f.hitch)[None, :, None]
+    own = -hitch * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    offset = own
+    for _ in range(MAX_TRAILERS):
+        offset = jnp.where(hitch > 0, offset[:, before] + own, 0)
+    return offset
+
+
+def of_robots(f: FootprintArrays | None, touch: Array, count: int) -> Array:
+    """``(K, ...)`` whether one of a robot's bodies touches, of flags ``(F, ...)``."""
+    if f is None or len(touch) == count:
+        return touch
+    robots = jnp.zeros((count, *touch.shape[1:]), bool)
+    return robots.at[jnp.asarray(f.robot)].max(touch)
 
 
 def place_bodies(bodies: MovingBodies) -> PlacedBodies:
@@ -71,7 +103,10 @@ def place_bodies(bodies: MovingBodies) -> PlacedBodies:
     place = jnp.asarray(bodies.places).T[..., None]
     if bodies.footprints is None or bodies.headings is None:
         return _discs(place, jnp.asarray(bodies.radius))
-    return _bodies(bodies.footprints, place, jnp.asarray(bodies.headings)[:, None])
+    f, heading = bodies.footprints, jnp.asarray(bodies.headings)[:, None]
+    if len(f.robot) > len(bodies.places):
+        place = place[:, jnp.asarray(f.robot)] + _hitched(f, heading)
+    return _bodies(f, place, heading)
 
 
 def _discs(place: Array, radius: Array) -> PlacedBodies:
@@ -157,6 +192,11 @@ def _balls_within(offset: Array, a: Array, b: Array) -> Array:
 
 def static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
     """``(K, S)`` whether robots in ``state`` ``(K, n, S)`` come within ``extra`` of an obstacle or a bound."""
+    return of_robots(arrays.footprints, _static_contacts(arrays, state, extra), len(state))
+
+
+def _static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
+    """``(F, S)`` the same of bodies."""
     dimension, extra = arrays.goal.shape[1], jnp.asarray(extra)
     bodies = place_robots(arrays.footprints, state, dimension)
     if dimension == 3:

@@ -261,14 +261,15 @@ class TeamLayer:
         self.goals.set_verts(panel.outlines(goals, 1.5 * self.radius, _DIAMOND))
         self.bodies.set_verts(self.body_outlines(states))
         shade = np.where(arrived[:, None], ARRIVED_SHADE, 1.0)
-        self.bodies.set_facecolor(shade * self.colors + 1 - shade)
+        robots = [body.robot for body in self.problem.team.bodies]
+        self.bodies.set_facecolor((shade * self.colors + 1 - shade)[robots])
         self.headings.set_segments(self.heading_lines(states))
         white = self.dark & ~arrived[self.drives]
         self.headings.set_color(["white" if on_dark else INK for on_dark in white])
         self.contacts.set_verts(panel.outlines(contacts, self.mark_size, _STAR))
 
     def body_outlines(self, states: Array) -> Array:
-        """``(K, vertices, .)`` outlines of the robots in states ``(K, n)``; in space ellipsoids face the reader."""
+        """``(F, vertices, .)`` outlines of the bodies in states ``(K, n)``; in space ellipsoids face the reader."""
         team, panel = self.problem.team, self.panel
         places = states[:, : team.dimension]
         if not team.shapes:
@@ -278,10 +279,10 @@ class TeamLayer:
             sizes = panel.flatten(team.all_footprint_arrays.semi_axes)
             corners: Array = panel.flatten(places)[:, None] + balls * sizes[:, None]
             return corners
-        turn = team.headings(states)[:, None]
-        x, y = np.moveaxis(np.stack([footprint.outline() for footprint in team.footprint]), 2, 0)
-        cosine, sine = np.cos(turn), np.sin(turn)
-        planar: Array = panel.flatten(places)[:, None] + np.stack(
+        poses = team.body_poses(states)
+        x, y = np.moveaxis(np.stack([body.footprint.outline() for body in team.bodies]), 2, 0)
+        cosine, sine = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+        planar: Array = panel.flatten(poses[:, :2])[:, None] + np.stack(
             [cosine * x - sine * y, sine * x + cosine * y], axis=-1
         )
         return planar

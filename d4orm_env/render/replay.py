@@ -17,6 +17,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.render.denoising_frames import Denoising
 from d4orm_env.render.panels import robot_colors, view_limits
@@ -176,11 +177,21 @@ def _setting(problem: Problem) -> dict[str, object]:
         "world": _obstacles(problem),
         "radius": np.asarray(problem.team.radius).tolist(),
         "outlines": [footprint.outline().tolist() for footprint in problem.team.shapes] or None,
+        "trailers": [_trailers(problem.team, robot) for robot in range(problem.num_robots)],
         "models": [model.name for model in models],
         "names": [list(model.state_names) for model in models],
         "heading": [model.heading_index for model in models],
         "colors": [to_hex(color) for color in robot_colors(problem.num_robots)],
     }
+
+
+def _trailers(team: Team, robot: int) -> list[dict[str, object]]:
+    """Outlines of a robot's trailers, their hitch angles' state components, and the hitches' lengths."""
+    return [
+        {"outline": body.footprint.outline().tolist(), "hitch": body.heading, "length": body.hitch}
+        for body in team.bodies[team.num_robots :]
+        if body.robot == robot
+    ]
 
 
 def _denoising(denoising: Denoising) -> dict[str, object]:

@@ -11,18 +11,21 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import Floats, shown
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.core.yaml_text import read_yaml
-from d4orm_env.footprints import Box, Disc, Footprint
+from d4orm_env.dynamics.models import get_model
+from d4orm_env.dynamics.robot_model import Model
+from d4orm_env.footprints import Box, Disc, Footprint, Train
 
 if TYPE_CHECKING:
     from d4orm_env.core.trajectory import Trajectory
@@ -43,6 +46,11 @@ _INTEGRATOR1: dict[str, Any] = {"dynamics": "integrator1_2d", "max_vel": 0.5, "s
 _INTEGRATOR2: dict[str, Any] = {
     "dynamics": "integrator2_2d", "max_vel": 0.5, "max_acc": 2.0, "shape": "sphere", "radius": 0.1,
 }  # fmt: skip
+_UNICYCLE2: dict[str, Any] = _UNICYCLE1 | {"dynamics": "unicycle2", "max_acc_abs": 0.25, "max_angular_acc": 0.25}
+_CAR1: dict[str, Any] = {
+    "dynamics": "car_with_trailers", "num_trailers": 1, "min_vel": -0.1, "max_vel": 0.5, "max_steering_abs": 1.047198,
+    "l": 0.25, "hitch_lengths": (0.5,), "shape": "box", "size": (0.5, 0.25), "size_trailer": (0.3, 0.25),
+}  # fmt: skip
 _SPHERE = _UNICYCLE1 | {"shape": "sphere", "min_angular_vel": -2.0, "max_angular_vel": 2.0}
 
 MODELS: dict[str, dict[str, Any]] = {
@@ -51,6 +59,10 @@ MODELS: dict[str, dict[str, Any]] = {
     "unicycle_first_order": _UNICYCLE1,
     "unicycle_first_order_0": _UNICYCLE1,
     "unicycle_first_order_0_sphere": _SPHERE,
+    "unicycle2_v0": _UNICYCLE2,
+    "unicycle_second_order_0": _UNICYCLE2,
+    "car1_v0": _CAR1,
+    "car_first_order_with_1_trailers_0": _CAR1,
     "integrator1_2d_v0": _INTEGRATOR1,
     "single_integrator": _INTEGRATOR1,
     "single_integrator_0": _INTEGRATOR1,
@@ -61,8 +73,8 @@ MODELS: dict[str, dict[str, Any]] = {
 """Robot types and their parameters, as in dynobench's ``models`` and db-CBS's ``robots.cpp``."""
 
 DYNAMICS = {
-    "unicycle1": "unicycle", "integrator1_2d": "velocity2d", "integrator2_2d": "holonomic2d",
-    "integrator2_3d": "holonomic3d",
+    "unicycle1": "unicycle1", "unicycle2": "unicycle2", "integrator1_2d": "velocity2d", "integrator2_2d": "holonomic2d",
+    "integrator2_3d": "holonomic3d", "car_with_trailers": "car_with_1_trailer",
 }  # fmt: skip
 """Their dynamics and our models."""
 
@@ -97,13 +109,14 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     robots, environment = content["robots"], content["environment"]
     types = [robot["type"] for robot in robots]
     _check_types(types, models)
-    parameters = [models[name] for name in types]
-    names = tuple(DYNAMICS[own["dynamics"]] for own in parameters)
+    parameters = [_symmetric(models[name]) | models[name] for name in types]
+    names = tuple(map(_model, parameters))
     team = Team(
         names,
         max_speed=[own["max_vel"] for own in parameters],
-        max_acceleration=[own.get("max_acc", 1.0) for own in parameters],
+        max_acceleration=[own.get("max_acc") or own.get("max_acc_abs") or 1.0 for own in parameters],
         max_turn_rate=[own.get("max_angular_vel", 1.0) for own in parameters],
+        own_limits=_own_limits(parameters, names),
         footprint=[_footprint(own) for own in parameters],
     )
     start, goal = np.zeros((2, team.num_robots, team.state_size))
@@ -112,7 +125,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
             if len(entry[what]) != model.state_size:
                 given, kind = shown(entry[what]), entry["type"]
                 raise ValueError(f"{what} of robot_{robot} is {given}; a {kind} has {model.state_size} components")
-            states[robot, : model.state_size] = entry[what]
+            states[robot, : model.state_size] = _state(model, entry[what])
     turning = np.array([model.heading_index is not None for model in team.robot_models])
     inertia = np.array([not model.first_order for model in team.robot_models])
     d = team.dimension
@@ -140,13 +153,60 @@ def _check_types(types: list[Any], models: Mapping[str, dict[str, Any]]) -> None
                 f"robot type {name}: dynamics {shown(own.get('dynamics'))} has no model here; "
                 f"there are {', '.join(DYNAMICS)}"
             )
-        for least, most in (("min_vel", "max_vel"), ("min_angular_vel", "max_angular_vel")):
-            if least in own and own[least] != -own[most]:
-                raise ValueError(f"robot type {name}: {least} is {own[least]:g}; limits here are symmetric, -{most}")
+        for least in ("min_vel", "min_angular_vel"):
+            if own.get(least, -1.0) >= 0:
+                raise ValueError(f"robot type {name}: {least} is {own[least]:g}; it must be negative, for robots rest")
+
+
+def _symmetric(own: Mapping[str, Any]) -> dict[str, float]:
+    """The lower limits of a type whose parameters give none."""
+    return {f"min_{name}": -own[f"max_{name}"] for name in ("vel", "angular_vel") if f"max_{name}" in own}
+
+
+def _model(own: Mapping[str, Any]) -> str:
+    """The name of our model; the unicycle has limits for both directions only where they are not symmetric."""
+    name = DYNAMICS[own["dynamics"]]
+    if name == "car_with_1_trailer" and own["num_trailers"] > 1:
+        return f"car_with_{own['num_trailers']}_trailers"
+    return "unicycle" if name == "unicycle1" and own.items() >= _symmetric(own).items() else name
+
+
+def _limits_of(own: Mapping[str, Any]) -> dict[str, float]:
+    """What our models have for themselves, from a type's parameters."""
+    names = {"max_angular_acc": "max_turn_acceleration", "max_steering_abs": "max_steering", "l": "wheelbase"}
+    limits = {ours: float(own[theirs]) for theirs, ours in names.items() if theirs in own}
+    lower = {"min_vel": "max_reverse_speed", "min_angular_vel": "max_right_turn_rate"}
+    limits |= {ours: -float(own[theirs]) for theirs, ours in lower.items() if theirs in own}
+    for number, length in enumerate(own.get("hitch_lengths", ()), 1):
+        limits[f"hitch_length_{number}"] = float(length)
+        limits[f"max_hitch_angle_{number}"] = float(own.get("diff_max_abs", math.pi / 4))
+    return limits
+
+
+def _own_limits(parameters: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[float]]:
+    """``(K,)`` values by name; one where a robot has no such limit."""
+    known, given = [{limit.name for limit in get_model(name).own_limits} for name in names], map(_limits_of, parameters)
+    own = [{name: limits[name] for name in has} for has, limits in zip(known, given, strict=True)]
+    return {name: [limits.get(name, 1.0) for limits in own] for name in dict.fromkeys(chain(*own))}
+
+
+def _state(model: Model, theirs: list[float]) -> Floats:
+    """A state of ours; trailers turn by their hitch angles, and in theirs by their headings."""
+    state = np.array(theirs, np.float64)
+    if model.trailers:
+        state[3:] = _wrapped(state[2:-1] - state[3:])
+    return state
+
+
+def _wrapped(angle: Floats) -> Floats:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _footprint(own: Mapping[str, Any]) -> Footprint:
-    return Disc(own["radius"]) if own["shape"] == "sphere" else Box(*own["size"][:2])
+    footprint: Disc | Box = Disc(own["radius"]) if own["shape"] == "sphere" else Box(*own["size"][:2])
+    if own["dynamics"] != "car_with_trailers":
+        return footprint
+    return Train(footprint, [Box(*own["size_trailer"][:2])] * own["num_trailers"])
 
 
 def _world(environment: Mapping[str, Any], team: Team) -> World:
@@ -169,6 +229,7 @@ def _world(environment: Mapping[str, Any], team: Team) -> World:
 def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
     """The lines of a result file: states and actions of every robot, until it rests at its goal for good."""
     known = {ours: theirs for theirs, ours in DYNAMICS.items()}
+    known |= {"unicycle": "unicycle1"} | {f"car_with_{count}_trailers": "car_with_trailers" for count in (2, 3)}
     yield "result:"
     for robot, model in enumerate(problem.team.robot_models):
         if model.name not in known:
@@ -178,8 +239,11 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
         moving = np.flatnonzero(~trajectory.arrived[:, robot])
         last = int(moving[-1]) + 1 if len(moving) else 0
         states = trajectory.states[: last + 1, robot, : model.state_size].astype(np.float64)
+        for hitch, _ in model.trailers:
+            states[:, hitch] = states[:, hitch - 1] - states[:, hitch]
         if model.heading_index is not None:
-            states[:, model.heading_index] = (states[:, model.heading_index] + np.pi) % (2 * np.pi) - np.pi
+            turned = [model.heading_index, *(hitch for hitch, _ in model.trailers)]
+            states[:, turned] = _wrapped(states[:, turned])
         yield "-"
         for name, rows in (("states", states), ("actions", trajectory.controls[:last, robot, : model.control_size])):
             yield f"  {name}:" if len(rows) else f"  {name}: []"

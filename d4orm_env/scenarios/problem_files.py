@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from d4orm_env import footprints
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.yaml_text import read_yaml
 from d4orm_env.footprints import Disc
 from d4orm_env.scenarios.dynobench import load_dynobench
+from d4orm_env.scenarios.footprint_entries import described
 from d4orm_env.scenarios.schema import VERSION, parse, start_fields
 
 
@@ -131,7 +131,7 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     footprint = team.footprint[robot]
     shape = {"radius": team.radius[[robot]]} if isinstance(footprint, Disc) else {}
     if not shape:
-        entry["footprint"] = footprints.described(footprint)
+        entry["footprint"] = described(footprint)
     for name in (*shape, "max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
     if not np.isnan(problem.goal_heading[robot]):

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from d4orm_env import footprints
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
@@ -19,7 +18,8 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
-from d4orm_env.footprints import Disc
+from d4orm_env.footprints import Disc, Footprint
+from d4orm_env.scenarios.footprint_entries import parsed
 from d4orm_env.scenarios.problems import SCENARIOS
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
@@ -267,8 +267,8 @@ def parse(data: object) -> Problem:
         return content.build()
 
 
-def _footprint(entry: RobotEntry) -> footprints.Footprint:
-    return Disc(entry.radius) if entry.footprint is None else footprints.parsed(entry.footprint)
+def _footprint(entry: RobotEntry) -> Footprint:
+    return Disc(entry.radius) if entry.footprint is None else parsed(entry.footprint)
 
 
 def _explain(error: ValidationError) -> str:

@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
+from d4orm_env.core import portable
+from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
 from d4orm_env.verify.footprints import ConvexBodies, TurningPairs, turning_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
+from d4orm_env.verify.surroundings import surroundings
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -78,7 +80,7 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
 
 def _report(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
-    pairs, obstacles = make_watches(problem, docking.robot)
+    pairs, obstacles = make_watches(problem, *course.bodies(docking))
     watches: list[Watch] = [pairs, *obstacles]
     for stretch in course.stretches(docking, max(len(watch.rows) for watch in watches)):
         for watch in watches:
@@ -99,12 +101,12 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
     )
 
 
-def make_watches(problem: Problem, robot: NDArray[np.intp]) -> tuple[Pairs, list[Watch]]:
-    """Return the watch over bodies, those of ``robot`` ``(B,)``, and those over their surroundings."""
+def make_watches(problem: Problem, robot: NDArray[np.intp], body: NDArray[np.intp]) -> tuple[Pairs, list[Watch]]:
+    """Return the watch over bodies, of these robots and these numbers ``(B,)``, and those over their surroundings."""
     if problem.team.shapes:
-        shapes = ConvexBodies.of(problem.team)
+        shapes = ConvexBodies.of(problem.team).take(body)
         return TurningPairs(robot, shapes), turning_watches(problem.world, robot, shapes)
-    radius = problem.team.radius.astype(np.float64)
+    radius = problem.team.radius.astype(np.float64)[robot]
     return Pairs(robot, radius), surroundings(problem.world, robot, radius)
 
 
@@ -119,12 +121,40 @@ class _Course:
         displacements = [self._displacement(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]
         self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *displacements]), axis=0)
 
-    def _turns(self, steps: slice, docking: Docking, stop: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        """``(T, S+1, B)`` headings, a docked robot's as it docked, and by how much ``(T, B)`` they change [rad]."""
-        headings, ends = self._motion.headings(steps, self._sub_steps), self._motion.end_headings
-        stands = np.arange(len(ends))[steps, None] >= docking.steps
-        turn = np.where(stands[:, None], ends[stop - 1, docking.robot], headings[:, :, docking.robot])
-        return turn, np.abs(turn - turn[:, :1]).max(axis=1)
+    def bodies(self, docking: Docking) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Robots and numbers ``(B,)`` of the bodies of every reading, those of trailers last."""
+        reading, body = self._readings(docking)
+        return docking.robot[reading], body
+
+    def _readings(self, docking: Docking) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        first = len(self._motion.max_speed)
+        trailers = [
+            (reading, first + number)
+            for number, robot in enumerate(self._motion.trailer_robots)
+            for reading in np.flatnonzero(docking.robot == robot)
+        ]
+        readings, bodies = np.array([*enumerate(docking.robot), *trailers], np.intp).T
+        return readings, bodies
+
+    def _turns(self, steps: slice, docking: Docking, stop: NDArray[np.intp]) -> Floats:
+        """``(T, S+1, B)`` headings, a docked robot's as it docked [rad]."""
+        (reading, body), ends = self._readings(docking), self._motion.end_headings
+        headings = self._motion.headings(steps, self._sub_steps)
+        stands = np.arange(len(ends))[steps, None] >= docking.steps[reading]
+        return np.where(stands[:, None], ends[stop[reading] - 1, body], headings[:, :, body])
+
+    def _hitched(self, docking: Docking, turn: Floats) -> Floats:
+        """``(T, S+1, B, d)`` reference points of the bodies relative to those of their robots [m]."""
+        reading, body = self._readings(docking)
+        offset = np.zeros((*turn.shape, self._motion.size))
+        last = list(range(len(docking.robot)))  # the last body of each reading so far
+        for number in range(len(docking.robot), len(body)):
+            sine, cosine = portable.sin_cos(turn[..., number])
+            hitch = self._motion.hitches[body[number] - len(self._motion.max_speed)]
+            behind = hitch * np.stack([cosine, sine], axis=-1)
+            offset[..., number, :] = offset[..., last[reading[number]], :] - behind
+            last[reading[number]] = number
+        return offset
 
     def _displacement(self, steps: slice) -> Floats:
         return self._motion.displacement(steps, self._sub_steps)
@@ -145,11 +175,16 @@ class _Course:
             stands = np.arange(horizon)[steps, None] >= docking.steps
             displacement[np.broadcast_to(stands[:, None], displacement.shape[:3])] = 0.0
             place = np.where(stands[..., None], docked, place)
-            reach, turn = norm(displacement).max(axis=1), np.zeros((0, 0, 0))
+            path, reach, turn = place[:, None] + displacement, norm(displacement).max(axis=1), np.zeros((0, 0, 0))
             if self._shapes is not None:
-                turn, turned = self._turns(steps, docking, stop)
-                reach = self._shapes.stretch[robot] * (reach + self._shapes.outer[robot] * turned)
-            yield Stretch(place[:, None] + displacement, reach, steps.start * dt, dt, turn)
+                turn, (reading, body) = self._turns(steps, docking, stop), self._readings(docking)
+                if len(body) > len(robot):
+                    offset = self._hitched(docking, turn)
+                    path, displacement = path[:, :, reading] + offset, displacement[:, :, reading] + offset
+                    reach = norm(displacement - displacement[:, :1]).max(axis=1)
+                turned = np.abs(turn - turn[:, :1]).max(axis=1)
+                reach = self._shapes.stretch[body] * (reach + self._shapes.outer[body] * turned)
+            yield Stretch(path, reach, steps.start * dt, dt, turn)
 
 
 def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:

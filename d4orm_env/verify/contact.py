@@ -9,24 +9,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.verify.geometry import (
-    Floats,
-    box_approach,
-    box_distance,
-    closest_approach,
-    norm,
-    polygon_approach,
-    polygon_distance,
-)
+from d4orm_env.verify.geometry import Floats, closest_approach, norm
 from d4orm_env.verify.report import Violation
-
-if TYPE_CHECKING:
-    from d4orm_env.core.world import World
 
 Indices = NDArray[np.intp]
 
@@ -175,10 +163,10 @@ class Pairs(Watch):
     """Robots against each other: in every stretch those that it takes close enough to matter."""
 
     def __init__(self, robot: Indices, radius: Floats) -> None:
-        names = [f"robot_{index}" for index in range(len(radius))]
+        names = [f"robot_{index}" for index in range(int(robot.max()) + 1)]
         nobody = np.empty(0, np.intp)
         super().__init__("robot contact", robot, names, nobody, nobody)
-        self._radius = radius[robot]
+        self._radius = radius
 
     def select(self, stretch: Stretch) -> None:
         lower, upper = stretch.path.min(axis=(0, 1)), stretch.path.max(axis=(0, 1))
@@ -232,7 +220,7 @@ class Static(Watch):
     def __init__(self, kind: str, robot: Indices, radius: Floats, names: Sequence[str]) -> None:
         rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))
         super().__init__(kind, robot, names, rows, columns)
-        self._radius = radius[robot[rows]]
+        self._radius = radius[rows]
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
         distance = self.distance(stretch.path[steps, 0, self.rows[pairs]], self.columns[pairs])
@@ -257,89 +245,3 @@ class Static(Watch):
     @abstractmethod
     def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         """Smallest distance on the chords from ``start`` to ``end``, and at what fraction of them."""
-
-
-class Round(Static):
-    """Robots against circles, spheres or vertical cylinders."""
-
-    def __init__(self, robot: Indices, radius: Floats, obstacles: Floats, shape: str) -> None:
-        super().__init__("obstacle contact", robot, radius, [f"{shape}[{index}]" for index in range(len(obstacles))])
-        self._centres, self._sizes = obstacles[:, :-1], obstacles[:, -1]
-
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        return norm(self._offset(places, columns)) - self._sizes[columns]
-
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        distance, fraction = closest_approach(self._offset(start, columns), self._offset(end, columns))
-        return distance - self._sizes[columns], fraction
-
-    def _offset(self, places: Floats, columns: Indices) -> Floats:
-        # A cylinder is a circle seen from above.
-        offset: Floats = places[..., : self._centres.shape[1]] - self._centres[columns]
-        return offset
-
-
-class Boxes(Static):
-    """Robots against axis-aligned boxes."""
-
-    def __init__(self, robot: Indices, radius: Floats, boxes: Floats) -> None:
-        super().__init__("obstacle contact", robot, radius, [f"boxes[{index}]" for index in range(len(boxes))])
-        self._boxes = boxes
-
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        return box_distance(places, self._boxes[columns])
-
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        return box_approach(start, end, self._boxes[columns])
-
-
-class Polygon(Static):
-    """Robots against one polygon."""
-
-    def __init__(self, robot: Indices, radius: Floats, corners: Floats, name: str) -> None:
-        super().__init__("obstacle contact", robot, radius, [name])
-        self._corners = corners
-
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        return polygon_distance(places, self._corners)
-
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        return polygon_approach(start, end, self._corners)
-
-
-class Bounds(Static):
-    """Robots against the sides of the world."""
-
-    def __init__(self, robot: Indices, radius: Floats, lower: Floats, upper: Floats) -> None:
-        axes = "xyz"[: len(lower)]
-        names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
-        super().__init__("bounds contact", robot, radius, names)
-        self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
-        self._place = np.concatenate([lower, -upper])
-
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        axis = np.broadcast_to(self._axis[columns], places.shape[:-1])
-        value = np.take_along_axis(places, axis[..., None], axis=-1)[..., 0]
-        distance: Floats = self._sign[columns] * value - self._place[columns]
-        return distance
-
-    def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
-        before, after = self.distance(start, columns), self.distance(end, columns)
-        return np.minimum(before, after), (after < before).astype(np.float64)
-
-
-def surroundings(world: World, robot: Indices, radius: Floats) -> list[Watch]:
-    """Return a watch for each kind of obstacle there is, and for the bounds."""
-    watches: list[Watch] = []
-    for shape in ("circles", "spheres", "cylinders"):
-        obstacles = np.asarray(getattr(world, shape), np.float64)
-        if len(obstacles):
-            watches.append(Round(robot, radius, obstacles, shape))
-    if len(world.boxes):
-        watches.append(Boxes(robot, radius, np.asarray(world.boxes, np.float64)))
-    for index, corners in enumerate(world.polygons):
-        watches.append(Polygon(robot, radius, np.asarray(corners, np.float64), f"polygons[{index}]"))
-    if world.lower is not None:
-        lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
-        watches.append(Bounds(robot, radius, lower, upper))
-    return watches

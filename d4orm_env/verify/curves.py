@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch, surroundings
+from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.report import VerificationReport, Violation
+from d4orm_env.verify.surroundings import surroundings
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem

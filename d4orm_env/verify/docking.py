@@ -125,7 +125,7 @@ def heading_errors(problem: Problem, motion: TeamMotion) -> Floats:
     wanted = problem.goal_heading.astype(np.float64)
     if np.isnan(wanted).all():
         return np.full((1, len(wanted)), -np.inf)
-    turns = (motion.end_headings - wanted) / (2 * np.pi)
+    turns = (motion.end_headings[:, : len(wanted)] - wanted) / (2 * np.pi)
     return np.where(np.isnan(wanted), -np.inf, 2 * np.pi * np.abs(turns - np.round(turns)))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -51,16 +51,18 @@ class ConvexBodies:
 
     @classmethod
     def of(cls, team: Team) -> ConvexBodies:
-        """The footprints of a team."""
-        size = len(team.models)
+        """The footprints of a team: of its robots, and then of their trailers."""
+        bodies: list[Any] = [getattr(footprint, "front", footprint) for footprint in team.footprint]
+        bodies += [trailer for footprint in team.footprint for trailer in getattr(footprint, "trailers", ())]
+        size = len(bodies)
         corners, rounding, semi_axes = np.zeros((size, MAX_CORNERS, 2)), np.zeros(size), np.ones((size, 3))
-        for robot, footprint in enumerate(team.footprint):
+        for robot, footprint in enumerate(bodies):
             if team.dimension == 3:
-                semi_axes[robot] = footprint.semi_axes  # type: ignore[attr-defined] # all in space have them
+                semi_axes[robot] = footprint.semi_axes
                 continue
-            own, rounding[robot] = footprint.core  # type: ignore[attr-defined] # all in the plane have one
+            own, rounding[robot] = footprint.core
             corners[robot, : len(own)], corners[robot, len(own) :] = own, own[-1]
-        outer = team.radius.astype(np.float64)
+        outer = np.array([footprint.outer_radius for footprint in bodies]).astype(np.float32).astype(np.float64)
         return cls(corners, rounding, semi_axes, outer, semi_axes.max(axis=1) / semi_axes.min(axis=1))
 
     def take(self, index: Indices) -> ConvexBodies:
@@ -142,7 +144,7 @@ class TurningPairs(Turning, Pairs):
 
     def __init__(self, robot: Indices, shapes: ConvexBodies) -> None:
         super().__init__(robot, shapes.outer)
-        self.shapes = shapes.take(robot)
+        self.shapes = shapes
 
     def near_gap(self, stretch: Stretch, a: Indices, b: Indices) -> Floats:
         poses = [(stretch.path[0, 0, bodies], stretch.turn[0, 0, bodies]) for bodies in (a, b)]
@@ -166,7 +168,7 @@ class TurningStatic(Turning, Static):
 
     def __init__(self, kind: str, robot: Indices, shapes: ConvexBodies, names: Sequence[str]) -> None:
         super().__init__(kind, robot, shapes.outer, names)
-        self.shapes = shapes.take(robot)
+        self.shapes = shapes
 
     def distance(self, places: Floats, columns: Indices) -> Floats:
         raise NotImplementedError("the gap of a footprint is not that of its place")

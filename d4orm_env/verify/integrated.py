@@ -45,7 +45,7 @@ class Integrated:
         sizes: ``(H, R, m)`` limit plus what is cut off of each component.
         pace: ``(H, R)`` speed after each step [m/s].
         bend: ``(H, R)`` acceleration within each step [m/s^2].
-        end_headings: ``(H, R)`` headings after each step [rad]; zero for a model without one.
+        end_headings: ``(H, R, 1 + trailers)`` headings after each step [rad]; zero for a model without one.
         step_error: ``(H, R)`` what one step of Runge-Kutta per control step is off by [m].
     """
 
@@ -64,8 +64,7 @@ class Integrated:
         self.sizes: Floats = self.limits + np.moveaxis(np.abs(asked - self._commands), 0, 2)
         states = self._states(start[robots, : model.state_size].T)
         self._begins = states[:, :-1]
-        column = model.heading_index
-        self.end_headings: Floats = np.zeros_like(states[0, 1:]) if column is None else states[column, 1:]
+        self.end_headings = self._headings(states[:, 1:])
         velocity = self._call(model.functions.velocity, states[:, 1:], self._commands)
         self.pace: Floats = norm(np.moveaxis(velocity, 0, 2))
         displacement = self.displacement(slice(None), SUB_STEPS)
@@ -163,12 +162,18 @@ class Integrated:
         return np.moveaxis(np.stack(displacements), (0, 1), (1, 3))
 
     def headings(self, steps: slice, sub_steps: int) -> Floats:
-        """``(T, S+1, R)`` headings at the ends of sub-steps [rad]; zero for a model without one."""
-        column = self._model.heading_index
-        headings: Floats = np.stack(
-            [np.zeros_like(x[0]) if column is None else x[column] for x in self._within(steps, sub_steps)], axis=1
-        )
+        """``(T, S+1, R, 1 + trailers)`` headings at the ends of sub-steps [rad]; zero for a model without one."""
+        headings: Floats = np.stack([self._headings(x) for x in self._within(steps, sub_steps)], axis=1)
         return headings
+
+    def _headings(self, states: Floats) -> Floats:
+        """``(..., 1 + trailers)`` headings in states ``(n, ...)`` of the robot and of its trailers."""
+        column = self._model.heading_index
+        headings = [np.zeros_like(states[0]) if column is None else states[column]]
+        for hitch, _ in self._model.trailers:
+            headings.append(headings[-1] - states[hitch])
+        turned: Floats = np.stack(headings, axis=-1)
+        return turned
 
     def _within(self, steps: slice, sub_steps: int) -> Iterator[Floats]:
         """``(n, T, R)`` states at the ends of sub-steps, the beginning of each step first."""

@@ -45,6 +45,9 @@ class TeamMotion:
         self.max_speed, self.max_acceleration, self.max_turn_rate = (
             np.asarray(values, np.float64) for values in (team.max_speed, team.max_acceleration, team.max_turn_rate)
         )
+        models = list(enumerate(team.robot_models))
+        self.trailer_robots = [robot for robot, model in models for _ in model.trailers]
+        self.hitches = [float(team.limits[robot, column]) for robot, model in models for _, column in model.trailers]
         self.limits = self._limits()
         commands, self.sizes = self._clip(np.where(integrated[:, None], 0.0, controls[..., : self.size]))
         self._turn_rate, self._thrust = (np.where(self.wheeled, commands[..., column], 0.0) for column in (0, 1))
@@ -137,20 +140,24 @@ class TeamMotion:
         return displacement
 
     def headings(self, steps: slice, sub_steps: int) -> Floats:
-        """``(T, S+1, K)`` headings at the ends of sub-steps [rad]; zero of robots without one."""
+        """``(T, S+1, F)`` headings at the ends of sub-steps [rad], those of trailers last; zero without one."""
         time = np.linspace(0.0, self.dt, sub_steps + 1)[:, None]
         headings: Floats = self._heading[:-1][steps, None] + self._turn_rate[steps, None] * time
-        for group in self.groups:
-            headings[:, :, group.robots] = group.headings(steps, sub_steps)
-        return headings
+        return self._with_groups(headings, [group.headings(steps, sub_steps) for group in self.groups])
 
     @property
     def end_headings(self) -> Floats:
-        """``(H, K)`` headings after each step [rad]."""
-        ends: Floats = self._heading[1:].copy()
-        for group in self.groups:
-            ends[:, group.robots] = group.end_headings
-        return ends
+        """``(H, F)`` headings after each step [rad]."""
+        return self._with_groups(self._heading[1:].copy(), [group.end_headings for group in self.groups])
+
+    def _with_groups(self, headings: Floats, of_groups: list[Floats]) -> Floats:
+        """``(..., F)`` headings ``(..., K)`` with those of the integrated robots ``(..., R, 1 + trailers)`` in."""
+        trailers, robots = np.zeros((*headings.shape[:-1], len(self.trailer_robots))), np.array(self.trailer_robots)
+        for group, own in zip(self.groups, of_groups, strict=True):
+            headings[..., group.robots] = own[..., 0]
+            for column, robot in enumerate(group.robots.tolist() if own.shape[-1] > 1 else ()):
+                trailers[..., robots == robot] = own[..., column, 1:]
+        return np.concatenate([headings, trailers], axis=-1)
 
     def _wheeled_displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S, ., 2)`` the differential drives' part of :meth:`displacement`, but for its beginning."""

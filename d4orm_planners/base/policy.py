@@ -248,8 +248,7 @@ class RandomControls(StatePolicy):
         self._generator = generator(seed, Stream.RANDOM_CONTROLS)
 
     def _controls(self, joint: JointState) -> FloatArray:
-        limit = self.problem.team.control_limits
-        return self._generator.uniform(-limit, limit).astype(np.float32)
+        return np.asarray(self._generator.uniform(*self.problem.team.control_bounds), np.float32)
 
 
 def makes_policy(kind: object) -> TypeGuard[Callable[..., object]]:

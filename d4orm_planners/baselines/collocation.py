@@ -224,20 +224,19 @@ class TeamProgram:
             advance = ca.Function("advance", [x, u], [ca.vertcat(*after)]).map(self.problem.horizon)
             defect = self.states[robot] - advance(self.paths[robot][:, :-1], self.controls[robot])
             yield defect / ca.repmat(ca.DM(self.units[0][robot]), 1, self.problem.horizon), 0.0, 0.0
-            for values, components, limit in self._limited(robot):
+            for values, components, _, limit in self._limited(robot):
                 if len(components) > 1:  # of a velocity or an acceleration
                     yield ca.sum1((values[components, :] / self.unit) ** 2), -np.inf, (limit / self.unit) ** 2
 
-    def _limited(self, robot: int) -> Iterator[tuple[Expression, list[int], float]]:
-        """Variables, the components of theirs that share a limit, and that limit on their norm."""
+    def _limited(self, robot: int) -> Iterator[tuple[Expression, list[int], float, float]]:
+        """Variables, the components of theirs that share a limit, the lowest value of each, and the limit."""
         model, limits = self.models[robot], self.limits[robot]
-        if model.speed_indices:
-            yield self.states[robot], list(model.speed_indices), float(limits[SPEED])
-        for index, column in model.state_limits:
-            yield self.states[robot], [index], float(limits[column])
+        lower = model.lower_bounds(limits)
+        for column, components in model.limited_components.items():
+            yield self.states[robot], components, -float(lower[column]), float(limits[column])
         for column in dict.fromkeys(model.control_limits):
             components = [index for index, own in enumerate(model.control_limits) if own == column]
-            yield self.controls[robot], components, float(limits[column])
+            yield self.controls[robot], components, -float(lower[column]), float(limits[column])
 
     def _goal_rows(self, docks: IntArray) -> Iterator[Rows]:
         """At the step at which a robot docks it is within the goal radius, and no faster than docking allows."""
@@ -270,10 +269,11 @@ class TeamProgram:
         problem = self.problem
         states = np.full((problem.horizon + 1, problem.num_robots, problem.state_size), np.inf)
         controls = np.full((problem.horizon, problem.num_robots, problem.control_size), np.inf)
-        for robot in range(problem.num_robots):
-            for values, components, limit in self._limited(robot):
-                (states if values is self.states[robot] else controls)[:, robot, components] = limit
         low, high = CollocatedMotion(-states, -controls), CollocatedMotion(states, controls)
+        for robot in range(problem.num_robots):
+            for values, components, least, most in self._limited(robot):
+                for motion, end in ((low, least), (high, most)):
+                    (motion.states if values is self.states[robot] else motion.controls)[:, robot, components] = end
         reach = np.array([[self._reach(robot)] for robot in range(problem.num_robots)])
         low.states[:, :, : problem.dimension] = problem.world.bounds[0] + reach
         high.states[:, :, : problem.dimension] = problem.world.bounds[1] - reach

@@ -94,8 +94,7 @@ class Window:
         result = self._engine.denoise(
             self._task(now), self._rules, np.zeros_like(now.base), self._noise_scale, config.num_samples, seed
         )
-        limit = problem.team.control_limits
-        sampled = np.clip(now.base + result.mean, -limit, limit).astype(np.float32)
+        sampled = np.clip(now.base + result.mean, *problem.team.control_bounds).astype(np.float32)
         controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
         radius = docking_radius(problem, self._docks)
         joint, horizon = now.joint, config.predict_horizon

@@ -138,8 +138,7 @@ class D4ormC2F(StatePolicy):
             controls = np.where(standing.robots[:, None], probe, controls)
         if self.config.control_noise_std:
             noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
-            limit = self.problem.team.control_limits
-            controls = np.clip(controls + noise, -limit, limit).astype(np.float32)
+            controls = np.clip(controls + noise, *self.problem.team.control_bounds).astype(np.float32)
         self._deviation.expect(controls)
         return controls
 

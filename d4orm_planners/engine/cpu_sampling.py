@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.bodies import Body
 from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
 from d4orm_env.engine import noise
 from d4orm_env.engine.cpu import CpuEngine, typed
@@ -85,7 +86,7 @@ def _nobody(task: SamplingTask) -> MovingObstacles:
 
 
 def _discs(radius: FloatArray) -> FootprintArrays:
-    return as_arrays(tuple(Disc(size) for size in radius.tolist()), [None] * len(radius))
+    return as_arrays([Body(number, Disc(size), None, 0.0) for number, size in enumerate(radius.tolist())])
 
 
 class Sampling:
@@ -111,7 +112,8 @@ class Sampling:
             penalties=task.penalties,
             per_pair=task.penalty_per_pair,
         )
-        self.shaped = self.arrays.footprints is not None
+        footprints = self.arrays.footprints
+        self.num_bodies = 0 if footprints is None else len(footprints.heading)
         self.seed = np.array(noise.seed_words(seed), np.uint32)
         self.rewards = np.empty((problem.num_robots, num_samples), np.float32)
         num_tiles, pairs = -(-num_samples // TILE), (problem.control_size + 1) // 2
@@ -120,7 +122,7 @@ class Sampling:
     def space(self, first: int) -> score.Workspace:
         """The workspace of the thread whose tiles begin with this number."""
         if first not in self.spaces:
-            self.spaces[first] = score.make_workspace(self.base.shape, self.arrays.goal.shape[1], self.shaped)
+            self.spaces[first] = score.make_workspace(self.base.shape, self.arrays.goal.shape[1], self.num_bodies)
         return self.spaces[first]
 
     def score(self, step: int, mean: FloatArray, scale: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import simd
 from d4orm_env.engine.compiling import ZERO, aligned_zeros, compiled, inlined
-from d4orm_env.engine.footprint_contacts import angle_of, bodies_within, refine_pair
+from d4orm_env.engine.footprint_contacts import POSE, meets_body, refine_chunk
 from d4orm_env.engine.obstacles import may_touch
 from d4orm_env.engine.simd import (
     BLOCK,
@@ -79,7 +79,7 @@ class Bodies(NamedTuple):
         boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
             margin.
         footprints: Theirs, or ``None`` where all bodies and robots are discs.
-        headings: ``(H, O)``, or ``(0, 0)`` where all are discs.
+        headings: ``(H, F)`` of their bodies and trailers, or ``(H, 0)`` where all are discs.
     """
 
     places: FloatArray
@@ -119,7 +119,7 @@ def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
     blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
     blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
     boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
-    headings = np.zeros((0, 0)) if moving.headings is None else moving.headings
+    headings = np.zeros((num_steps, 0)) if moving.headings is None else moving.headings
     return Bodies(places, radius, boxes, moving.footprints, np.array(headings, np.float32, order="C"))
 
 
@@ -134,10 +134,14 @@ def place_of(k: Whole, step: int, dimension: int) -> Whole:
     return (k * BLOCK + step) * dimension * TILE
 
 
+POSES = BLOCK * POSE * TILE
+"""Numbers of a body's poses in a block."""
+
+
 @inlined
-def turn_of(k: Whole, step: int) -> Whole:
-    """Return where the row of robot ``k``'s headings after a step of the block begins."""
-    return (k * BLOCK + step) * TILE
+def pose_of(step: int) -> Whole:
+    """Return where the rows of a body's pose after a step of the block begin, among its :data:`POSES`."""
+    return step * POSE * TILE
 
 
 @inlined
@@ -208,8 +212,16 @@ def _count(digits: int, k: Whole, step: int, touch: np.uint64, near: NDArray[np.
     near[digits - 1, k, step] |= touch
 
 
+@inlined
+def _undecided(f: FootprintArrays | None, digits: int, both: np.uint64, chunk: int, touch: np.uint64) -> np.uint64:
+    """Leave out of ``touch`` where both robots are known to be near something, if one thing counts as much as two."""
+    if f is None:
+        return touch
+    return touch & ~(both >> np.uint64(chunk)) if digits == 1 else touch
+
+
 @compiled
-def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, turns: FloatArray, s: Scratch) -> None:
+def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, poses: FloatArray, s: Scratch) -> None:
     """Count robots within the margin of those on their lists."""
     radius, margin, dimension = arrays.radius, arrays.margin, arrays.goal.shape[1]
     use_wide_registers()
@@ -224,9 +236,10 @@ def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, turns: 
                 for step in range(BLOCK):
                     a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
                     touch = _near_pair(reach, a, b, dimension, places)
-                    own, its, f = turn_of(k, step) + chunk, turn_of(other, step) + chunk, arrays.footprints
-                    touch = refine_pair(
-                        f, arrays, k, other, touch, margin, dimension, places, a, b, turns, own, its, s.buffer
+                    f, begin = arrays.footprints, pose_of(step) + chunk
+                    touch = _undecided(f, digits, s.near[0, k, step] & s.near[0, other, step], chunk, touch)
+                    touch = refine_chunk(
+                        f, k, other, touch, margin, dimension, places, a, b, poses, POSES, begin, s.buffer
                     )
                     touch <<= np.uint64(chunk)
                     _count(digits, k, step, touch, s.near)
@@ -235,7 +248,7 @@ def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, turns: 
 
 @compiled
 def _mark_bodies(
-    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, turns: FloatArray,
+    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, poses: FloatArray,
     s: Scratch,
 ) -> None:  # fmt: skip
     """Count moving bodies within the margin of robots."""
@@ -250,9 +263,9 @@ def _mark_bodies(
                     begin = place_of(k, step, dimension)
                     rows = places[begin : place_of(k, step + 1, dimension)]
                     touch = near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
-                    f, turn = arrays.footprints, turn_of(k, step)
+                    f, begin = arrays.footprints, pose_of(step)
                     touch = _refine_body(
-                        f, bodies.footprints, arrays, bodies, body, first + step, k, touch, rows, turns, turn, s
+                        f, bodies.footprints, arrays, bodies, body, first + step, k, touch, rows, poses, begin, s
                     )
                     _count(digits, k, step, touch, s.near)
 
@@ -260,22 +273,21 @@ def _mark_bodies(
 @compiled
 def _refine_body(
     f: FootprintArrays | None, others: Any, arrays: ProblemArrays, bodies: Bodies, body: int, t: int,
-    k: int, near: np.uint64, rows: FloatArray, turns: FloatArray, turn: Whole, s: Scratch,
+    k: int, near: np.uint64, rows: FloatArray, poses: FloatArray, begin: Whole, s: Scratch,
 ) -> np.uint64:  # fmt: skip
     """Return where, of the samples ``near``, robot ``k`` is within the margin of a body at time ``t``."""
     if f is None:
         return near
     sure, dimension = near, arrays.goal.shape[1]
-    angle = bodies.headings[t, body] if bodies.headings.shape[0] > 0 else ZERO
+    turns = bodies.headings[t]
     for sample in range(TILE):
         bit = np.uint64(1) << np.uint64(sample)
         if near & bit == NOWHERE:
             continue
         x, y = bodies.places[t, body, 0] - rows[sample], bodies.places[t, body, 1] - rows[TILE + sample]
         z = bodies.places[t, body, 2] - rows[2 * TILE + sample] if dimension == 3 else ZERO
-        own_angle = angle_of(f, k, turns, turn + sample)
-        if not bodies_within(
-            f, k, arrays.radius[k], own_angle, others, body, bodies.radius[body], angle,
+        if not meets_body(
+            f, k, arrays.radius[k], poses, POSES, begin + sample, others, body, bodies.radius[body], turns,
             x, y, z, dimension == 2, arrays.margin, s.buffer,
         ):  # fmt: skip
             sure &= ~bit
@@ -284,7 +296,7 @@ def _refine_body(
 
 @inlined
 def mark_robots(
-    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, turns: FloatArray,
+    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, poses: FloatArray,
     s: Scratch,
 ) -> None:  # fmt: skip
     """Count in ``s.near`` robots and bodies within the margin of each robot in a block.
@@ -296,15 +308,15 @@ def mark_robots(
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
         places: Rows of places, see :func:`place_of`.
-        turns: Rows of headings, see :func:`turn_of`; of size zero where all bodies are discs.
+        poses: Rows of poses, see :func:`pose_of`; of size zero where all bodies are discs.
         s: Scratch with the boxes of the robots in this block.
     """
     s.near[:digits] = NOWHERE
     dimension = bodies.places.shape[2]
     _list_near(dimension, s)
-    _mark_listed(arrays, digits, places, turns, s)
+    _mark_listed(arrays, digits, places, poses, s)
     if bodies.places.shape[1] > 0:
-        _mark_bodies(arrays, bodies, digits, first, count, places, turns, s)
+        _mark_bodies(arrays, bodies, digits, first, count, places, poses, s)
 
 
 @inlined

@@ -23,7 +23,7 @@ class MovingObstacles(NamedTuple):
         positions: ``(H, O, d)`` where each body is after every step [m].
         radius: ``(O,)`` [m]; outer radii of bodies that are no discs.
         footprints: Theirs; ``None`` where all are discs.
-        headings: ``(H, O)`` what turns them [rad], or ``None`` where all are discs.
+        headings: ``(H, F)`` what turns them and their trailers [rad], or ``None`` where all are discs.
     """
 
     positions: FloatArray
@@ -34,7 +34,7 @@ class MovingObstacles(NamedTuple):
 
 def moving_robots(team: Team, states: FloatArray) -> MovingObstacles:
     """The robots of a team as moving obstacles; ``states`` ``(H, K, n)`` are theirs after every step."""
-    turning = team.headings(states) if team.shapes else None
+    turning = team.body_poses(states)[..., -1].astype(np.float32) if team.shapes else None
     return MovingObstacles(states[..., : team.dimension], team.radius, team.footprint_arrays, turning)
 
 

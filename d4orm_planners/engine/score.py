@@ -26,7 +26,7 @@ from d4orm_env.engine import obstacles
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.footprint_contacts import refine_static
+from d4orm_env.engine.footprint_contacts import place_bodies, refine_static
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.sample_noise import TURN, VECTOR, Drawing, draw_block, fill_keys
 from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
@@ -34,6 +34,7 @@ from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_steppe
 from d4orm_env.engine.tile_layout import READ, WRITE, Row
 from d4orm_planners.engine.proximity import (
     DIGITS,
+    POSES,
     Bodies,
     Scratch,
     enclose,
@@ -41,7 +42,7 @@ from d4orm_planners.engine.proximity import (
     mark_robots,
     near_static,
     place_of,
-    turn_of,
+    pose_of,
 )
 
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
@@ -65,7 +66,7 @@ class Workspace(NamedTuple):
         keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
         standing: ``(K,)`` whether a robot has docked in all samples.
         scratch: Scratch of :mod:`~d4orm_planners.engine.proximity`.
-        turns: ``(K BLOCK TILE,)`` headings of the robots in a block, or of size zero where all bodies are discs.
+        poses: ``(F POSES,)`` poses of the ``F`` bodies in a block, or of size zero where all are discs.
     """
 
     w: FloatArray
@@ -76,7 +77,7 @@ class Workspace(NamedTuple):
     keys: NDArray[np.uint32]
     standing: BoolArray
     scratch: Scratch
-    turns: FloatArray
+    poses: FloatArray
 
 
 class Scoring(NamedTuple):
@@ -103,14 +104,14 @@ Score: TypeAlias = Kernel[[ProblemArrays, Scoring, Drawing, IntArray, Workspace,
 """A kernel of :func:`score_kernel`."""
 
 
-def make_workspace(shape: tuple[int, ...], dimension: int, shaped: bool) -> Workspace:
-    """A workspace for controls of this shape, ``(H, K, m)``; ``shaped`` if some footprint is no disc."""
+def make_workspace(shape: tuple[int, ...], dimension: int, num_bodies: int) -> Workspace:
+    """A workspace for controls of this shape, ``(H, K, m)``, and so many bodies: none if all are discs."""
     num_steps, num_robots, num_controls = shape
     return Workspace(
         aligned_zeros(num_robots * STRIDE), aligned_zeros(num_robots * BLOCK * dimension * TILE),
         aligned_zeros(BLOCK * 4 * DRAWS), aligned_zeros(BLOCK * CONTROL_ROWS * TILE), aligned_zeros(DOCKED * TILE),
         np.empty((2, num_robots * num_steps * ((num_controls + 1) // 2)), np.uint32), np.empty(num_robots, np.bool_),
-        make_scratch(num_robots, dimension), aligned_zeros(num_robots * BLOCK * TILE if shaped else 0),
+        make_scratch(num_robots, dimension), aligned_zeros(num_bodies * POSES),
     )  # fmt: skip
 
 
@@ -131,13 +132,13 @@ def _runner(name: str) -> Callable[..., None]:
     read_x, write_x = READ[model.state_size], WRITE[model.state_size]
     read_u, write_u = READ[model.control_size], WRITE[model.control_size]
     turn, vector, dimension = TURN[model.control_size], VECTOR[model.control_size], model.dimension
-    num_limits, heading = len(model.limit_names), model.heading_index or 0
+    num_limits = len(model.limit_names)
 
     @compiled
     def run(
         all_limits: FloatArray, h: TimeStep, docking: Docking, goal: Row, inverse: np.float32,
         offset: FloatArray, scale: FloatArray, draws: FloatArray, controls: FloatArray, moved: FloatArray,
-        places: FloatArray, turns: FloatArray, w: FloatArray,
+        places: FloatArray, f: FootprintArrays | None, k: int, poses: FloatArray, w: FloatArray,
     ) -> None:  # fmt: skip
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
@@ -166,8 +167,8 @@ def _runner(name: str) -> Callable[..., None]:
                 w[DOCKED * TILE + s] = ONE if docked else ZERO
                 w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
             _copy(w[: dimension * TILE], places[i * dimension * TILE : (i + 1) * dimension * TILE])
-            if turns.shape[0] > 0:
-                _copy(w[heading * TILE : (heading + 1) * TILE], turns[i * TILE : (i + 1) * TILE])
+            if f is not None:
+                place_bodies(f, k, w, poses, POSES, pose_of(i))
 
     return run
 
@@ -211,10 +212,11 @@ def _stay(dimension: int, w: FloatArray, places: FloatArray) -> None:
 
 
 @inlined
-def _stay_turned(f: FootprintArrays | None, k: int, w: FloatArray, turns: FloatArray) -> None:
-    """Fill the headings of every step of a block with the robot's."""
+def _stay_turned(f: FootprintArrays | None, k: int, w: FloatArray, poses: FloatArray) -> None:
+    """Fill the poses of every step of a block with the robot's."""
     if f is not None:
-        _stay(1, w[max(f.heading[k], 0) * TILE :], turns)
+        for step in range(BLOCK):
+            place_bodies(f, k, w, poses, POSES, pose_of(step))
 
 
 @inlined
@@ -242,7 +244,7 @@ def _score_tile(
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
     w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
     moved, keys, scratch, offset, scale = space.moved, space.keys, space.scratch, drawing.offset, drawing.scale
-    turns, footprints = space.turns, arrays.footprints
+    poses, footprints = space.poses, arrays.footprints
     penalties, bounds, digits = scoring.penalties, scoring.bounds, DIGITS if scoring.per_pair else 1
     num_steps, num_robots, num_controls = offset.shape
     num_pairs = (num_controls + 1) // 2
@@ -262,17 +264,16 @@ def _score_tile(
             draw_block(keys, counter, stream, count, num_pairs, kept, draws)
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             own_places = places[place_of(k, 0, dimension) : place_of(k + 1, 0, dimension)]
-            own_turns = turns[turn_of(k, 0) : turn_of(k + 1, 0)] if turns.shape[0] > 0 else turns
             if standing[k]:
                 _stay(dimension, robot, own_places)
-                _stay_turned(footprints, k, robot, own_turns)
+                _stay_turned(footprints, k, robot, poses)
                 enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
                 continue
             goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
             last, docking = first + count, docking_of(arrays, k)
             run_robot(
                 codes[k], all_limits[k], h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k],
-                draws, controls, moved, own_places, own_turns, robot,
+                draws, controls, moved, own_places, footprints, k, poses, robot,
             )  # fmt: skip
             # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags
             # towards static obstacles.
@@ -286,12 +287,12 @@ def _score_tile(
                 for step in range(count):
                     rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
                     touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.buffer)
-                    turn, buffer = step * TILE, scratch.buffer
-                    touch = refine_static(footprints, arrays, k, touch, margin, rows, 0, own_turns, turn, buffer)
+                    begin, buffer = pose_of(step), scratch.buffer
+                    touch = refine_static(footprints, arrays, k, touch, margin, rows, poses, POSES, begin, buffer)
                     steps = np.float32(1 + rest if step == count - 1 else 1)
                     subtract_where(robot, TOTAL * TILE, touch, steps * penalties[k])
         if scoring.collisions:
-            mark_robots(arrays, scoring.bodies, digits, first, count, places, turns, scratch)
+            mark_robots(arrays, scoring.bodies, digits, first, count, places, poses, scratch)
             _punish_near(scratch.near, digits, count, penalties, w)
 
 

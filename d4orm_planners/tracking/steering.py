@@ -116,8 +116,7 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
 
     controls = _by_rows(problem, problem.control_size, (states, velocities), law)
     # The norm may come out above the limit by a rounding error.
-    limit = problem.team.control_limits
-    return np.clip(controls, -limit, limit)
+    return np.clip(controls, *problem.team.control_bounds)
 
 
 def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:

@@ -22,15 +22,12 @@ from d4orm_env.engine.choice import get_engine
 JAX_OPS = Ops(jnp.cos, jnp.sin, jnp.sqrt, jnp.minimum, jnp.maximum, jnp.arctan2, jnp.where)
 LIMITS = (2.0, 1.0, 0.5)
 """Speed, acceleration, turn rate: all different, so that none can stand for another."""
-CAR_LIMITS = (*LIMITS, 0.6, 1.5, 0.25)
-"""And steering, steering rate and wheelbase."""
+CAR_LIMITS = (*LIMITS, 0.6, 1.5, 0.25, 0.5, 0.4, 0.6, 0.45, 0.7, 0.5)
+"""And steering, steering rate and wheelbase; what other models have for themselves takes the same numbers."""
 
 
 def test_the_registry_is_consistent() -> None:
     # A code is part of what a problem's digest says.
-    built_in = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle", "car")
-    assert tuple(MODELS) == tuple(MODEL_CODES) == built_in
-    assert list(MODEL_CODES.values()) == [0, 1, 2, 3, 4, 5]
     sizes = {name: (model.dimension, model.state_size, model.control_size) for name, model in MODELS.items()}
     assert sizes == {
         "holonomic2d": (2, 4, 2),
@@ -39,7 +36,16 @@ def test_the_registry_is_consistent() -> None:
         "differential_drive": (2, 4, 2),
         "unicycle": (2, 3, 2),
         "car": (2, 5, 2),
+        "unicycle1": (2, 3, 2),
+        "unicycle2": (2, 5, 2),
+        "holonomic2d_jerk": (2, 6, 2),
+        "holonomic3d_drag": (3, 6, 3),
+        "car_with_1_trailer": (2, 4, 2),
+        "car_with_2_trailers": (2, 5, 2),
+        "car_with_3_trailers": (2, 6, 2),
     }
+    assert tuple(MODELS) == tuple(MODEL_CODES) == tuple(sizes)
+    assert list(MODEL_CODES.values()) == list(range(len(sizes)))
     for name, model in MODELS.items():
         assert get_model(name) is model
         assert model.name == name
@@ -51,8 +57,8 @@ def test_the_registry_is_consistent() -> None:
 
 
 def test_heading_and_speed_are_where_the_model_says() -> None:
-    assert [model.heading_index for model in MODELS.values()] == [None, None, None, 2, 2, 2]
-    assert [model.speed_indices for model in MODELS.values()] == [(2, 3), (3, 4, 5), (), (3,), (), (3,)]
+    assert [model.heading_index for model in MODELS.values()][:6] == [None, None, None, 2, 2, 2]
+    assert [model.speed_indices for model in MODELS.values()][:6] == [(2, 3), (3, 4, 5), (), (3,), (), (3,)]
 
 
 def test_an_unknown_model_is_named_with_those_there_are() -> None:
@@ -79,6 +85,14 @@ def test_an_unknown_model_is_named_with_those_there_are() -> None:
         # It turns at v tan(steering) / wheelbase, here 2 * 1 / 0.25.
         ("car", (1, 2, math.pi / 2, 2, math.pi / 4), (5, 6), (0, 2, 8, 5, 6), (0, 2)),
         ("car", (1, 2, 0, -2, math.pi / 4), (5, 6), (-2, 0, -8, 5, 6), (-2, 0)),
+        ("unicycle1", (1, 2, math.pi / 6), (4, 5), (4 * math.sqrt(0.75), 2, 5), (4 * math.sqrt(0.75), 2)),
+        ("unicycle2", (1, 2, math.pi / 2, 3, 4), (5, 6), (0, 3, 4, 5, 6), (0, 3)),
+        ("holonomic2d_jerk", (1, 2, 3, 4, 5, 6), (7, 8), (3, 4, 5, 6, 7, 8), (3, 4)),
+        # Backwards at 0.5 m/s with sin(pi / 6) = 1/2, over 0.4 m.
+        ("car_with_1_trailer", (1, 2, 0, math.pi / 6), (-0.5, 0), (-0.5, 0, 0, 0.625), (-0.5, 0)),
+        ("car_with_1_trailer", (1, 2, 0, 0), (0.5, math.pi / 4), (0.5, 0, 2, 2), (0.5, 0)),
+        # A drag of 0.6 / s.
+        ("holonomic3d_drag", (1, 2, 3, 10, 20, -5), (7, 8, 9), (10, 20, -5, 1, -4, 12), (10, 20, -5)),
     ],
 )
 def test_derivatives_and_velocities(name: str, x: Any, u: Any, derivative: Any, velocity: Any) -> None:
@@ -103,6 +117,11 @@ def test_derivatives_and_velocities(name: str, x: Any, u: Any, derivative: Any, 
         ("differential_drive", (0.4, 3.0), (0.4, 1.0)),
         ("unicycle", (-3.0, 0.7), (-2.0, 0.5)),  # speed and turn rate
         ("car", (-3.0, 2.0), (-1.0, 1.5)),  # acceleration and steering rate
+        ("unicycle1", (-3.0, 0.7), (-0.6, 0.5)),  # backwards it has limits of its own
+        ("unicycle1", (3.0, -2.0), (2.0, -1.5)),
+        ("unicycle2", (-3.0, 2.0), (-1.0, 0.25)),
+        ("car_with_2_trailers", (-3.0, 2.0), (-1.5, 0.6)),
+        ("holonomic2d_jerk", (3.0, 4.0), (0.36, 0.48)),
     ],
 )
 def test_control_limits(name: str, u: Any, limited: Any) -> None:
@@ -121,6 +140,10 @@ def test_control_limits(name: str, u: Any, limited: Any) -> None:
         ("unicycle", (7.0, 8.0, 9.0), (7.0, 8.0, 9.0)),
         ("car", (7.0, 8.0, 9.0, -2.5, 0.7), (7.0, 8.0, 9.0, -2.0, 0.6)),
         ("car", (7.0, 8.0, 9.0, 1.5, -0.7), (7.0, 8.0, 9.0, 1.5, -0.6)),
+        ("unicycle2", (7.0, 8.0, 9.0, -2.5, 0.7), (7.0, 8.0, 9.0, -0.6, 0.5)),
+        ("unicycle2", (7.0, 8.0, 9.0, 2.5, -1.6), (7.0, 8.0, 9.0, 2.0, -1.5)),
+        ("car_with_3_trailers", (7.0, 8.0, 9.0, 1.0, -1.0, 0.3), (7.0, 8.0, 9.0, 0.5, -0.6, 0.3)),
+        ("holonomic2d_jerk", (7.0, 8.0, 3.0, -4.0, 3.0, 4.0), (7.0, 8.0, 1.2, -1.6, 0.6, 0.8)),
     ],
 )
 def test_speed_limits(name: str, x: Any, limited: Any) -> None:
@@ -136,6 +159,9 @@ def test_speed_limits(name: str, x: Any, limited: Any) -> None:
         ("differential_drive", (1, 2, 3, 4), (1, 2, 3, 0)),
         ("unicycle", (1, 2, 3), (1, 2, 3)),
         ("car", (1, 2, 3, 4, 5), (1, 2, 3, 0, 5)),
+        ("unicycle2", (1, 2, 3, 4, 5), (1, 2, 3, 0, 0)),
+        ("car_with_2_trailers", (1, 2, 3, 4, 5), (1, 2, 3, 4, 5)),
+        ("holonomic2d_jerk", (1, 2, 3, 4, 5, 6), (1, 2, 0, 0, 0, 0)),
     ],
 )
 def test_rest_keeps_place_and_heading(name: str, x: Any, rest: Any) -> None:
@@ -151,10 +177,12 @@ def test_limited_controls_keep_the_limits_and_the_direction(name: str, data: st.
     limited = model.functions.limit_control(u, CAR_LIMITS, PYTHON_OPS)
     again = model.functions.limit_control(limited, CAR_LIMITS, PYTHON_OPS)
     assert again == pytest.approx(limited, rel=1e-12, abs=1e-300)
-    assert all(abs(v) <= CAR_LIMITS[column] * (1 + 1e-12) for v, column in zip(limited, model.control_limits))
+    lower = model.lower_bounds(list(CAR_LIMITS))
+    bounds = [(-lower[column], CAR_LIMITS[column]) for column in model.control_limits]
+    assert all(a * (1 + 1e-12) <= v <= b * (1 + 1e-12) for v, (a, b) in zip(limited, bounds))
     assert all(v * w >= 0 and abs(v) <= abs(w) * (1 + 1e-12) for v, w in zip(limited, u))
     if len(set(model.control_limits)) == 1:
-        assert math.hypot(*limited) <= LIMITS[model.control_limits[0]] * (1 + 1e-12)
+        assert math.hypot(*limited) <= CAR_LIMITS[model.control_limits[0]] * (1 + 1e-12)
         # Parallel to what was asked for.
         assert math.hypot(*u) * math.hypot(*limited) == pytest.approx(sum(v * w for v, w in zip(limited, u)), abs=1e-9)
 
@@ -164,7 +192,7 @@ def cases(name: str) -> list[tuple[np.ndarray, np.ndarray]]:
     model, generator = MODELS[name], np.random.default_rng(1)
     reach = np.full(model.state_size, 3.0)
     for index, column in model.state_limits:
-        reach[index] = CAR_LIMITS[column]
+        reach[index] = CAR_LIMITS[column] / 2
     return [(generator.uniform(-reach, reach), generator.uniform(-2, 2, model.control_size)) for _ in range(20)]
 
 

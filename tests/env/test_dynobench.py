@@ -106,10 +106,25 @@ def test_what_is_wrong_is_told(instance: Path, old: str, new: str, message: str)
         load_dynobench(instance)
 
 
-def test_limits_that_are_not_symmetric_are_refused(instance: Path) -> None:
-    forward = {"dynamics": "unicycle1", "max_vel": 0.5, "min_vel": 0.25, "shape": "box", "size": [0.5, 0.25]}
-    with pytest.raises(ValueError, match=r"robot type unicycle1_v0: min_vel is 0\.25; limits here are symmetric"):
-        load_dynobench(instance, models={"unicycle1_v0": forward})
+def test_limits_that_are_not_symmetric_are_taken(instance: Path) -> None:
+    slow = {"dynamics": "unicycle1", "max_vel": 0.5, "min_vel": -0.1, "max_angular_vel": 0.5, "min_angular_vel": -0.25}
+    shape = {"shape": "box", "size": [0.5, 0.25]}
+    team = load_dynobench(instance, models={"unicycle1_v0": slow | shape}).team
+    assert team.models == ("unicycle", "unicycle1", "holonomic2d")
+    np.testing.assert_allclose(team.control_bounds[:, 1], np.float32([[-0.1, -0.25], [0.5, 0.5]]))
+    with pytest.raises(ValueError, match=r"robot type unicycle1_v0: min_vel is 0\.25; it must be negative"):
+        load_dynobench(instance, models={"unicycle1_v0": slow | shape | {"min_vel": 0.25}})
+
+
+def test_a_unicycle_of_second_order_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    robots = "robots: [{type: unicycle_second_order_0, start: [1, 2.5, 0, 0.25, 0], goal: [4, 2.5, 3.14, 0, 0]}]\n"
+    path.write_text("environment: {min: [0, 0], max: [5, 5]}\n" + robots)
+    problem = load_dynobench(path)
+    assert problem.team.models == ("unicycle2",)
+    assert problem.start[0].tolist() == [1, 2.5, 0, 0.25, 0]
+    assert problem.team.limits[0].tolist() == [0.5, 0.25, 0.5, 0.5, 0.5, 0.25]
+    assert problem.goal_heading[0] == np.float32(3.14)
 
 
 def test_other_models_have_no_result_file(tmp_path: Path) -> None:

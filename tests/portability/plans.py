@@ -15,6 +15,7 @@ import numpy as np
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.disturbances import Disturbance, Intruder, Push
+from d4orm_env.footprints import Box, Footprint
 from d4orm_planners import make_planner, make_policy, run_episode
 
 
@@ -27,6 +28,8 @@ class Case(NamedTuple):
     arguments: dict[str, Any]
     max_iterations: int = 2
     disturbances: tuple[Disturbance[Any], ...] = ()
+    footprint: Footprint | None = None
+    """Of all robots, which then have to face along x at their goals."""
 
 
 CASES = {
@@ -48,7 +51,11 @@ CASES = {
     "first-order robots": Case("d4orm", {}, "circle", {"num_robots": 6, "model": "velocity2d"}),
     "unicycles": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "unicycle"}),
     "cars": Case("d4orm", {}, "circle", {"num_robots": 4, "model": "car"}),
+    "boxes that face their goals": Case(
+        "d4orm", {}, "circle", {"num_robots": 6, "model": "differential_drive"}, footprint=Box(0.4, 0.2, 0.05)
+    ),
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
+    "in space with drag": Case("d4orm", {}, "sphere", {"num_robots": 4, "model": "holonomic3d_drag"}),
     "among walls": Case("hybrid", {"improve": True}, "rooms", {"num_robots": 8}, 3),
     "a roundabout": Case("hybrid", {"improve": True}, "circle", {"num_robots": 6}, 3),
     "amswarm": Case("amswarm", {}, "amswarm_3", {}, 1),
@@ -66,6 +73,9 @@ QUICK = ("d4orm", "hybrid", "mppi", "cem", "mixed models")
 def digest(case: Case) -> str:
     """The problem, the controls and the states that they lead to, as 16 hexadecimal digits."""
     problem = make_problem(case.scenario, seed=0, goal_speed=np.inf, **case.arguments)
+    if case.footprint is not None:
+        team = problem.team.replace(footprint=case.footprint)
+        problem = problem.replace(team=team, goal_heading=np.zeros(team.num_robots))
     if case.disturbances:
         env = navigation_v0.parallel_env(problem=problem, disturbances=case.disturbances)
         done = run_episode(env, make_policy(case.planner, engine="cpu", **case.settings), seed=1)

@@ -150,13 +150,23 @@ class Painter {
     if (edge) { this.pen.strokeStyle = edge; this.pen.stroke(); }
   }
 
-  /** A robot: a disc, or its outline turned by its heading. */
+  /** A robot: a disc, or its outline turned by its heading, and its trailers behind it. */
   body(moment, robot, place, style, edge) {
     const { scene } = this;
     if (!scene.outlines) return this.disc(place, scene.radius[robot], style, edge);
-    const index = scene.heading[robot], angle = index === null ? 0 : scene.between(moment, robot, index, true);
+    const index = scene.heading[robot];
+    let angle = index === null ? 0 : scene.between(moment, robot, index, true);
+    this.shape(scene.outlines[robot], place, angle, style, edge);
+    for (const { outline, hitch, length } of scene.trailers[robot]) {
+      angle -= scene.between(moment, robot, hitch, true);
+      place = [place[0] - length * Math.cos(angle), place[1] - length * Math.sin(angle), place[2]];
+      this.shape(outline, place, angle, style, edge);
+    }
+  }
+
+  shape(outline, place, angle, style, edge) {
     const c = Math.cos(angle), s = Math.sin(angle);
-    this.trace(scene.outlines[robot].map(([x, y]) => [place[0] + c * x - s * y, place[1] + s * x + c * y, place[2]]));
+    this.trace(outline.map(([x, y]) => [place[0] + c * x - s * y, place[1] + s * x + c * y, place[2]]));
     this.pen.closePath();
     this.pen.fillStyle = style; this.pen.fill();
     this.pen.strokeStyle = edge; this.pen.stroke();

@@ -1,0 +1,154 @@
+"""Exact tests of convex bodies, compiled with numba: cores of the plane one at a time, and ellipsoids.
+
+Two convex cores are apart by more than a reach where one of their axes tells (the separating axis theorem, which along
+a unit axis bounds the distance), overlap where none tells anything, and are otherwise as near as some corner of one is
+to some edge of the other. All is computed relative to the robot, so that large coordinates cost no precision. In space
+ellipsoids keep their axes along those of the world; see :func:`balls_within`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Whole
+from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.dynamics import collision
+from d4orm_env.engine.compiling import ONE, ZERO, compiled
+from d4orm_env.engine.elementary import OPS
+
+_HALF = np.float32(0.5)
+
+# Parts of a placed core: a row of a buffer of TILE numbers.
+COUNT, NUM_AXES, ROUNDING, CORNERS, AXES, EXTENTS = 0, 1, 2, 3, 19, 35
+BISECTIONS = 16
+"""Steps by which the best weight of two ellipsoids is found: to 2^-16, where the criterion is flat."""
+
+
+@compiled
+def place_disc(radius: np.float32, x: np.float32, y: np.float32, core: FloatArray) -> None:
+    """Write a disc at ``(x, y)``."""
+    core[COUNT], core[NUM_AXES], core[ROUNDING] = ONE, ZERO, radius
+    core[CORNERS], core[CORNERS + 1] = x, y
+
+
+@compiled
+def place_body(
+    f: FootprintArrays, i: Whole, c: np.float32, s: np.float32, x: np.float32, y: np.float32, core: FloatArray
+) -> None:
+    """Write body ``i`` at ``(x, y)``, its heading as a unit vector ``(c, s)``."""
+    core[COUNT], core[NUM_AXES], core[ROUNDING] = f.num_corners[i], f.num_axes[i], f.rounding[i]
+    for j in range(f.num_corners[i]):
+        core[CORNERS + 2 * j] = x + (c * f.corners[i, j, 0] - s * f.corners[i, j, 1])
+        core[CORNERS + 2 * j + 1] = y + (s * f.corners[i, j, 0] + c * f.corners[i, j, 1])
+    for j in range(f.num_axes[i]):
+        along_x, along_y = c * f.axes[i, j, 0] - s * f.axes[i, j, 1], s * f.axes[i, j, 0] + c * f.axes[i, j, 1]
+        core[AXES + 2 * j], core[AXES + 2 * j + 1] = along_x, along_y
+        core[EXTENTS + j] = f.extents[i, j] + (along_x * x + along_y * y)
+
+
+@compiled
+def place_box(boxes: FloatArray, i: Whole, x: np.float32, y: np.float32, core: FloatArray) -> None:
+    """Write a rounded box of the plane, seen from ``(x, y)``."""
+    left, low, right, high = boxes[i, 0] - x, boxes[i, 1] - y, boxes[i, 2] - x, boxes[i, 3] - y
+    core[COUNT], core[NUM_AXES], core[ROUNDING] = np.float32(4), np.float32(4), boxes[i, 4]
+    core[CORNERS], core[CORNERS + 1], core[CORNERS + 2], core[CORNERS + 3] = left, low, right, low
+    core[CORNERS + 4], core[CORNERS + 5], core[CORNERS + 6], core[CORNERS + 7] = right, high, left, high
+    core[AXES], core[AXES + 1], core[AXES + 2], core[AXES + 3] = -ONE, ZERO, ONE, ZERO
+    core[AXES + 4], core[AXES + 5], core[AXES + 6], core[AXES + 7] = ZERO, -ONE, ZERO, ONE
+    core[EXTENTS], core[EXTENTS + 1], core[EXTENTS + 2], core[EXTENTS + 3] = -left, right, -low, high
+
+
+@compiled
+def place_triangle(triangles: FloatArray, i: Whole, x: np.float32, y: np.float32, core: FloatArray) -> None:
+    """Write a triangle, seen from ``(x, y)``."""
+    core[COUNT], core[NUM_AXES], core[ROUNDING] = np.float32(3), np.float32(3), ZERO
+    for j in range(3):
+        core[CORNERS + 2 * j], core[CORNERS + 2 * j + 1] = triangles[i, 2 * j] - x, triangles[i, 2 * j + 1] - y
+    for j in range(3):
+        after = CORNERS + 2 * ((j + 1) % 3)
+        along_x, along_y = core[after] - core[CORNERS + 2 * j], core[after + 1] - core[CORNERS + 2 * j + 1]
+        length = np.sqrt(along_x * along_x + along_y * along_y)
+        core[AXES + 2 * j], core[AXES + 2 * j + 1] = along_y / length, -along_x / length
+        core[EXTENTS + j] = core[AXES + 2 * j] * core[after] + core[AXES + 2 * j + 1] * core[after + 1]
+
+
+@compiled
+def _separation(a: FloatArray, b: FloatArray, widest: np.float32) -> np.float32:
+    """The most by which an axis of ``a`` tells ``b`` from it, or ``widest`` if that is more."""
+    for i in range(int(a[NUM_AXES])):
+        along_x, along_y, least = a[AXES + 2 * i], a[AXES + 2 * i + 1], np.float32(np.inf)
+        for j in range(int(b[COUNT])):
+            least = min(least, along_x * b[CORNERS + 2 * j] + along_y * b[CORNERS + 2 * j + 1])
+        widest = max(widest, least - a[EXTENTS + i])
+    return widest
+
+
+@compiled
+def _corner_near_edge(a: FloatArray, b: FloatArray, reach: np.float32) -> bool:
+    """Check whether a corner of ``a`` is within reach of an edge of ``b``."""
+    count = int(b[COUNT])
+    for i in range(int(a[COUNT])):
+        for j in range(count):
+            x, y = a[CORNERS + 2 * i] - b[CORNERS + 2 * j], a[CORNERS + 2 * i + 1] - b[CORNERS + 2 * j + 1]
+            if x * x + y * y <= reach * reach:
+                return True
+            after = CORNERS + 2 * ((j + 1) % count)
+            along_x, along_y = b[after] - b[CORNERS + 2 * j], b[after + 1] - b[CORNERS + 2 * j + 1]
+            # A point, and a box of no size, have edges of no length: their corner has been asked.
+            if along_x * along_x + along_y * along_y > ZERO and collision.meets_edge(
+                x, y, along_x, along_y, reach, ZERO, OPS
+            ):
+                return True
+    return False
+
+
+@compiled
+def cores_within(a: FloatArray, b: FloatArray, reach: np.float32) -> bool:
+    """Check whether two placed cores, each widened by its rounding, are within ``reach`` of each other."""
+    total = a[ROUNDING] + b[ROUNDING] + reach
+    nothing = np.float32(-np.inf)
+    apart = _separation(b, a, _separation(a, b, nothing))
+    if apart > total:
+        return False
+    if apart <= ZERO and apart > nothing:
+        return True
+    return _corner_near_edge(a, b, total) or _corner_near_edge(b, a, total)
+
+
+@compiled
+def balls_within(
+    x: np.float32, y: np.float32, z: np.float32,
+    a: tuple[np.float32, np.float32, np.float32], b: tuple[np.float32, np.float32, np.float32],
+) -> bool:  # fmt: skip
+    """Check whether two ellipsoids with these semi-axes, offset by ``(x, y, z)``, touch (Perram and Wertheim, 1985).
+
+    They are apart where ``s (1 - s) (x^2 / ((1 - s) a^2 + s b^2) + ...)`` exceeds one for some weight ``s``. It is
+    concave in ``s``: its slope is bisected.
+    """
+    low, high, most = ZERO, ONE, ZERO
+    for _ in range(BISECTIONS):
+        s = _HALF * (low + high)
+        value = slope = ZERO
+        for axis in range(3):
+            d = x if axis == 0 else y if axis == 1 else z
+            a2, b2 = a[axis] * a[axis], b[axis] * b[axis]
+            mixed = (ONE - s) * a2 + s * b2
+            value += s * (ONE - s) * d * d / mixed
+            slope += d * d * ((ONE - s) * (ONE - s) * a2 - s * s * b2) / (mixed * mixed)
+        most = max(most, value)
+        low, high = (s, high) if slope > ZERO else (low, s)
+    return bool(most <= ONE)
+
+
+@compiled
+def ball_meets_box(boxes: FloatArray, i: Whole, x: np.float32, y: np.float32, z: np.float32,
+                    axes: tuple[np.float32, np.float32, np.float32]) -> bool:  # fmt: skip
+    """Check whether an ellipsoid with these semi-axes at ``(x, y, z)`` touches a rounded box."""
+    gap_x = max(boxes[i, 0] - x, x - boxes[i, 3], ZERO)
+    gap_y = max(boxes[i, 1] - y, y - boxes[i, 4], ZERO)
+    gap_z = max(boxes[i, 2] - z, z - boxes[i, 5], ZERO)
+    rounding = boxes[i, 6]
+    if rounding > ZERO:  # a ball, or a cylinder, from whose axis the gap along z is zero
+        return balls_within(gap_x, gap_y, gap_z, axes, (rounding, rounding, rounding))
+    gap_x, gap_y, gap_z = gap_x / axes[0], gap_y / axes[1], gap_z / axes[2]
+    return bool(gap_x * gap_x + gap_y * gap_y + gap_z * gap_z <= ONE)
