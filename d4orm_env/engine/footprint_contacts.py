@@ -248,7 +248,7 @@ def _any_leaves_bounds(
 
 
 @compiled
-def _touches_static(
+def touches_static(
     f: FootprintArrays, arrays: ProblemArrays, k: Whole, place: tuple[np.float32, np.float32, np.float32],
     poses: FloatArray, stride: int, begin: Whole, extra: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
@@ -294,6 +294,6 @@ def refine_static(
         s = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
         place = (places[s], places[TILE + s], ZERO if planar else places[2 * TILE + s])
-        if not _touches_static(f, arrays, k, place, poses, stride, begin + s, extra, buffer):
+        if not touches_static(f, arrays, k, place, poses, stride, begin + s, extra, buffer):
             sure &= ~(_BIT << np.uint64(s))
     return sure

@@ -18,6 +18,9 @@ from d4orm_planners.d4orm_d.planner import State as DecouplingState
 from d4orm_planners.d4orm_d.repairs import Repairs
 from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.hybrid.settings import HybridConfig
+from d4orm_planners.manoeuvres.planning import find_manoeuvres, improve_manoeuvres
+from d4orm_planners.manoeuvres.robots import can_plan
+from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.mapf.beams import prepare_beams
 from d4orm_planners.mapf.motion_lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (
@@ -31,8 +34,8 @@ from d4orm_planners.mapf.planner import (
     roadmap_iteration,
 )
 
-State = DecouplingState | RoadmapSolution
-"""State between iterations: the repairer's, or the roadmap solution once there is one."""
+State = DecouplingState | RoadmapSolution | TeamMotions
+"""State between iterations: the repairer's, or the roadmap solution or the team's manoeuvres once there are any."""
 
 REPLANNING = MAPFConfig()
 MAPF_AFTER = 6
@@ -70,6 +73,12 @@ class Hybrid(Planner):
         """See :meth:`Planner.iterate`: initialise, then repair robots that fail, then improve."""
         if isinstance(state, RoadmapSolution):
             return self.improve_roadmap_solution(search, state)
+        if isinstance(state, TeamMotions):
+            return state, improve_manoeuvres(search, state)
+        if self.finds_manoeuvres(search):
+            motions = find_manoeuvres(search)
+            if motions is not None:
+                return motions, Iteration(motions.controls())
         if self.finds_paths(search):
             solution = find_roadmap_solution(search)
             if isinstance(solution, RoadmapSolution):
@@ -135,6 +144,11 @@ class Hybrid(Planner):
             solution = going_on_from_best(search, solution)
         solution = improve_roadmap_solution(search, solution, REPLANNING.neighbours, REPLANNING.replannings)
         return solution, roadmap_iteration(search, solution)
+
+    def finds_manoeuvres(self, search: SolveRun) -> bool:
+        """Return whether this iteration is to find manoeuvres: the first, if they are what the team needs."""
+        from_nothing = search.iteration == 0 and not search.current.controls.any()
+        return from_nothing and self.config.start == "auto" and can_plan(search.problem)
 
     def finds_paths(self, search: SolveRun) -> bool:
         """Return whether this iteration is to find paths: the first, or one after some without a solution."""

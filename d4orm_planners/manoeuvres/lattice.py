@@ -1,0 +1,201 @@
+"""Where a robot may be: its footprint among the obstacles, and how long it takes from any pose to its goal."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats, Whole
+from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.engine.elementary import cosine, sine
+from d4orm_env.engine.footprint_contacts import POSE, touches_static
+from d4orm_env.engine.simd import TILE
+from d4orm_planners.manoeuvres.heaps import Heap, pop, push
+from d4orm_planners.manoeuvres.primitives import SECTOR, SECTORS, Primitives
+
+TURN = 2 * np.pi
+BUFFER = (2 + POSE) * TILE
+"""Numbers that contacts are found in: two cores and a pose."""
+WIDER, LATER = 1.2, 20
+"""Poses count from which a robot takes at most so many times as long as from its start, and so many steps more."""
+
+
+class Body(NamedTuple):
+    """A robot's body among the obstacles.
+
+    Attributes:
+        footprints: Of all robots.
+        arrays: The problem, without goal headings and footprints, so that all have one type.
+        robot: Its number.
+        extra: Distance that it keeps from everything [m].
+        stride: What the fastest robot drives in a step [m].
+        parts: Poses that are looked at in a step.
+    """
+
+    footprints: FootprintArrays
+    arrays: ProblemArrays
+    robot: int
+    extra: np.float32
+    stride: float
+    parts: int
+
+
+class Lattice(NamedTuple):
+    """Cells of positions and sectors of headings: poses in the same are taken for one.
+
+    Attributes:
+        low: ``(2,)`` lowest corner [m].
+        scale: One over the size of a cell [1/m].
+        size: ``(2,)`` cells along x and y.
+        heading: Middle of the first sector [rad].
+        sectors: Number of sectors; one for a robot without a heading.
+    """
+
+    low: Floats
+    scale: float
+    size: tuple[int, int]
+    heading: float
+    sectors: int
+
+
+@compiled
+def turned_by(angle: float) -> float:
+    """The same angle, at most half a turn."""
+    return angle - TURN * np.rint(angle / TURN)
+
+
+@compiled
+def is_far_from_all(body: Body, x: float, y: float, wider: float) -> bool:
+    """Check whether the robot's disc, and so much round it, is clear of obstacles and bounds there; it may be so too
+    where this does not find out.
+    """
+    arrays = body.arrays
+    reach = arrays.radius[body.robot] + body.extra + np.float32(wider)
+    px, py, low, high = np.float32(x), np.float32(y), arrays.bounds[0], arrays.bounds[1]
+    if not (px - reach > low[0] and py - reach > low[1] and px + reach < high[0] and py + reach < high[1]):
+        return False
+    grid = arrays.grid
+    if grid.clearance.shape[0] == 0:
+        return True
+    i, j = np.int64((px - grid.low[0]) * grid.scale), np.int64((py - grid.low[1]) * grid.scale)
+    if px <= grid.low[0] or py <= grid.low[1] or i >= grid.size[0] or j >= grid.size[1]:
+        return False
+    return bool(grid.clearance[i * grid.size[1] + j] - grid.slack > reach)
+
+
+@compiled
+def is_free(body: Body, x: float, y: float, heading: float, buffer: FloatArray) -> bool:
+    """Check whether the robot is clear of obstacles and bounds there."""
+    if is_far_from_all(body, x, y, 0.0):
+        return True
+    place, poses = (np.float32(x), np.float32(y), np.float32(0)), buffer[2 * TILE :]
+    poses[0], poses[TILE] = direction(body, body.robot, heading)
+    poses[2 * TILE] = poses[3 * TILE] = np.float32(0)
+    return not touches_static(body.footprints, body.arrays, body.robot, place, poses, 0, 0, body.extra, buffer)
+
+
+@compiled
+def direction(body: Body, robot: Whole, heading: float) -> tuple[np.float32, np.float32]:
+    """Return what a robot's footprint is turned by at a heading, as a unit vector."""
+    if body.footprints.heading[robot] < 0:
+        return np.float32(1), np.float32(0)
+    return cosine(np.float32(heading)), sine(np.float32(heading))
+
+
+@compiled
+def moved(x: float, y: float, heading: float, step: Floats) -> tuple[float, float, float]:
+    """The pose after a step ``(3,)`` seen from a pose; its heading is not wound up."""
+    c, s = np.float64(cosine(np.float32(heading))), np.float64(sine(np.float32(heading)))
+    return x + (c * step[0] - s * step[1]), y + (s * step[0] + c * step[1]), turned_by(heading + step[2])
+
+
+@compiled
+def cell_of(lattice: Lattice, x: float, y: float, heading: float, mode: Whole) -> int:
+    """Number of the cell of a pose in a mode, -1 outside."""
+    i = int(np.floor((x - lattice.low[0]) * lattice.scale))
+    j = int(np.floor((y - lattice.low[1]) * lattice.scale))
+    if i < 0 or j < 0 or i >= lattice.size[0] or j >= lattice.size[1]:
+        return -1
+    sector = 0
+    if lattice.sectors > 1:
+        sector = int(np.rint((heading - lattice.heading) / SECTOR)) % SECTORS
+    return ((int(mode) * lattice.sectors + sector) * lattice.size[0] + i) * lattice.size[1] + j
+
+
+@compiled
+def is_way_free(
+    body: Body, primitives: Primitives, number: Whole, x: float, y: float, heading: float, buffer: FloatArray
+) -> bool:
+    """Check whether the robot is clear of obstacles and bounds after every step of a primitive."""
+    if is_far_from_all(body, x, y, primitives.reach[number]):
+        return True
+    # From the end on: what is not free is found there soonest.
+    for step in range(primitives.first[number + 1] - 1, primitives.first[number] - 1, -1):
+        px, py, turned = moved(x, y, heading, primitives.poses[step])
+        if not is_free(body, px, py, turned, buffer):
+            return False
+    return True
+
+
+@compiled
+def _spread(
+    body: Body, primitives: Primitives, lattice: Lattice, start: Floats, pace: float, cell: int, costs: FloatArray,
+    poses: Floats, heap: Heap, buffer: FloatArray,
+) -> None:  # fmt: skip
+    """Spread costs from a cell to those that primitives lead to."""
+    x, y, heading = poses[cell, 0], poses[cell, 1], poses[cell, 2]
+    mode = cell // (lattice.sectors * lattice.size[0] * lattice.size[1])
+    for number in range(primitives.begin[mode], primitives.begin[mode + 1]):
+        first, end = primitives.first[number], primitives.first[number + 1]
+        px, py, turned = moved(x, y, heading, primitives.poses[end - 1])
+        other, cost = cell_of(lattice, px, py, turned, primitives.mode[number]), costs[cell] + np.float32(end - first)
+        if other < 0 or costs[other] <= cost or not is_way_free(body, primitives, number, x, y, heading, buffer):
+            continue
+        costs[other] = cost
+        poses[other, 0], poses[other, 1], poses[other, 2] = px, py, turned
+        push(heap, cost + pace * np.sqrt((px - start[0]) ** 2 + (py - start[1]) ** 2), other)
+
+
+@cached_kernel(**OPTIONS)
+def fill_costs(
+    body: Body, primitives: Primitives, lattice: Lattice, goals: Floats, start: Floats, pace: float,
+    costs: FloatArray, poses: Floats, heap: Heap,
+) -> float:  # fmt: skip
+    """Spread costs backwards from the goals over all poses from which it may be worthwhile to go there.
+
+    Args:
+        body: The robot.
+        primitives: What it can do, backwards in time.
+        lattice: Cells and sectors.
+        goals: ``(., 3)`` poses.
+        start: ``(3,)`` pose, towards which costs are spread first.
+        pace: Steps that a metre takes at least.
+        costs: ``(cells,)`` steps to the goal, filled; infinite to begin with, and beyond what was reached.
+        poses: ``(cells, 3)`` to overwrite.
+        heap: To overwrite.
+
+    Returns:
+        The cost up to which all are known.
+    """
+    buffer, begin = np.zeros(BUFFER, np.float32), cell_of(lattice, start[0], start[1], start[2], 0)
+    heap.filled[0] = 0
+    for number in range(goals.shape[0]):
+        cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], 0)
+        if cell >= 0 and costs[cell] > 0:
+            costs[cell], poses[cell] = 0, goals[number]
+            push(heap, 0.0, cell)
+    most, last = np.inf, 0.0
+    while 0 < heap.filled[0] < heap.value.shape[0] - 256 and last <= most:
+        value, cell = pop(heap)
+        last = max(last, value)
+        x, y, cost = poses[cell, 0], poses[cell, 1], costs[cell]
+        if value > cost + pace * np.sqrt((x - start[0]) ** 2 + (y - start[1]) ** 2) + 1e-3:
+            continue
+        if cell == begin:
+            most = min(most, WIDER * cost + LATER)
+        _spread(body, primitives, lattice, start, pace, cell, costs, poses, heap, buffer)
+    return last

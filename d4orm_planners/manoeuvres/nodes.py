@@ -1,0 +1,167 @@
+"""Nodes of a search for one robot's motion, and which of them count."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
+from d4orm_env.engine.compiling import compiled
+from d4orm_planners.manoeuvres.heaps import Heap, push
+from d4orm_planners.manoeuvres.lattice import BUFFER, Body, Lattice, cell_of, turned_by
+from d4orm_planners.manoeuvres.primitives import Primitives
+from d4orm_planners.manoeuvres.snapping import Goal, Limits, snap_of, snap_steps
+
+MAX_STEPS = 2**14
+"""Most steps of a move."""
+
+
+class Nodes(NamedTuple):
+    """Nodes of a search, ``N`` at most, and where to find those of a cell.
+
+    Attributes:
+        pose: ``(N, 3)``.
+        mode: ``(N,)``, -1 for a node at which the robot stays at its goal.
+        time: ``(N,)`` step of arrival.
+        until: ``(N,)`` first step at which it must have gone.
+        parent: ``(N,)``, -1 for the first.
+        move: ``(N,)`` primitive, or one of :data:`AHEAD` and :data:`BEHIND`, ...
+        depart: ``(N,)`` ... and the step at which it begins.
+        next: ``(N,)`` another one of the same cell, -1 for none.
+        filled: ``(1,)`` how many there are.
+        soonest: ``(1,)`` step from which on the robot can stay at its goal.
+        cells: ``(C,)`` numbers of cells, hashed.
+        heads: ``(C,)`` first node of each.
+        marks: ``(C,)`` search that wrote it.
+        heap: Those to be followed.
+        swept: ``(., 4)`` poses and speeds on a move, from where it begins.
+        buffer: See :data:`~d4orm_planners.manoeuvres.lattice.BUFFER`.
+    """
+
+    pose: Floats
+    mode: IntArray
+    time: IntArray
+    until: IntArray
+    parent: IntArray
+    move: IntArray
+    depart: IntArray
+    next: IntArray
+    filled: IntArray
+    soonest: IntArray
+    cells: IntArray
+    heads: IntArray
+    marks: IntArray
+    heap: Heap
+    swept: Floats
+    buffer: FloatArray
+
+    @classmethod
+    def of(cls, size: int) -> Nodes:
+        """Room for so many."""
+        slots = 1 << int(2 * size - 1).bit_length()
+
+        def numbers(count: int) -> IntArray:
+            return np.zeros(count, np.int64)
+
+        return cls(
+            np.empty((size, 3)), numbers(size), numbers(size), numbers(size), numbers(size), numbers(size),
+            numbers(size), numbers(size), numbers(1), numbers(1), numbers(slots), numbers(slots), numbers(slots),
+            Heap.of(size + 1), np.empty((MAX_STEPS + 1, 4)), np.zeros(BUFFER, np.float32),
+        )  # fmt: skip
+
+
+class Task(NamedTuple):
+    """What to look for.
+
+    Attributes:
+        body: The robot.
+        primitives: What it can do.
+        limits: For the last stretch.
+        goal: Where to.
+        lattice: Cells and sectors.
+        costs: Steps to the goal from every cell of the goal's own lattice, none in a world without obstacles, ...
+        far: ... and from those that are not known.
+        costs_lattice: Lattice of the costs.
+        weight: Times that these count more than the steps behind.
+        patience: Steps between departures that are tried.
+        horizon: Last step.
+        number: Of the search; no two with the same nodes have the same.
+    """
+
+    body: Body
+    primitives: Primitives
+    limits: Limits
+    goal: Goal
+    lattice: Lattice
+    costs: FloatArray
+    far: float
+    costs_lattice: Lattice
+    weight: float
+    patience: int
+    horizon: int
+    number: int
+
+
+@compiled
+def slot_of(nodes: Nodes, cell: int, number: int) -> int:
+    """The slot of a cell, or the free one that it may take."""
+    mask = nodes.cells.shape[0] - 1
+    at = (cell * 0x9E3779B1 >> 4) & mask
+    while nodes.marks[at] == number and nodes.cells[at] != cell:
+        at = (at + 1) & mask
+    return at
+
+
+@compiled
+def is_dominated(nodes: Nodes, slot: int, number: int, own: int, time: int) -> bool:
+    """Check whether some other node of the cell is there as soon and may wait until then."""
+    if nodes.marks[slot] != number:
+        return False
+    other = nodes.heads[slot]
+    while other >= 0:
+        if other != own and nodes.time[other] <= time < nodes.until[other]:
+            return True
+        other = nodes.next[other]
+    return False
+
+
+@compiled
+def cost_to_go(task: Task, x: float, y: float, heading: float, mode: Whole) -> float:
+    """Steps to the goal; where there are no obstacles, those of the last stretch."""
+    if task.costs.shape[0] == 0:
+        ahead = snap_steps(snap_of(task.limits, task.goal, x, y, heading, 1.0))
+        return float(min(ahead, snap_steps(snap_of(task.limits, task.goal, x, y, heading, -1.0))))
+    cell = cell_of(task.costs_lattice, x, y, heading, mode)
+    cost = np.float64(task.costs[cell]) if cell >= 0 else np.inf
+    return cost if cost < np.inf else task.far
+
+
+@compiled
+def add(
+    task: Task, nodes: Nodes, x: float, y: float, heading: float, mode: int, time: int, until: int, parent: int,
+    move: int, depart: int,
+) -> None:  # fmt: skip
+    """Take in a node, unless another one is as good."""
+    slot, remaining = -1, 0.0
+    if mode >= 0:
+        cell = cell_of(task.lattice, x, y, heading, mode)
+        if cell < 0:
+            return
+        slot = slot_of(nodes, cell, task.number)
+        if is_dominated(nodes, slot, task.number, -1, time):
+            return
+        remaining = cost_to_go(task, x, y, heading, mode)
+    number = nodes.filled[0]
+    if number >= nodes.mode.shape[0]:
+        return
+    nodes.filled[0] = number + 1
+    nodes.pose[number, 0], nodes.pose[number, 1], nodes.pose[number, 2] = x, y, turned_by(heading)
+    nodes.mode[number], nodes.time[number], nodes.until[number] = mode, time, until
+    nodes.parent[number], nodes.move[number], nodes.depart[number], nodes.next[number] = parent, move, depart, -1
+    if mode >= 0:
+        if nodes.marks[slot] == task.number:
+            nodes.next[number] = nodes.heads[slot]
+        nodes.marks[slot], nodes.cells[slot], nodes.heads[slot] = task.number, cell, number
+    # Who is there too soon has to wait in any case: then the nearest is best.
+    push(nodes.heap, max(time, nodes.soonest[0] - remaining) + task.weight * remaining, number)

@@ -1,0 +1,66 @@
+"""Manoeuvres of a whole team as the hybrid planner begins with, and makes better from iteration to iteration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.footprints import Box
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.manoeuvres.search import find_motion
+from d4orm_planners.manoeuvres.team import TeamMotions
+from d4orm_planners.mapf.lns import search_neighbourhoods
+
+ROUNDS = 200
+"""Neighbourhoods that are replanned to find a motion for everybody."""
+BETTER_ROUNDS = 16
+"""Neighbourhoods that are replanned in an iteration once there is one."""
+
+
+def compile_manoeuvres() -> None:
+    """Compile the search, if it is not yet: it is the same for all models."""
+    if find_motion.signatures:
+        return
+    start = [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+    world = World(boxes=[[0.5, 0.8, 0.6, 1.2]])
+    team = Team(("unicycle",) * 2, footprint=Box(0.4, 0.2))
+    problem = Problem(team, start, [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
+    motions = TeamMotions.prepared(problem, lambda: False)
+    assert motions is not None
+    motions.plan_all()
+
+
+def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
+    """Motions for the whole team, or for some robots if time is up; ``None`` if not all have one in so many rounds."""
+    with search.watch.paused():
+        compile_manoeuvres()
+    motions = TeamMotions.prepared(search.problem, search.should_stop)
+    if motions is None:
+        return None
+    motions.plan_all()
+    return motions if _complete(search, motions) or search.should_stop() else None
+
+
+def _complete(search: SolveRun, motions: TeamMotions) -> bool:
+    """Replan neighbourhoods of robots without a motion until there are none; return whether that is so."""
+    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
+    for _ in range(ROUNDS):
+        if not motions.missing or search.should_stop():
+            break
+        search_neighbourhoods(motions, random, 1, search.should_stop)
+    return not motions.missing
+
+
+def improve_manoeuvres(search: SolveRun, motions: TeamMotions) -> Iteration:
+    """The team's controls, after some robots have looked for faster motions, or for any that the judge accepts."""
+    if not search.best.solved:
+        motions.leave_out(np.flatnonzero(search.current.unsolved).tolist())
+        _complete(search, motions)
+        return Iteration(motions.controls())
+    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
+    search_neighbourhoods(motions, random, BETTER_ROUNDS, search.should_stop)
+    return Iteration(motions.controls())

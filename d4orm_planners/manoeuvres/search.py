@@ -1,0 +1,202 @@
+"""Search for one robot's motion among obstacles and the motions of others, in safe intervals of time.
+
+A node is a pose, a mode and a time, and until when the robot may wait there (SIPP: M. Phillips and M. Likhachev, ICRA
+2011). Primitives begin as soon as they can, and later ones count only if they lead into another safe interval. Poses in
+the same cell are taken for one, as in db-A* (W. Hoenig, J. Ortiz-Haro and M. Toussaint, IROS 2022), but motions follow
+each other without any gap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_planners.manoeuvres.heaps import pop
+from d4orm_planners.manoeuvres.lattice import cell_of, moved
+from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, docks_after, is_sweep_free, reaches, sweep
+from d4orm_planners.manoeuvres.nodes import Nodes, Task, add, cost_to_go, is_dominated, slot_of
+from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, Goal, Limits, Snap, snap_of, snap_steps
+from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, is_met, safe_since, safe_until, visits_of
+
+NOTHING, PAUSED = -1, -2
+"""Results of a search that ends without a motion, and of one that is to go on if there is time."""
+PATIENCE = 2000
+"""Nodes that are followed until it is asked whether there is time."""
+SHORT, EVERY = 40, 8
+"""Steps of a last stretch that every node tries, if it is about as quick as any way; longer ones only every eighth."""
+
+
+@compiled
+def _has_traffic(traffic: Traffic, nodes: Nodes, count: int, since: int) -> bool:
+    """Check whether anybody comes near to a move at this time or later."""
+    for step in range(1, count + 1):
+        begin, end = visits_of(traffic, nodes.swept[step, 0], nodes.swept[step, 1])
+        for row in range(begin, end):
+            if traffic.visits[row, 2] >= since:
+                return True
+    return False
+
+
+@compiled
+def _meeting(task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int, likely: int) -> int:
+    """A step of a move in which another robot is met if it begins then, zero for none; the likely one first."""
+    for number in range(count + 1):
+        step = number if number else likely
+        if step and is_met(task.body, traffic, depart + step, nodes.swept[step - 1], nodes.swept[step], nodes.buffer):
+            return step
+    return 0
+
+
+@compiled
+def _first_use(task: Task, nodes: Nodes, node: int, move: int) -> int:
+    """The first step at which it is of use to begin a primitive from a node: until then others are at its end."""
+    pose, first, end = nodes.pose[node], task.primitives.first[move], task.primitives.first[move + 1]
+    depart, count = nodes.time[node], end - first
+    if task.goal.docks:
+        dx, dy = task.goal.x - pose[0], task.goal.y - pose[1]
+        near = task.goal.radius + task.primitives.reach[move]
+        if dx * dx + dy * dy <= near * near:
+            return depart
+    x, y, heading = moved(pose[0], pose[1], pose[2], task.primitives.poses[end - 1])
+    cell = cell_of(task.lattice, x, y, heading, task.primitives.mode[move])
+    if cell < 0:
+        return NEVER
+    slot, last = slot_of(nodes, cell, task.number), -1
+    while depart > last and nodes.marks[slot] == task.number:
+        last, other = depart, nodes.heads[slot]
+        while other >= 0:
+            if nodes.time[other] <= depart + count < nodes.until[other]:
+                depart = nodes.until[other] - count
+            other = nodes.next[other]
+    return depart
+
+
+@compiled
+def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) -> None:
+    """Make a move from a node, as soon as others let it, and later into other intervals."""
+    depart, until = nodes.time[node], nodes.until[node]
+    waits = task.primitives.rests[nodes.mode[node]]
+    if move >= 0:
+        soonest = _first_use(task, nodes, node, move)
+        if soonest >= until or (soonest > depart and not waits):
+            return
+        depart = soonest
+    count, docks = sweep(task, nodes, node, move), False
+    if task.goal.docks:
+        end = docks_after(task, nodes, count)
+        count, docks = min(count, end), end <= count
+    if count == 0 or not is_sweep_free(task.body, nodes.swept, count, nodes.buffer):
+        return
+    mode = task.primitives.mode[move] if move >= 0 and not docks else -1
+    busy, met = _has_traffic(traffic, nodes, count, depart), 0
+    x, y, heading, _ = nodes.swept[count]
+    while depart < until and depart + count <= task.horizon:
+        if not busy:
+            add(task, nodes, x, y, heading, mode, depart + count, NEVER, node, move, depart)
+            return
+        met = _meeting(task, nodes, traffic, count, depart, met)
+        if met == 0:
+            end = safe_until(task.body, traffic, depart + count, nodes.swept[count], nodes.buffer)
+            if mode >= 0 or end == NEVER:
+                add(task, nodes, x, y, heading, mode, depart + count, end, node, move, depart)
+            if end == NEVER:
+                return
+            depart = max(depart, end - count)
+        elif depart > traffic.end:
+            return
+        if not waits:
+            return
+        depart += task.patience
+
+
+@compiled
+def _snaps(task: Task, nodes: Nodes, traffic: Traffic, node: int) -> None:
+    """Try the last stretch, where it is about as quick as any way."""
+    pose, mode = nodes.pose[node], nodes.mode[node]
+    if task.limits.way == NOWHERE or not task.primitives.rests[mode]:
+        return
+    remaining = cost_to_go(task, pose[0], pose[1], pose[2], mode)
+    for move in range(AHEAD, BEHIND - 1 if task.limits.way != SIDEWAYS else BEHIND, -1):
+        snap = snap_of(task.limits, task.goal, pose[0], pose[1], pose[2], 1.0 if move == AHEAD else -1.0)
+        steps = snap_steps(snap)
+        # A long one is seldom free: nodes that are near to each other need not all try.
+        if steps <= 1.25 * remaining + 20 and (steps <= SHORT or node % EVERY == 0):
+            _follow(task, nodes, traffic, node, move)
+
+
+@compiled
+def _soonest(task: Task, traffic: Traffic, nodes: Nodes) -> int:
+    """The step from which on the robot can stay at its goal; zero where it may face anywhere."""
+    goal, pose = task.goal, nodes.swept[0]
+    if np.isnan(goal.heading):
+        return 0
+    pose[0], pose[1], pose[2] = goal.x, goal.y, goal.heading
+    return safe_since(task.body, traffic, pose, nodes.buffer)
+
+
+@compiled
+def _begin(task: Task, traffic: Traffic, nodes: Nodes, start: Floats) -> None:
+    """Begin at a pose ``(3,)``, at rest; there is no node if the robot cannot stay there for a step."""
+    nodes.filled[0], nodes.heap.filled[0] = 0, 0
+    until = safe_until(task.body, traffic, 0, start, nodes.buffer)
+    nodes.soonest[0] = _soonest(task, traffic, nodes)
+    if until > 0 and nodes.soonest[0] <= task.horizon:
+        add(task, nodes, start[0], start[1], start[2], 0, 0, until, -1, -1, 0)
+
+
+@cached_kernel(**OPTIONS)
+def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, goes_on: bool) -> int:
+    """Look for a motion from a pose ``(3,)`` at rest to the goal, where the robot stays; or go on looking for it.
+
+    Returns:
+        The node at its end; :data:`NOTHING` if there is none or no more room for nodes; or :data:`PAUSED`.
+    """
+    if not goes_on:
+        _begin(task, traffic, nodes, start)
+    for _ in range(PATIENCE):
+        if nodes.heap.filled[0] == 0 or nodes.filled[0] >= nodes.mode.shape[0]:
+            return NOTHING
+        _, node = pop(nodes.heap)
+        if nodes.mode[node] < 0:
+            return node
+        x, y, heading = nodes.pose[node]
+        cell = cell_of(task.lattice, x, y, heading, nodes.mode[node])
+        if is_dominated(nodes, slot_of(nodes, cell, task.number), task.number, node, nodes.time[node] - 1):
+            continue
+        rests = task.primitives.rests[nodes.mode[node]]
+        if rests and nodes.until[node] == NEVER and reaches(task.goal, x, y, heading, 0.0, 1.0):
+            return node
+        _snaps(task, nodes, traffic, node)
+        begin, end = task.primitives.begin[nodes.mode[node]], task.primitives.begin[nodes.mode[node] + 1]
+        for move in range(begin, end):
+            _follow(task, nodes, traffic, node, move)
+    return PAUSED
+
+
+@cached_kernel(**OPTIONS)
+def trace(task: Task, nodes: Nodes, node: int, poses: FloatArray) -> None:
+    """Fill in the poses ``(T + 1, 3)`` of the motion that ends in a node, at all ``T`` steps."""
+    last = poses.shape[0] - 1
+    while True:
+        for step in range(nodes.time[node], last + 1):
+            for i in range(3):
+                poses[step, i] = nodes.pose[node, i]
+        last = nodes.time[node] - 1
+        above = nodes.parent[node]
+        if above < 0:
+            return
+        depart = nodes.depart[node]
+        sweep(task, nodes, above, nodes.move[node])
+        for step in range(depart + 1, last + 1):
+            for i in range(3):
+                poses[step, i] = nodes.swept[step - depart, i]
+        last = depart
+        node = above
+
+
+@cached_kernel(**OPTIONS)
+def snap_from(limits: Limits, goal: Goal, x: float, y: float, heading: float, move: int) -> Snap:
+    """The last stretch from a pose, as one of the moves."""
+    return snap_of(limits, goal, x, y, heading, -1.0 if move == BEHIND else 1.0)

@@ -1,0 +1,228 @@
+"""The motions of a team: one robot at a time among the others', and some of them anew, until none is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_planners.manoeuvres.nodes import Nodes, Task
+from d4orm_planners.manoeuvres.robots import Robot, area_of, distance_kept, make_robot, plain_arrays
+from d4orm_planners.manoeuvres.search import PAUSED, find_motion, snap_from, trace
+from d4orm_planners.manoeuvres.snapping import snap_controls
+from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, traffic_of
+from d4orm_planners.mapf.lns import Odds
+
+MAX_NODES = 100_000
+"""Nodes after which a search gives up, ..."""
+FIRST_NODES = 400_000
+"""... and at first a robot's share of so many, once more after every four searches of each: in a large team it is
+quicker to change others' motions."""
+WEIGHT = 1.5
+"""Times that the steps ahead count more than those behind."""
+PATIENCE = 0.4
+"""Time between departures that are tried [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A robot's motion.
+
+    Attributes:
+        poses: ``(T + 1, 3)`` float32.
+        controls: ``(T, m)``.
+    """
+
+    poses: FloatArray
+    controls: FloatArray
+
+    @property
+    def steps(self) -> int:
+        """Steps until it has arrived."""
+        return len(self.controls)
+
+
+class TeamMotions:
+    """The motions of a team, as a low-level planner of :mod:`~d4orm_planners.mapf.lns`.
+
+    Args:
+        problem: The problem.
+        should_stop: Whether time is up.
+
+    Attributes:
+        robots: What the search knows of each.
+        motions: Of each robot, ``None`` for those that have none yet.
+        alone: Their motions if there were nobody else.
+    """
+
+    groups = 1
+
+    def __init__(self, problem: Problem, robots: list[Robot], reach: float, should_stop: Callable[[], bool]) -> None:
+        self.problem, self.robots, self.should_stop = problem, robots, should_stop
+        self._area, self._reach = area_of(problem), reach
+        self._nodes, self._searches = Nodes.of(MAX_NODES), 0
+        size, horizon = problem.num_robots, problem.horizon
+        self._poses = np.empty((size, horizon + 1, 3), np.float32)
+        self._poses[:] = np.array([robot.start for robot in self.robots])[:, None]
+        self.motions: list[Motion | None] = [None] * size
+        self.alone = [self._find(robot, (), {}) for robot in range(size)]
+
+    @classmethod
+    def prepared(cls, problem: Problem, should_stop: Callable[[], bool]) -> TeamMotions | None:
+        """A team without motions; ``None`` if time is up, or a robot has none even alone."""
+        area, extra, largest = area_of(problem), distance_kept(problem), float(problem.team.radius.max())
+        arrays, robots = plain_arrays(problem, largest + extra), {}
+
+        def prepare(part: IntArray) -> None:
+            for number in range(part[0], part[1]):
+                if not should_stop():
+                    robots[number] = make_robot(problem, number, area, arrays, extra)
+
+        Threads(available_cores()).over(problem.num_robots, prepare)
+        if len(robots) < problem.num_robots:
+            return None
+        everybody = [robots[number] for number in range(problem.num_robots)]
+        team = cls(problem, everybody, 2 * largest + extra + 2 * problem.stride, should_stop)
+        return None if any(motion is None for motion in team.alone) else team
+
+    @property
+    def missing(self) -> int:
+        """Number of robots without a motion."""
+        return sum(motion is None for motion in self.motions)
+
+    @property
+    def solution(self) -> list[Motion | None]:
+        """See :class:`~d4orm_planners.mapf.lns.LowLevelPlanner`."""
+        return self.motions.copy()
+
+    @property
+    def cost(self) -> tuple[int, int]:
+        """Number of robots without a motion, and the sum of the others' steps."""
+        return self.missing, sum(motion.steps for motion in self.motions if motion is not None)
+
+    def plan_all(self) -> None:
+        """Plan one robot after the other, each among those before it, those first that take longest."""
+        steps = [-1 if motion is None else motion.steps for motion in self.alone]
+        self._plan_in_turn(np.argsort(-np.array(steps), kind="stable").tolist(), {})
+
+    def leave_out(self, robots: Iterable[int]) -> None:
+        """Forget the motions of some robots."""
+        for robot in robots:
+            self._drop(robot)
+
+    def odds(self, random: np.random.Generator) -> Odds:
+        """See :meth:`LowLevelPlanner.odds`: who has no motion is late, and who takes longer than alone."""
+        missing = np.array([motion is None for motion in self.motions])
+        if missing.any():
+            delay = missing.astype(float)
+        else:
+            steps = np.array([[own.steps for own in some if own] for some in (self.motions, self.alone)], float)
+            delay = np.maximum(steps[0] - steps[1], 1.0)
+        places = self._poses[:, :, :2].swapaxes(0, 1).copy()
+        until = np.full(len(missing), self.problem.horizon)
+        for robot in np.flatnonzero(missing):
+            own = self.alone[robot]
+            if own is not None:
+                places[: own.steps + 1, robot], places[own.steps :, robot] = own.poses[:, :2], own.poses[-1, :2]
+        return Odds(delay, places, until, 4 * self._reach, (2, 4))
+
+    def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
+        """See :meth:`LowLevelPlanner.replan`."""
+        for group in groups:
+            before, cost = self.motions.copy(), self.cost
+            order = group.tolist()
+            if random.random() < 0.5:
+                order.sort(key=lambda robot: before[robot] is not None)
+            longest = max((own.steps for own in self.alone if own is not None), default=0)
+            held = {robot: int(longest * random.random() ** 2) * int(random.integers(2)) for robot in order}
+            for robot in order:
+                self._drop(robot)
+            self._plan_in_turn(order, held)
+            if self.cost > cost:
+                for robot, motion in enumerate(before):
+                    self._take(robot, motion)
+
+    def _plan_in_turn(self, order: list[int], held: dict[int, int]) -> None:
+        for place, robot in enumerate(order):
+            if self.should_stop():
+                return
+            others = [other for other, motion in enumerate(self.motions) if motion is not None and other != robot]
+            later = {other: held.get(other, 0) for other in order[place + 1 :]}
+            self._take(robot, self._find(robot, others, later))
+
+    def _drop(self, robot: int) -> None:
+        self.motions[robot] = None
+        self._poses[robot] = self.robots[robot].start
+
+    def _take(self, robot: int, motion: Motion | None) -> None:
+        self._drop(robot)
+        if motion is not None:
+            self.motions[robot] = motion
+            self._poses[robot, : motion.steps + 1] = motion.poses
+            self._poses[robot, motion.steps :] = motion.poses[-1]
+
+    def _traffic(self, others: Iterable[int], held: dict[int, int]) -> Traffic:
+        last, gone = np.full(len(self.robots), -1), np.full(len(self.robots), NEVER)
+        for other in others:
+            motion = self.motions[other]
+            assert motion is not None
+            last[other] = motion.steps
+        for other, steps in held.items():
+            if steps > 0:
+                last[other], gone[other] = 0, steps
+        return traffic_of(self._poses, last, gone, self._area.low, self._area.high, self._reach)
+
+    def _find(self, number: int, others: Iterable[int], held: dict[int, int]) -> Motion | None:
+        """Look for a robot's motion among those of others, while those that are held stand where they start."""
+        robot, dt = self.robots[number], self.problem.dt
+        self._searches += 1
+        task = Task(
+            robot.body, robot.primitives, robot.limits, robot.goal, robot.lattice, robot.costs, robot.far,
+            robot.costs_lattice, WEIGHT, max(1, round(PATIENCE / dt)), self.problem.horizon, self._searches,
+        )  # fmt: skip
+        self._nodes.filled[0] = 0
+        traffic, goes_on, node = self._traffic(others, held), False, PAUSED
+        team = len(self.robots)
+        most = FIRST_NODES // team * (1 + self._searches // (4 * team))
+        while node == PAUSED and self._nodes.filled[0] < most and not self.should_stop():
+            node = find_motion(task, traffic, self._nodes, robot.start, goes_on)
+            goes_on = True
+        return None if node < 0 else self._motion(robot, task, node)
+
+    def _motion(self, robot: Robot, task: Task, node: int) -> Motion:
+        """The motion that ends in a node."""
+        nodes, chain = self._nodes, [node]
+        while nodes.parent[chain[-1]] >= 0:
+            chain.append(int(nodes.parent[chain[-1]]))
+        steps = int(nodes.time[node])
+        controls = np.zeros((steps, robot.model.control_size), np.float32)
+        for last in chain[:-1]:
+            since, until = int(nodes.depart[last]), int(nodes.time[last])
+            pose = nodes.pose[nodes.parent[last]].tolist()
+            controls[since:until] = _controls(robot, int(nodes.move[last]), pose)[: until - since]
+        poses = np.empty((steps + 1, 3), np.float32)
+        trace(task, nodes, node, poses)
+        return Motion(poses, controls)
+
+    def controls(self) -> FloatArray:
+        """``(H, K, m)`` of the whole team; who has no motion stands."""
+        problem = self.problem
+        controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+        for robot, motion in enumerate(self.motions):
+            if motion is not None:
+                controls[: motion.steps, robot, : motion.controls.shape[1]] = motion.controls
+        return controls
+
+
+def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:
+    """``(n, m)`` controls of a move from a pose."""
+    if move >= 0:
+        first, end = robot.primitives.first[move : move + 2]
+        return robot.primitives.controls[first:end]
+    snap = snap_from(robot.limits, robot.goal, pose[0], pose[1], pose[2], move)
+    controls = snap_controls(robot.limits, snap, robot.model.first_order)
+    return controls[:, ::-1] if robot.model.name == "differential_drive" else controls

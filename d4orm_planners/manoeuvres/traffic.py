@@ -1,0 +1,192 @@
+"""Where the other robots are and when, and until when a pose is safe from them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.engine.convex_cores import cores_within, place_body
+from d4orm_env.engine.simd import TILE
+from d4orm_planners.manoeuvres.lattice import Body, direction, turned_by
+
+NEVER = 1 << 40
+"""Step that never comes."""
+
+
+class Traffic(NamedTuple):
+    """The motions of others, and a grid of who comes near to its cells when.
+
+    Attributes:
+        poses: ``(K, T + 1, 3)`` float32.
+        last: ``(K,)`` number of the last step at which each moves; it stays there, ...
+        gone: ``(K,)`` ... but is there no more from this step on.
+        end: The last step at which anything changes.
+        low: ``(2,)`` lowest corner of the grid [m].
+        scale: One over the size of its cells [1/m], no less than two robots' outer radii.
+        size: ``(2,)`` cells along x and y.
+        first: ``(C + 1,)`` where the visits to each cell begin.
+        visits: ``(V, 3)`` who comes near, and the first and the last step.
+    """
+
+    poses: FloatArray
+    last: IntArray
+    gone: IntArray
+    end: int
+    low: Floats
+    scale: float
+    size: tuple[int, int]
+    first: IntArray
+    visits: IntArray
+
+
+@compiled
+def _cell(low: Floats, scale: float, size: tuple[int, int], x: float, y: float) -> tuple[int, int]:
+    i, j = int((x - low[0]) * scale), int((y - low[1]) * scale)
+    return max(0, min(size[0] - 1, i)), max(0, min(size[1] - 1, j))
+
+
+@compiled
+def _note(
+    first: IntArray, visits: IntArray, size: tuple[int, int], at: tuple[int, int], robot: int, since: int, until: int
+) -> None:
+    """Note a visit in a cell and those round it; only count if there is no room yet."""
+    for i in range(max(0, at[0] - 1), min(size[0], at[0] + 2)):
+        for j in range(max(0, at[1] - 1), min(size[1], at[1] + 2)):
+            cell = i * size[1] + j
+            if visits.shape[0] > 0:
+                row = first[cell]
+                visits[row, 0], visits[row, 1], visits[row, 2] = robot, since, until
+            first[cell] += 1
+
+
+@cached_kernel(**OPTIONS)
+def count_visits(
+    poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, scale: float, size: tuple[int, int],
+    first: IntArray, visits: IntArray,
+) -> None:  # fmt: skip
+    """Count the visits to every cell; or write them, if there are rows for them, which ``first`` then tells."""
+    for robot in range(poses.shape[0]):
+        if last[robot] < 0:
+            continue
+        since, at = 0, _cell(low, scale, size, poses[robot, 0, 0], poses[robot, 0, 1])
+        for step in range(1, last[robot] + 1):
+            there = _cell(low, scale, size, poses[robot, step, 0], poses[robot, step, 1])
+            if there != at:
+                _note(first, visits, size, at, robot, since, step - 1)
+                since, at = step, there
+        _note(first, visits, size, at, robot, since, gone[robot] - 1)
+
+
+def traffic_of(poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, high: Floats, reach: float) -> Traffic:
+    """The motions of robots ``(K, T + 1, 3)``; who has none moves last at step -1."""
+    counted = np.maximum(np.ceil((high - low) / reach), 1)
+    size = (int(counted[0]), int(counted[1]))
+    cells = size[0] * size[1]
+    counts = np.zeros(cells, np.int64)
+    count_visits(poses, last, gone, low, 1 / reach, size, counts, np.empty((0, 3), np.int64))
+    end = int(max(last.max(), gone[gone < NEVER].max(initial=0)))
+    first = np.concatenate([[0], np.cumsum(counts)])
+    visits = np.empty((max(int(first[-1]), 1), 3), np.int64)
+    count_visits(poses, last, gone, low, 1 / reach, size, first[:-1].copy(), visits)
+    return Traffic(poses, last, gone, end, low, 1 / reach, size, first, visits)
+
+
+@compiled
+def visits_of(traffic: Traffic, x: float, y: float) -> tuple[int, int]:
+    """The rows of the visits to the cell of a place."""
+    i, j = _cell(traffic.low, traffic.scale, traffic.size, x, y)
+    cell = i * traffic.size[1] + j
+    return traffic.first[cell], traffic.first[cell + 1]
+
+
+@compiled
+def _meets(
+    body: Body, traffic: Traffic, other: Whole, step: Whole, before: Floats, after: Floats, parts: int,
+    buffer: FloatArray,
+) -> bool:  # fmt: skip
+    """Check whether another robot is too near to this one in a step that ends at a number, between two poses of it."""
+    arrays, k, last = body.arrays, body.robot, traffic.last[other]
+    end, begin = traffic.poses[other, min(step, last)], traffic.poses[other, min(max(step - 1, 0), last)]
+    reach = arrays.radius[k] + arrays.radius[other] + body.extra
+    dx, dy = np.float32(end[0] - after[0]), np.float32(end[1] - after[1])
+    far = reach + np.float32(2 * body.stride)
+    if dx * dx + dy * dy > far * far:
+        return False
+    turn, its_turn = turned_by(after[2] - before[2]), turned_by(np.float64(end[2]) - begin[2])
+    for part in range(parts):
+        back = part / parts
+        x = np.float32(after[0] - back * (after[0] - before[0]))
+        y = np.float32(after[1] - back * (after[1] - before[1]))
+        dx = np.float32(end[0] - back * (end[0] - begin[0])) - x
+        dy = np.float32(end[1] - back * (end[1] - begin[1])) - y
+        headings = (after[2] - back * turn, end[2] - back * its_turn)
+        if dx * dx + dy * dy <= reach * reach and _touches(body, other, headings, dx, dy, buffer):
+            return True
+    return False
+
+
+@compiled
+def _touches(
+    body: Body, other: Whole, headings: tuple[float, float], dx: np.float32, dy: np.float32, buffer: FloatArray
+) -> bool:
+    """Check whether another robot, offset by ``(dx, dy)`` from this one, is too near to it."""
+    f, k = body.footprints, body.robot
+    inner = f.inner[k] + f.inner[other] + body.extra
+    if dx * dx + dy * dy <= inner * inner:
+        return True
+    own, core = buffer[:TILE], buffer[TILE : 2 * TILE]
+    (c, s), (its_c, its_s) = direction(body, k, headings[0]), direction(body, other, headings[1])
+    place_body(f, k, c, s, np.float32(0), np.float32(0), own)
+    place_body(f, other, its_c, its_s, dx, dy, core)
+    return cores_within(own, core, body.extra)
+
+
+@compiled
+def is_met(body: Body, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray) -> bool:
+    """Check whether another robot is too near to this one in a step that ends at a number, between two poses of it."""
+    begin, end = visits_of(traffic, after[0], after[1])
+    for row in range(begin, end):
+        if traffic.visits[row, 1] <= step <= traffic.visits[row, 2] and _meets(
+            body, traffic, traffic.visits[row, 0], step, before, after, body.parts, buffer
+        ):
+            return True
+    return False
+
+
+@compiled
+def safe_until(body: Body, traffic: Traffic, step: Whole, pose: Floats, buffer: FloatArray) -> int:
+    """The first step, from this one on, in which another robot comes too near to one that stands there."""
+    until = NEVER
+    begin, end = visits_of(traffic, pose[0], pose[1])
+    for row in range(begin, end):
+        other = traffic.visits[row, 0]
+        since = max(step, traffic.visits[row, 1])
+        # Who stands does not come nearer.
+        last = min(traffic.visits[row, 2], until - 1, max(traffic.last[other], since))
+        for at in range(since, last + 1):
+            if _meets(body, traffic, other, at, pose, pose, body.parts if at > step else 1, buffer):
+                until = at
+                break
+    return until
+
+
+@compiled
+def safe_since(body: Body, traffic: Traffic, pose: Floats, buffer: FloatArray) -> int:
+    """The first step from which on no other robot comes too near to one that stands there, :data:`NEVER` for none."""
+    since = 0
+    begin, end = visits_of(traffic, pose[0], pose[1])
+    for row in range(begin, end):
+        other = traffic.visits[row, 0]
+        last = min(traffic.visits[row, 2], max(traffic.last[other], traffic.visits[row, 1]))
+        for at in range(last, max(since, traffic.visits[row, 1]) - 1, -1):
+            if _meets(body, traffic, other, at, pose, pose, body.parts, buffer):
+                if at == last < traffic.visits[row, 2]:
+                    # It stands there until it is gone.
+                    at = traffic.visits[row, 2]
+                since = max(since, min(at + 1, NEVER))
+                break
+    return since
