@@ -24,8 +24,8 @@ FIRST_NODES = 400_000
 quicker to change others' motions."""
 WEIGHT = 1.5
 """Times that the steps ahead count more than those behind."""
-PATIENCE = 0.4
-"""Time between departures that are tried [s]."""
+PATIENCE = 0.7
+"""Time between departures that are tried, in what the fastest robot takes for the radius of the largest one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,11 +178,12 @@ class TeamMotions:
 
     def _find(self, number: int, others: Iterable[int], held: dict[int, int]) -> Motion | None:
         """Look for a robot's motion among those of others, while those that are held stand where they start."""
-        robot, dt = self.robots[number], self.problem.dt
+        robot, problem = self.robots[number], self.problem
+        patience = max(1, round(PATIENCE * float(problem.team.radius.max()) / problem.stride))
         self._searches += 1
         task = Task(
             robot.body, robot.primitives, robot.limits, robot.goal, robot.lattice, robot.costs, robot.far,
-            robot.costs_lattice, WEIGHT, max(1, round(PATIENCE / dt)), self.problem.horizon, self._searches,
+            robot.costs_lattice, WEIGHT, patience, problem.horizon, self._searches,
         )  # fmt: skip
         self._nodes.filled[0] = 0
         traffic, goes_on, node = self._traffic(others, held), False, PAUSED
