@@ -86,7 +86,7 @@ class Team(Frozen):
             if not any(trailers):
                 self._set(radius=radii, shapes=())
                 return
-            discs = [Disc(size) for size in radii.tolist()]
+            discs = [Disc(float(str(size))) for size in radii]  # the decimal that files have
             given = [Train(disc, (disc,) * size) if size else disc for disc, size in zip(discs, trailers, strict=True)]
             radius = None
         footprints = (given,) * count if isinstance(given, Footprint) else tuple(given)

@@ -15,7 +15,7 @@ ENGINES = ("cpu", "jax", "plain")
 SECTIONS = (
     "denoising", "threads", "environments", "obstacles", "index", "robots", "startup", "memory", "plans",
 )  # fmt: skip
-MODELS = (*COMMON, "unicycle", "car")
+MODELS = (*COMMON, "unicycle", "unicycle1", "unicycle2", "car", "holonomic2d_jerk", "holonomic3d_drag")
 
 Robots = Annotated[Count, Field(le=10_000)]
 """Number of robots, as many as scenarios make."""

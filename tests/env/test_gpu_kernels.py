@@ -104,6 +104,7 @@ def test_a_denoising_run_is_one_loop_of_few_kernels_on_a_gpu(model: str, monkeyp
     task = SamplingTask(problem, np.zeros((HORIZON, 3, problem.control_size), np.float32))
     JaxSamplingEngine().prepare(task, planner.rules(), planner.noise_scale(), SAMPLES)
     (program,) = lowered
-    assert program.count("gpu.triton") == 2
+    # Rollouts and, of teams of discs, pair checks.
+    assert program.count("gpu.triton") == (1 if problem.team.shapes else 2)
     assert program.count("stablehlo.while") == 1
     assert "callback" not in program

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from numba.core import config
 
-from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN
+from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN, get_model
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.machine import commit, describe_machine
 from d4orm_planners.benchmark import bench_report, timing
@@ -140,7 +140,9 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
 def test_every_model_that_comes_with_the_package_is_measured_and_the_plain_loop_where_it_has_it() -> None:
     todo = parts(BenchmarkSettings(**{**TINY, "models": MODELS, "engines": ("cpu", "plain")}))
     measured = {what for section, what, _ in todo if section == "denoising"}
-    assert {what.split()[1] for what in measured} == set(tuple(MODEL_CODES)[:NUM_BUILT_IN])
+    # Cars with trailers do not fit on the circle.
+    expected = {name for name in tuple(MODEL_CODES)[:NUM_BUILT_IN] if not get_model(name).trailers}
+    assert {what.split()[1] for what in measured} == expected
     assert {what.split()[1] for what in measured if what.endswith("plain")} == set(COMMON)
 
 

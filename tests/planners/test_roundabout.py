@@ -11,7 +11,10 @@ from d4orm_planners import make_planner
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.roundabout import drive_roundabout
 
-PLANAR = [name for name, model in MODELS.items() if model.dimension == 2]
+# Cars with trailers do not fit on the circle, and robots whose jerk is limited swing out of it.
+PLANAR = [
+    name for name, model in MODELS.items() if model.dimension == 2 and not model.trailers and name != "holonomic2d_jerk"
+]
 
 
 @pytest.mark.parametrize("side", [1, -1])
