@@ -181,4 +181,4 @@ def test_two_cars_with_trailers_swap(tmp_path: Path) -> None:
 
 def test_a_team_with_trailers_is_made_by_name() -> None:
     problem = make_problem("circle", num_robots=2, model="car_with_1_trailer")
-    assert problem.team.shapes[0] == Train(Disc(float(np.float32(0.15))), [Disc(float(np.float32(0.15)))])
+    assert problem.team.shapes[0] == Train(Disc(0.15), [Disc(0.15)])
