@@ -24,7 +24,7 @@ WIDER, LATER = 1.2, 20
 """Poses count from which a robot takes at most so many times as long as from its start, and so many steps more."""
 
 
-class Body(NamedTuple):
+class RobotBody(NamedTuple):
     """A robot's body among the obstacles.
 
     Attributes:
@@ -44,7 +44,7 @@ class Body(NamedTuple):
     parts: int
 
 
-class Lattice(NamedTuple):
+class PoseLattice(NamedTuple):
     """Cells of positions and sectors of headings: poses in the same are taken for one.
 
     Attributes:
@@ -69,7 +69,7 @@ def turned_by(angle: float) -> float:
 
 
 @compiled
-def is_far_from_all(body: Body, x: float, y: float, wider: float) -> bool:
+def is_far_from_all(body: RobotBody, x: float, y: float, wider: float) -> bool:
     """Check whether the robot's disc, and so much round it, is clear of obstacles and bounds there; it may be so too
     where this does not find out.
     """
@@ -88,7 +88,7 @@ def is_far_from_all(body: Body, x: float, y: float, wider: float) -> bool:
 
 
 @compiled
-def is_free(body: Body, x: float, y: float, heading: float, buffer: FloatArray) -> bool:
+def is_free(body: RobotBody, x: float, y: float, heading: float, buffer: FloatArray) -> bool:
     """Check whether the robot is clear of obstacles and bounds there."""
     if is_far_from_all(body, x, y, 0.0):
         return True
@@ -99,7 +99,7 @@ def is_free(body: Body, x: float, y: float, heading: float, buffer: FloatArray) 
 
 
 @compiled
-def direction(body: Body, robot: Whole, heading: float) -> tuple[np.float32, np.float32]:
+def direction(body: RobotBody, robot: Whole, heading: float) -> tuple[np.float32, np.float32]:
     """Return what a robot's footprint is turned by at a heading, as a unit vector."""
     if body.footprints.heading[robot] < 0:
         return np.float32(1), np.float32(0)
@@ -114,7 +114,7 @@ def moved(x: float, y: float, heading: float, step: Floats) -> tuple[float, floa
 
 
 @compiled
-def cell_of(lattice: Lattice, x: float, y: float, heading: float, mode: Whole) -> int:
+def cell_of(lattice: PoseLattice, x: float, y: float, heading: float, mode: Whole) -> int:
     """Number of the cell of a pose in a mode, -1 outside."""
     i = int(np.floor((x - lattice.low[0]) * lattice.scale))
     j = int(np.floor((y - lattice.low[1]) * lattice.scale))
@@ -128,7 +128,7 @@ def cell_of(lattice: Lattice, x: float, y: float, heading: float, mode: Whole) -
 
 @compiled
 def is_way_free(
-    body: Body, primitives: Primitives, number: Whole, x: float, y: float, heading: float, buffer: FloatArray
+    body: RobotBody, primitives: Primitives, number: Whole, x: float, y: float, heading: float, buffer: FloatArray
 ) -> bool:
     """Check whether the robot is clear of obstacles and bounds after every step of a primitive."""
     if is_far_from_all(body, x, y, primitives.reach[number]):
@@ -143,8 +143,8 @@ def is_way_free(
 
 @compiled
 def _spread(
-    body: Body, primitives: Primitives, lattice: Lattice, start: Floats, pace: float, cell: int, costs: FloatArray,
-    poses: Floats, heap: Heap, buffer: FloatArray,
+    body: RobotBody, primitives: Primitives, lattice: PoseLattice, start: Floats, pace: float, cell: int,
+    costs: FloatArray, poses: Floats, heap: Heap, buffer: FloatArray,
 ) -> None:  # fmt: skip
     """Spread costs from a cell to those that primitives lead to."""
     x, y, heading = poses[cell, 0], poses[cell, 1], poses[cell, 2]
@@ -162,7 +162,7 @@ def _spread(
 
 @cached_kernel(**OPTIONS)
 def fill_costs(
-    body: Body, primitives: Primitives, lattice: Lattice, goals: Floats, start: Floats, pace: float,
+    body: RobotBody, primitives: Primitives, lattice: PoseLattice, goals: Floats, start: Floats, pace: float,
     costs: FloatArray, poses: Floats, heap: Heap,
 ) -> float:  # fmt: skip
     """Spread costs backwards from the goals over all poses from which it may be worthwhile to go there.

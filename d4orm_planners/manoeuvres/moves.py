@@ -6,7 +6,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.engine.compiling import compiled
-from d4orm_planners.manoeuvres.lattice import Body, is_far_from_all, is_free, moved, turned_by
+from d4orm_planners.manoeuvres.lattice import RobotBody, is_far_from_all, is_free, moved, turned_by
 from d4orm_planners.manoeuvres.nodes import MAX_STEPS, Nodes, Task
 from d4orm_planners.manoeuvres.snapping import Goal, snap_of, snap_pose, snap_steps
 
@@ -56,7 +56,7 @@ def docks_after(task: Task, nodes: Nodes, count: int) -> int:
 
 
 @compiled
-def is_sweep_free(body: Body, swept: Floats, count: int, buffer: FloatArray) -> bool:
+def is_sweep_free(body: RobotBody, swept: Floats, count: int, buffer: FloatArray) -> bool:
     """Check whether a move is clear of obstacles and bounds, in all parts of all steps."""
     for step in range(count, 0, -1):
         before, after = swept[step - 1], swept[step]

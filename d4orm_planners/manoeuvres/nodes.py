@@ -9,7 +9,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
 from d4orm_planners.manoeuvres.heaps import Heap, push
-from d4orm_planners.manoeuvres.lattice import BUFFER, Body, Lattice, cell_of, turned_by
+from d4orm_planners.manoeuvres.lattice import BUFFER, PoseLattice, RobotBody, cell_of, turned_by
 from d4orm_planners.manoeuvres.primitives import Primitives
 from d4orm_planners.manoeuvres.snapping import Goal, Limits, snap_of, snap_steps
 
@@ -82,21 +82,21 @@ class Task(NamedTuple):
         lattice: Cells and sectors.
         costs: Steps to the goal from every cell of the goal's own lattice, none in a world without obstacles, ...
         far: ... and from those that are not known.
-        costs_lattice: Lattice of the costs.
+        costs_lattice: PoseLattice of the costs.
         weight: Times that these count more than the steps behind.
         patience: Steps between departures that are tried.
         horizon: Last step.
         number: Of the search; no two with the same nodes have the same.
     """
 
-    body: Body
+    body: RobotBody
     primitives: Primitives
     limits: Limits
     goal: Goal
-    lattice: Lattice
+    lattice: PoseLattice
     costs: FloatArray
     far: float
-    costs_lattice: Lattice
+    costs_lattice: PoseLattice
     weight: float
     patience: int
     horizon: int

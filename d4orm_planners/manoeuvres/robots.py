@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
 from d4orm_planners.manoeuvres.heaps import Heap
-from d4orm_planners.manoeuvres.lattice import Body, Lattice, fill_costs
+from d4orm_planners.manoeuvres.lattice import PoseLattice, RobotBody, fill_costs
 from d4orm_planners.manoeuvres.primitives import MOVES, SECTOR, SECTORS, Kind, Mode, Primitives, primitives_of
 from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TURNING, Goal, Limits
 
@@ -119,11 +119,11 @@ class Robot:
     start: Floats
     goal: Goal
     limits: Limits
-    body: Body
+    body: RobotBody
     primitives: Primitives
     modes: tuple[Mode, ...]
-    lattice: Lattice
-    costs_lattice: Lattice
+    lattice: PoseLattice
+    costs_lattice: PoseLattice
     costs: FloatArray
     far: float
 
@@ -144,7 +144,9 @@ def make_robot(problem: Problem, number: int, area: Area, arrays: ProblemArrays,
     start[: _extra(model)] = problem.start[number, : _extra(model)]
     goal = _goal(problem, number, heading if sectors > 1 else np.nan)
     parts = int(np.ceil(CUTTING * problem.stride / extra))
-    body = Body(team.all_footprint_arrays, arrays, number, np.float32(extra), problem.stride, min(parts, MAX_PARTS))
+    body = RobotBody(
+        team.all_footprint_arrays, arrays, number, np.float32(extra), problem.stride, min(parts, MAX_PARTS)
+    )
     costs, far, limits = np.zeros(0, np.float32), np.inf, _limits(model, own, problem.dt)
     if problem.world.num_obstacles or limits.way == NOWHERE:
         costs, far = _costs(body, back, towards, goal, start, 1 / (own[SPEED] * problem.dt))
@@ -154,9 +156,9 @@ def make_robot(problem: Problem, number: int, area: Area, arrays: ProblemArrays,
     )  # fmt: skip
 
 
-def _lattice(area: Area, cell: float, heading: float, sectors: int) -> Lattice:
+def _lattice(area: Area, cell: float, heading: float, sectors: int) -> PoseLattice:
     size = np.ceil((area.high - area.low) / cell).astype(int).tolist()
-    return Lattice(area.low, 1 / cell, (size[0], size[1]), heading, sectors)
+    return PoseLattice(area.low, 1 / cell, (size[0], size[1]), heading, sectors)
 
 
 def _limits(model: Model, own: Floats, dt: float) -> Limits:
@@ -174,7 +176,7 @@ def _goal(problem: Problem, number: int, heading: float) -> Goal:
 
 
 def _costs(
-    body: Body, back: Primitives, lattice: Lattice, goal: Goal, start: Floats, pace: float
+    body: RobotBody, back: Primitives, lattice: PoseLattice, goal: Goal, start: Floats, pace: float
 ) -> tuple[FloatArray, float]:
     """Steps to the goal from all cells, and from where they are not known."""
     cells = len(back.rests) * lattice.sectors * lattice.size[0] * lattice.size[1]

@@ -11,7 +11,7 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.engine.convex_cores import cores_within, place_body
 from d4orm_env.engine.simd import TILE
-from d4orm_planners.manoeuvres.lattice import Body, direction, turned_by
+from d4orm_planners.manoeuvres.lattice import RobotBody, direction, turned_by
 
 NEVER = 1 << 40
 """Step that never comes."""
@@ -105,7 +105,7 @@ def visits_of(traffic: Traffic, x: float, y: float) -> tuple[int, int]:
 
 @compiled
 def _meets(
-    body: Body, traffic: Traffic, other: Whole, step: Whole, before: Floats, after: Floats, parts: int,
+    body: RobotBody, traffic: Traffic, other: Whole, step: Whole, before: Floats, after: Floats, parts: int,
     buffer: FloatArray,
 ) -> bool:  # fmt: skip
     """Check whether another robot is too near to this one in a step that ends at a number, between two poses of it."""
@@ -131,7 +131,7 @@ def _meets(
 
 @compiled
 def _touches(
-    body: Body, other: Whole, headings: tuple[float, float], dx: np.float32, dy: np.float32, buffer: FloatArray
+    body: RobotBody, other: Whole, headings: tuple[float, float], dx: np.float32, dy: np.float32, buffer: FloatArray
 ) -> bool:
     """Check whether another robot, offset by ``(dx, dy)`` from this one, is too near to it."""
     f, k = body.footprints, body.robot
@@ -146,7 +146,7 @@ def _touches(
 
 
 @compiled
-def is_met(body: Body, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray) -> bool:
+def is_met(body: RobotBody, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray) -> bool:
     """Check whether another robot is too near to this one in a step that ends at a number, between two poses of it."""
     begin, end = visits_of(traffic, after[0], after[1])
     for row in range(begin, end):
@@ -158,7 +158,7 @@ def is_met(body: Body, traffic: Traffic, step: Whole, before: Floats, after: Flo
 
 
 @compiled
-def safe_until(body: Body, traffic: Traffic, step: Whole, pose: Floats, buffer: FloatArray) -> int:
+def safe_until(body: RobotBody, traffic: Traffic, step: Whole, pose: Floats, buffer: FloatArray) -> int:
     """The first step, from this one on, in which another robot comes too near to one that stands there."""
     until = NEVER
     begin, end = visits_of(traffic, pose[0], pose[1])
@@ -175,7 +175,7 @@ def safe_until(body: Body, traffic: Traffic, step: Whole, pose: Floats, buffer: 
 
 
 @compiled
-def safe_since(body: Body, traffic: Traffic, pose: Floats, buffer: FloatArray) -> int:
+def safe_since(body: RobotBody, traffic: Traffic, pose: Floats, buffer: FloatArray) -> int:
     """The first step from which on no other robot comes too near to one that stands there, :data:`NEVER` for none."""
     since = 0
     begin, end = visits_of(traffic, pose[0], pose[1])
