@@ -114,7 +114,7 @@ class Team(Frozen):
         self._set(radius=radii, shapes=footprints if shaped else ())
 
     def _reach(self, robot: int, footprint: Footprint) -> float:
-        """How far a robot's bodies may reach about its reference point [m]."""
+        """Largest reach of a robot's bodies about its reference point [m]."""
         reach, distance = footprint.outer_radius, 0.0
         if isinstance(footprint, Train):
             for trailer, (_, column) in zip(footprint.trailers, self.robot_models[robot].trailers, strict=True):

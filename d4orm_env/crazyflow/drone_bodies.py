@@ -47,8 +47,8 @@ class DronePhysics:
 
 
 MODEL = "holonomic3d"
-SENSED = 0.2
-"""Share of what a drone is off its setpoint beside what is known of that already, that is seen within a step."""
+LAG = 0.2
+"""Time constant of a drone's accelerations [s]: it is not seen to be off its setpoint for less than twice that."""
 HOVER, GUST = 3.0, 0.5
 """Time to hover at the start before a flight, and for which a gust blows in one direction [s]."""
 FLOOR, LOST = 0.05, 0.5
@@ -87,7 +87,7 @@ class DroneBodies:
 
     Drones follow setpoints, which move as the team's model does under the controls and stay at the goal where that has
     arrived. Drones that are held hover. What is seen of a drone is its setpoint, and how far it is off that on the
-    average of a second: who saw what its attitude has not yet done would ask for it again.
+    average of half a second: who saw what its attitude has not yet done would ask for it again.
 
     Args:
         problem: The problem; see :func:`check_problem`.
@@ -142,7 +142,8 @@ class DroneBodies:
         touched = self.lead(before, self._setpoints, intruders)
         if self.problem.docks:
             self.hold(np.flatnonzero(reached_goals(self.problem.team, arrays, self._setpoints, controls)))
-        self._off += SENSED * (self._position - self._setpoints[:, :3] - self._off)
+        share = self.problem.dt / (self.problem.dt + 2 * LAG)
+        self._off += share * (self._position - self._setpoints[:, :3] - self._off)
         self._look()
         return Moved(self.states, touched)
 

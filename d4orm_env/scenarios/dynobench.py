@@ -172,7 +172,7 @@ def _model(own: Mapping[str, Any]) -> str:
 
 
 def _limits_of(own: Mapping[str, Any]) -> dict[str, float]:
-    """What our models have for themselves, from a type's parameters."""
+    """Limits that only one of our models has, from a type's parameters."""
     names = {"max_angular_acc": "max_turn_acceleration", "max_steering_abs": "max_steering", "l": "wheelbase"}
     limits = {ours: float(own[theirs]) for theirs, ours in names.items() if theirs in own}
     lower = {"min_vel": "max_reverse_speed", "min_angular_vel": "max_right_turn_rate"}

@@ -187,7 +187,7 @@ MMD_MAPS: Mapping[str, tuple[str, Sequence[Box]]] = {
         [(x, y, 0.4, 0.4) for x, y in product((-0.4, 0.4), repeat=2)],
     ),
 }
-"""What describes each map, and its boxes; see :func:`mmd_map`."""
+"""Description of each map, and its boxes; see :func:`mmd_map`."""
 
 
 def mmd_map(boxes: Sequence[Box], settings: Settings, *, side: float | None = None) -> Problem:

@@ -1,4 +1,4 @@
-"""Where a robot may be: its footprint among the obstacles, and how long it takes from any pose to its goal."""
+"""Free poses of a footprint among the obstacles, and the time from each of them to the goal."""
 
 from __future__ import annotations
 

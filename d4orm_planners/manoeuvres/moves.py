@@ -1,4 +1,4 @@
-"""Where a robot is in every step of a move, and whether obstacles let it pass."""
+"""Poses of a robot in every step of a move, and the check that obstacles let it pass."""
 
 from __future__ import annotations
 

@@ -57,9 +57,12 @@ def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> 
     # dt^2 times the control a step, which the controller does not ask of a robot.
     gained = 0.2 if model.startswith("holonomic") else 0.02
     np.testing.assert_allclose(places[:steps], states[:steps], atol=2e-5 if mode == "nominal" else gained)
+    speeds = np.linalg.norm([s.velocity for s in said], axis=2)
+    at_limit = (speeds >= 0.999 * problem.team.max_speed).any(axis=1)
+    before = int(at_limit.argmax()) if at_limit.any() else steps
+    np.testing.assert_allclose(places[:before], states[:before], atol=0.02)
     np.testing.assert_array_equal(said[-1].arrived, True)
     assert not any(s.held for s in said)
-    speeds = np.linalg.norm([s.velocity for s in said], axis=2)
     assert speeds.max() <= problem.team.max_speed.max() * (1 + 1e-5)
 
 
