@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -176,22 +176,7 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
     def ms(seconds: float) -> float:
         return 1000 * (seconds - start)
 
-    sent = {(row["robot"], row["message"]): row for row in own if row["event"] == "sent"}
-    told: set[tuple[int, str]] = set()
-    for row in own:
-        message = sent.get((row["of"], row["message"])) if row["event"] in ("received", "selected") else None
-        if message is None or row["of"] == row["robot"]:
-            continue
-        if row["event"] == "received":
-            # That a plan is told again is not shown.
-            if (row["robot"], row["plan"]) not in told:
-                axes.plot(
-                    [ms(message["time"]), ms(row["time"])], [row["of"], row["robot"]], color=FAINT, lw=0.7, zorder=1
-                )
-            told.add((row["robot"], row["plan"]))
-        else:
-            axes.plot([ms(message["time"]), ms(row["time"])], [row["of"], row["robot"]], color=INK, lw=1.4, zorder=4)
-            axes.plot(ms(row["time"]), row["robot"], "o", color=INK, ms=3.5, zorder=5)
+    _draw_messages(axes, own, ms)
     for row in own:
         if row["event"] == "computed":
             span = [(ms(row["time"]), ms(row["until"]) - ms(row["time"]))]
@@ -218,6 +203,31 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
         title=f"Round {number}: the plan of {whose} is taken over",
     )
     _rows_of(axes, num_robots)
+    _explain_round(axes)
+
+
+def _draw_messages(axes: Any, own: Sequence[Row], ms: Callable[[float], float]) -> None:
+    """A line for every message of a round that was received, black where its candidate was gone on from."""
+    sent = {(row["robot"], row["message"]): row for row in own if row["event"] == "sent"}
+    told: set[tuple[int, str]] = set()
+    for row in own:
+        message = sent.get((row["of"], row["message"])) if row["event"] in ("received", "selected") else None
+        if message is None or row["of"] == row["robot"]:
+            continue
+        if row["event"] == "received":
+            # That a plan is told again is not shown.
+            if (row["robot"], row["plan"]) not in told:
+                axes.plot(
+                    [ms(message["time"]), ms(row["time"])], [row["of"], row["robot"]], color=FAINT, lw=0.7, zorder=1
+                )
+            told.add((row["robot"], row["plan"]))
+        else:
+            axes.plot([ms(message["time"]), ms(row["time"])], [row["of"], row["robot"]], color=INK, lw=1.4, zorder=4)
+            axes.plot(ms(row["time"]), row["robot"], "o", color=INK, ms=3.5, zorder=5)
+
+
+def _explain_round(axes: Any) -> None:
+    """The legend of a round."""
     axes.legend(
         handles=[
             Patch(facecolor="#6B7280", label="computing"),
