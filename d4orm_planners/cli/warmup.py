@@ -99,7 +99,7 @@ def compile_for_planning(
 
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     # What ends it, as Ctrl-C, ends this process too, which says so.
-    names = "drive_once, find_paths, roll_out_once, sample_once"
+    names = "drive_once, find_paths, roll_out_once, sample_once, spread_waves"
     return subprocess.Popen(
         [sys.executable, "-c", f"from {__name__} import {names}; {call}"], stderr=subprocess.DEVNULL
     )
@@ -155,7 +155,7 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths()")
+    other = _in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()")
     sample_once((TEAMS[0], TEAMS[-1]))
     for models in TEAMS:
         roll_out_once(models)
@@ -166,6 +166,7 @@ def warm_up() -> WarmupReport:
     sample_once(TEAMS)
     drive_once(TEAMS[0])
     find_paths()
+    spread_waves()
     _evade()
     _plan()
     seconds = time.perf_counter() - begin
