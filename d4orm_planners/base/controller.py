@@ -71,7 +71,8 @@ class Controller:
         policy: Anything that :func:`~d4orm_planners.make_policy` takes.
         mode: ``"nominal"`` or ``"measured"``.
         reserve: Share of the robots' limits on speed, acceleration and turn rate that the reference leaves to the
-            feedback, in mode ``"nominal"`` or with a tracker.
+            feedback, in mode ``"nominal"`` or with a tracker. By default 0.5 with a tracker, which has its robot tilt
+            or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
             meanwhile, and its answer, which would be too late, is not used. ``None`` waits.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
@@ -91,7 +92,7 @@ class Controller:
         policy: PolicyLike = "d4orm-c2f",
         *,
         mode: Mode = "nominal",
-        reserve: float = 0.2,
+        reserve: float | None = None,
         timeout: float | None = None,
         lag: ArrayLike = 0.0,
         tracker: bool = False,
@@ -100,7 +101,8 @@ class Controller:
         if mode not in get_args(Mode):
             raise ValueError(f"mode is {shown(mode)}; choose one of {', '.join(get_args(Mode))}")
         self.mode = mode
-        self.reserve = positive_number(reserve, "reserve", zero_allowed=True, most=0.9)
+        default = 0.5 if tracker else 0.2 if mode == "nominal" else 0.0
+        self.reserve = default if reserve is None else positive_number(reserve, "reserve", zero_allowed=True, most=0.9)
         self.timeout = None if timeout is None else positive_number(timeout, "timeout")
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = tracker
@@ -137,8 +139,7 @@ class Controller:
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
         start = self._possible(self._completed(states)[0])
-        left = 1 - (self.reserve if self._leads else 0.0)
-        team = problem.team
+        left, team = 1 - self.reserve, problem.team
         limits = {name: left * getattr(team, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
         self._open(problem.with_state(start, problem.goal, team=team.replace(**limits)), seed)
         self.policy.reset(self._env, seed=seed)

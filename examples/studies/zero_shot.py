@@ -30,7 +30,7 @@ CONDITIONS: dict[str, dict[str, float]] = {
     "nominal, disturbed": DISTURBED,
     "measured, disturbed": DISTURBED,
 }
-HORIZON, RESERVE = 150, 0.5
+HORIZON = 150
 CALM = 10
 """Steps to fly on when all have arrived."""
 
@@ -75,8 +75,7 @@ def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
 
 def fly_controller(problem: Problem, seed: int, bodies: Any, mode: Any) -> Iterator[np.ndarray]:
     """Who has touched something in each step of D4orm-C2F."""
-    settings = {"reserve": RESERVE, "lag": find_robot(ROBOT).lag, "tracker": True, "refine": "sync"}
-    with Controller("d4orm-c2f", mode=mode, **settings) as controller:
+    with Controller("d4orm-c2f", mode=mode, tracker=True, lag=find_robot(ROBOT).lag, refine="sync") as controller:
         last, step, calm = bodies.states, 0, 0
         controller.begin(problem, last, seed=seed)
         while calm < CALM:

@@ -122,7 +122,7 @@ def test_robots_without_a_speed_limit_of_their_own_keep_it() -> None:
 def test_robots_with_trackers_lead_and_are_led() -> None:
     problem = team("holonomic2d", 4, horizon=150)
     states, wind, nearest = problem.start.copy(), np.float32([0.3, -0.2]), np.inf
-    with Controller("d4orm-c2f", mode="measured", tracker=True, lag=0.2, reserve=0.5, refine="sync") as controller:
+    with Controller("d4orm-c2f", mode="measured", tracker=True, lag=0.2, refine="sync") as controller:
         controller.begin(problem, states, seed=2)
         for step in range(problem.horizon):
             s = controller.step(states, step * problem.dt)
