@@ -12,7 +12,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 
 
-class _Part(JITCodeLibrary):
+class _PartLibrary(JITCodeLibrary):
     """Code of a function, to be linked into that of kernels and optimised there."""
 
     def _optimize_final_module(self) -> None:
@@ -43,5 +43,5 @@ class PartCompiler(Compiler):
     """numba's compiler, with such libraries."""
 
     def define_pipelines(self) -> Any:
-        self.state.library = _Part(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library = _PartLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return Compiler.define_pipelines(self)

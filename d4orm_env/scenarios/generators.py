@@ -12,7 +12,7 @@ from d4orm_env.core.portable import cos, root, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.layout import Layout, build, in_space
-from d4orm_env.scenarios.placement import Area, Points, round_up, scatter
+from d4orm_env.scenarios.placement import PlacementArea, Points, round_up, scatter
 from d4orm_env.scenarios.settings import JITTER, Settings, bounded
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -60,7 +60,7 @@ def random(settings: Settings, *, size: float | None = None) -> Problem:
         size = max(5.0, 1.25 * root(settings.num_robots, dimension))
     size = bounded(size, "size")
     starts, goals = scatter(settings, size)
-    area = Area(np.full(dimension, size / 2))
+    area = PlacementArea(np.full(dimension, size / 2))
     return build(settings, Layout(starts, goals, World(dimension=dimension), size * math.sqrt(dimension), area))
 
 
@@ -122,7 +122,7 @@ def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = N
     x = np.where(np.arange(settings.num_robots) < first, -distance / 2, distance / 2)
     dimension = settings.team.dimension
     starts, goals = (in_space(np.column_stack([side, y]), dimension) for side in (x, -x))
-    area = Area(in_space([distance / 2, first * spacing / 2], dimension)[0])
+    area = PlacementArea(in_space([distance / 2, first * spacing / 2], dimension)[0])
     return build(settings, Layout(starts, goals, World(dimension=dimension), distance, area))
 
 
@@ -191,7 +191,7 @@ def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
     if needed >= diameter:
         raise _too_small(settings, "diameter", diameter, needed)
     starts, goals = _antipodal(points * (diameter / 2))
-    area = Area(np.full(3, diameter / 2), is_round=True)
+    area = PlacementArea(np.full(3, diameter / 2), is_round=True)
     return Layout(starts, goals, World(dimension=3), diameter, area)
 
 
@@ -204,7 +204,7 @@ def antipodal_circle(settings: Settings, diameter: float) -> Layout:
     angle = 2 * math.pi * np.arange(count) / count
     points = diameter / 2 * np.column_stack([cos(angle), sin(angle)])
     starts, goals = _antipodal(in_space(points, dimension))
-    area = Area(in_space([diameter / 2, diameter / 2], dimension)[0], is_round=True)
+    area = PlacementArea(in_space([diameter / 2, diameter / 2], dimension)[0], is_round=True)
     return Layout(starts, goals, World(dimension=dimension), diameter, area)
 
 

@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MAX_HORIZON, check_places
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.placement import Area, Points, with_random_obstacles
+from d4orm_env.scenarios.placement import PlacementArea, Points, with_random_obstacles
 from d4orm_env.scenarios.settings import LARGEST, Settings, bounded
 
 MIN_HORIZON = 100
@@ -39,7 +39,7 @@ class Layout:
     goals: Points
     world: World
     travel: float
-    area: Area | None = None
+    area: PlacementArea | None = None
 
 
 def build(settings: Settings, layout: Layout) -> Problem:
@@ -139,7 +139,7 @@ def require_margin(settings: Settings, world: World, starts: Points, goals: Poin
             )
 
 
-def with_bounds(settings: Settings, world: World, area: Area | None) -> World:
+def with_bounds(settings: Settings, world: World, area: PlacementArea | None) -> World:
     """The world, with the bounds that were asked for if any were.
 
     A margin is laid around the scenario's ``area``, the same for every seed, so that worlds that differ in their seed

@@ -15,7 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.generators import antipodal_circle, antipodal_sphere, circle, mixed_team
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.placement import Area, Points
+from d4orm_env.scenarios.placement import PlacementArea, Points
 from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, bounded, require_plane
 
 SINGLE_RADIUS = 0.5
@@ -57,7 +57,7 @@ def paper_random(settings: Settings) -> Problem:
     for _ in range(RESTARTS):
         starts = _starts(random, goals, SPACING * float(np.max(settings.team.radius)))
         if len(starts) == len(goals):
-            area = Area(np.full(2, SIDE / 2))
+            area = PlacementArea(np.full(2, SIDE / 2))
             return build(settings, Layout(starts, goals, World(dimension=2), FURTHEST, area))
     raise ValueError(
         f"scenario {settings.scenario!r}: {settings.num_robots} robots of radius {np.max(settings.team.radius):g} m "

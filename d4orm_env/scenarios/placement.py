@@ -23,7 +23,7 @@ DENSITY = {2: 0.4, 3: 0.25}
 """Share of the area (volume) that random placement fills without fail; it jams at 0.547 (0.384)."""
 
 
-class Area(NamedTuple):
+class PlacementArea(NamedTuple):
     """Region that points are drawn from: a box, or the ellipse (ellipsoid) inside it.
 
     Attributes:
@@ -53,7 +53,7 @@ def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
     """
     count, dimension = settings.num_robots, settings.team.dimension
     random = settings.generator(STARTS_AND_GOALS)
-    area = Area(np.full(dimension, size / 2))
+    area = PlacementArea(np.full(dimension, size / 2))
     needed = max(size_for(count, settings.spacing, dimension), 3 * settings.goal_radius)
     starts, goals = np.empty((0, dimension)), np.empty((0, dimension))
     for robot in range(count if needed <= size else 0):
@@ -77,7 +77,7 @@ def size_for(count: int, spacing: float, dimension: int) -> float:
     return root(count * ball / DENSITY[dimension], dimension) if count > 1 else 0.0
 
 
-def with_random_obstacles(settings: Settings, world: World, places: Points, area: Area) -> World:
+def with_random_obstacles(settings: Settings, world: World, places: Points, area: PlacementArea) -> World:
     """The world and ``settings.num_obstacles`` random circles, or spheres in space.
 
     They keep more than the margin to the ``places`` ``(2 K, d)``, starts, then goals, of which there are none where
@@ -117,7 +117,7 @@ def round_up(value: float) -> str:
 
 def _with_another(
     random: np.random.Generator,
-    area: Area,
+    area: PlacementArea,
     points: Points,
     spacing: float,
     avoid: tuple[Points, float] | None = None,
@@ -132,7 +132,9 @@ def _with_another(
     return points if place is None else np.vstack([points, place])
 
 
-def _first(random: np.random.Generator, area: Area, is_free: Callable[[Points], NDArray[np.bool_]]) -> Points | None:
+def _first(
+    random: np.random.Generator, area: PlacementArea, is_free: Callable[[Points], NDArray[np.bool_]]
+) -> Points | None:
     """The first uniform random point of an area that is free, or ``None`` if none of many was."""
     half = area.half_extent
     for attempt in range(ROUNDS):

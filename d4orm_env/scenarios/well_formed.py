@@ -20,7 +20,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.free_space import FreeSpace, Mask, free_space
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.placement import Area, Points, round_up, with_random_obstacles
+from d4orm_env.scenarios.placement import PlacementArea, Points, round_up, with_random_obstacles
 from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
 
 ndimage: Any = LazyModule("scipy.ndimage")
@@ -175,7 +175,7 @@ def with_obstacles(settings: Settings, world: World, places: Points | None = Non
     """A world with bounds and the random obstacles asked for, clear of starts and goals if they are known."""
     low, high = world.bounds.astype(np.float64)
     places = np.empty((0, world.dimension)) if places is None else places
-    return with_random_obstacles(settings, world, places, Area((high - low) / 2, centre=(low + high) / 2))
+    return with_random_obstacles(settings, world, places, PlacementArea((high - low) / 2, centre=(low + high) / 2))
 
 
 def draw_team(

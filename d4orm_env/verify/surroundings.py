@@ -55,7 +55,7 @@ class Boxes(Static):
         return box_approach(start, end, self._boxes[columns])
 
 
-class Polygon(Static):
+class PolygonObstacle(Static):
     """Robots against one polygon."""
 
     def __init__(self, robot: Indices, radius: Floats, corners: Floats, name: str) -> None:
@@ -100,7 +100,7 @@ def surroundings(world: World, robot: Indices, radius: Floats) -> list[Watch]:
     if len(world.boxes):
         watches.append(Boxes(robot, radius, np.asarray(world.boxes, np.float64)))
     for index, corners in enumerate(world.polygons):
-        watches.append(Polygon(robot, radius, np.asarray(corners, np.float64), f"polygons[{index}]"))
+        watches.append(PolygonObstacle(robot, radius, np.asarray(corners, np.float64), f"polygons[{index}]"))
     if world.lower is not None:
         lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
         watches.append(Bounds(robot, radius, lower, upper))

@@ -64,7 +64,7 @@ def node_seed(seed: int, node: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class NodeTask:
     """Common task of the nodes of one solve.
 
     Attributes:
@@ -107,7 +107,7 @@ class Node:
     def __init__(
         self,
         number: int,
-        task: Task,
+        task: NodeTask,
         planner: Planner,
         transport: Transport,
         evaluator: Evaluator,

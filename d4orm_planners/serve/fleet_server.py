@@ -37,7 +37,7 @@ TELL = 1.0
 
 
 @dataclass
-class Robot:
+class FleetRobot:
     """A robot as it was last heard.
 
     Attributes:
@@ -108,7 +108,7 @@ class FleetServer:
         self.deadline = positive_number(deadline, "deadline", least=problem.dt)
         self._problem, self._controller, self._seed = problem, controller, seed
         unknown = np.full(problem.state_size, np.nan, np.float32)
-        self._robots = [Robot(name, unknown) for name in names]
+        self._robots = [FleetRobot(name, unknown) for name in names]
         self._by_name = {name: robot for robot, name in enumerate(names)}
         self._odometry = session.subscriber("*/odom", messages.Odometry)
         self._poses = session.subscriber("*/pose", messages.PoseStamped)

@@ -19,7 +19,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.mmd.constraint_tree import Constraint, Planning, count_conflicts, first_conflict
-from d4orm_planners.baselines.mmd.guiding import Surroundings, guide
+from d4orm_planners.baselines.mmd.guiding import PathSurroundings, guide
 from d4orm_planners.baselines.mmd.path_frame import (
     FEATURES,
     MODES,
@@ -215,8 +215,8 @@ def test_plans_are_learned_as_they_are_driven() -> None:
 # Guidance.
 
 
-def surroundings(problem: Problem, **changes: Any) -> Surroundings:
-    nothing = Surroundings(
+def surroundings(problem: Problem, **changes: Any) -> PathSurroundings:
+    nothing = PathSurroundings(
         world_space(problem),
         0.2,
         problem.team.largest_radius,

@@ -25,7 +25,7 @@ zenoh = pytest.importorskip("zenoh")
 typesys = pytest.importorskip("rosbags.typesys")
 
 from d4orm_planners.serve import messages  # noqa: E402
-from d4orm_planners.serve.fleet_server import FleetServer, Robot  # noqa: E402
+from d4orm_planners.serve.fleet_server import FleetRobot, FleetServer  # noqa: E402
 from d4orm_planners.serve.team_messages import state_from, twist  # noqa: E402
 from d4orm_planners.serve.wire import RosSession  # noqa: E402
 
@@ -203,7 +203,7 @@ def test_emergency_stop_silence_and_restart(endpoint: str) -> None:
 
 
 def test_velocities_are_taken_from_poses() -> None:
-    robot, stamped = Robot("a", np.zeros(4, np.float32)), messages.PoseStamped()
+    robot, stamped = FleetRobot("a", np.zeros(4, np.float32)), messages.PoseStamped()
     for now, x, velocity in ((0.0, 1.0, 0.0), (0.01, 9.0, 0.0), (0.05, 1.1, 2.0), (0.06, 1.1, 2.0), (0.01, 3.0, 0.0)):
         stamped.header.stamp.nanosec, stamped.pose.position.x = round(1e9 * now), x
         robot.take_pose(stamped, 0.04)

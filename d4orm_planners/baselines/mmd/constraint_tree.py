@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths.spaces import Space
-from d4orm_planners.baselines.mmd.guiding import Surroundings
+from d4orm_planners.baselines.mmd.guiding import PathSurroundings
 from d4orm_planners.baselines.mmd.path_frame import PathFrame
 from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
 
@@ -92,7 +92,7 @@ class Constraint(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class RobotMotion:
     """Motion of one robot in a node of the tree.
 
     Attributes:
@@ -127,7 +127,7 @@ class TreeNode:
     conflicts: int
     cost: int
     number: int
-    motions: tuple[Motion, ...] = field(compare=False)
+    motions: tuple[RobotMotion, ...] = field(compare=False)
     constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)
     pair: tuple[int, int] = field(compare=False)
     step: int = field(compare=False)
@@ -169,13 +169,13 @@ class Planning:
 
     def root(self, seeds: list[int]) -> TreeNode:
         """All robots' motions, one after another around those that have planned (soft constraints only)."""
-        motions: list[Motion] = []
+        motions: list[RobotMotion] = []
         for robot, seed in enumerate(seeds):
             motions.append(self._plan(robot, motions, list(range(robot)), (), seed, None))
         return self.node(0, tuple(motions), ((),) * len(seeds))
 
     def node(
-        self, number: int, motions: tuple[Motion, ...], constraints: tuple[tuple[Constraint, ...], ...]
+        self, number: int, motions: tuple[RobotMotion, ...], constraints: tuple[tuple[Constraint, ...], ...]
     ) -> TreeNode:
         """A node with its conflicts counted and the first one found."""
         places = np.stack([motion.places for motion in motions])
@@ -222,17 +222,17 @@ class Planning:
     def _plan(
         self,
         robot: int,
-        motions: list[Motion],
+        motions: list[RobotMotion],
         others: list[int],
         constraints: tuple[Constraint, ...],
         seed: int,
         before: FloatArray | None,
-    ) -> Motion:
+    ) -> RobotMotion:
         """The motion of a robot that conflicts least with these others, of those that were denoised together."""
         config, frame = self._config, self._frames[robot]
         paths = np.stack([motions[other].places for other in others]) if others else np.empty((0, 1, 3))
         distances = self._distances[robot, others]
-        surroundings = Surroundings(
+        surroundings = PathSurroundings(
             space=self._space,
             clearance=frame.reach + config.clearance * self._problem.stride,
             size=self._problem.team.largest_radius,
@@ -247,7 +247,7 @@ class Planning:
         self.steps += batch.steps
         return self._choose(batch, paths, distances, frame.reach)
 
-    def _choose(self, batch: Batch, paths: Floats, distances: Floats, reach: float) -> Motion:
+    def _choose(self, batch: Batch, paths: Floats, distances: Floats, reach: float) -> RobotMotion:
         driven = batch.driven
         counts: NDArray[np.int64] = np.zeros((len(batch.motions), 2), np.int64)
         if len(paths):
@@ -255,4 +255,4 @@ class Planning:
         fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < reach + self._slack)
         best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
         controls, places = driven.controls[best].copy(), driven.places[best].copy()
-        return Motion(batch.motions, controls, places, int(driven.arrivals[best]), bool(fails[best]))
+        return RobotMotion(batch.motions, controls, places, int(driven.arrivals[best]), bool(fails[best]))

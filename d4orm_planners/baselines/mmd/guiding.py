@@ -27,7 +27,7 @@ _BACKING = 0.02
 the rest."""
 
 
-class Surroundings(NamedTuple):
+class PathSurroundings(NamedTuple):
     """Constraints on a robot's motion.
 
     Attributes:
@@ -71,7 +71,7 @@ def guide(
     frame: PathFrame,
     sines: Floats,
     deviation: Floats,
-    surroundings: Surroundings,
+    surroundings: PathSurroundings,
     durations: Floats,
     steps: int,
     motions: FloatArray,
@@ -117,7 +117,7 @@ def guide(
 
 
 @compiled
-def _violation(surroundings: Surroundings, step: Whole, spot: Floats, push: Floats) -> bool:
+def _violation(surroundings: PathSurroundings, step: Whole, spot: Floats, push: Floats) -> bool:
     """Fill ``push`` ``(3,)`` with what would end a place's violations at a step [m]; whether there are any."""
     push[:] = 0.0
     place, aside = spot[0], spot[2]

@@ -11,7 +11,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.counter_draws import draw_normals, draw_uniforms
-from d4orm_planners.baselines.mmd.guiding import Surroundings, guide
+from d4orm_planners.baselines.mmd.guiding import PathSurroundings, guide
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, sine_table
 from d4orm_planners.baselines.mmd.prior import (
     SIZE,
@@ -57,7 +57,7 @@ class Denoiser:
         self._deviation = self._prior.deviation.astype(np.float64)
 
     def denoise(
-        self, robot: int, frame: PathFrame, surroundings: Surroundings, seed: int, before: FloatArray | None = None
+        self, robot: int, frame: PathFrame, surroundings: PathSurroundings, seed: int, before: FloatArray | None = None
     ) -> Batch:
         """Motions of a robot that mind its surroundings, as well as guidance achieves it.
 
