@@ -21,7 +21,6 @@ __all__ = ["Box", "Capsule", "Disc", "Ellipsoid", "Footprint", "Polygon", "Train
 MAX_CORNERS = 8
 """Most corners of a polygon."""
 
-
 _ANGLES = np.linspace(0, 2 * np.pi, 64, endpoint=False)
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 """``(64, 2)`` unit vectors all round."""
@@ -29,8 +28,7 @@ DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 def _lengths(vectors: Floats) -> Floats:
     """``(n,)`` lengths of ``(n, 2)``, with the same bits on every processor, which ``hypot`` has not."""
-    lengths: Floats = np.sqrt(vectors[:, 0] * vectors[:, 0] + vectors[:, 1] * vectors[:, 1])
-    return lengths
+    return np.sqrt(vectors[:, 0] * vectors[:, 0] + vectors[:, 1] * vectors[:, 1])
 
 
 class Core(NamedTuple):
@@ -80,7 +78,7 @@ class Footprint(ABC):
     def outline(self) -> Floats:
         """``(n, 2)`` points round it, counterclockwise, seen from above [m]: to draw it."""
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
             if name == "offset":
                 if not (isinstance(value, int | float) and abs(value) <= LARGEST):
@@ -98,9 +96,6 @@ class Disc(Footprint):
     """
 
     radius: float
-
-    def __post_init__(self) -> None:
-        self._check()
 
     @property
     def outer_radius(self) -> float:
@@ -162,9 +157,6 @@ class Box(Planar):
     width: float
     offset: float = 0.0
 
-    def __post_init__(self) -> None:
-        self._check()
-
     @property
     def core(self) -> Core:
         """Its four corners."""
@@ -185,9 +177,6 @@ class Capsule(Planar):
     length: float
     radius: float
     offset: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._check()
 
     @property
     def core(self) -> Core:
@@ -251,9 +240,6 @@ class Ellipsoid(Footprint):
     z: float
     dimension = 3
 
-    def __post_init__(self) -> None:
-        self._check()
-
     @property
     def semi_axes(self) -> tuple[float, float, float]:
         """Along x, y and z."""
@@ -297,7 +283,7 @@ class Train(Footprint):
 
     @property
     def outer_radius(self) -> float:
-        """That of the front; how far the trailers reach follows from their hitches, see :attr:`Team.radius`."""
+        """That of the front; see :attr:`Team.radius` for how far trailers reach."""
         return self.front.outer_radius
 
     @property

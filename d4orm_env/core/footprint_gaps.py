@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.footprints import Core, Footprint
@@ -51,6 +51,25 @@ def touching(team: Team, states: FloatArray, among: NDArray[np.intp], rounding: 
             partners.setdefault(one, []).append(other)
             partners.setdefault(other, []).append(one)
     return partners
+
+
+def near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray, IntArray, Floats]:
+    """Pairs of robots at ``points`` ``(K, d)`` within the margin: the first, the second, and their gap [m]."""
+    axis = int(np.argmax(np.ptp(points, axis=0)))
+    order = np.argsort(points[:, axis], kind="stable")
+    along, reach = points[order, axis], 2 * radius.max() + margin
+    pairs: list[IntArray] = [np.empty((2, 0), np.int64)]
+    for offset in range(1, len(points)):
+        # Robots farther apart along the axis than any two reach need no look; a larger offset brings none nearer.
+        near = np.flatnonzero(along[offset:] - along[:-offset] <= reach)
+        if not len(near):
+            break
+        pairs.append(np.sort(np.stack([order[near], order[near + offset]]), axis=0))
+    first, second = np.concatenate(pairs, axis=1)
+    gaps = np.linalg.norm(points[first] - points[second], axis=1) - radius[first] - radius[second]
+    kept = gaps <= margin
+    by_robot = np.lexsort((first[kept], second[kept]))
+    return first[kept][by_robot], second[kept][by_robot], gaps[kept][by_robot]
 
 
 def world_gap(world: World, footprint: Footprint, pose: Floats) -> float:

@@ -12,13 +12,12 @@ from d4orm_env.core.arrays import (
     SMALLEST,
     FloatArray,
     Floats,
-    IntArray,
     as_float32,
     positive_number,
     shown,
     whole_number,
 )
-from d4orm_env.core.footprint_gaps import pair_gap, world_gap
+from d4orm_env.core.footprint_gaps import near_pairs, pair_gap, world_gap
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
@@ -246,7 +245,7 @@ def check_places(
     for robot in np.flatnonzero(gaps <= 0):
         where = f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an obstacle"
         raise ValueError(f"{where} or outside the bounds ({_size(team, int(robot))}); move it, or change the world")
-    first, second, between = _near_pairs(places.astype(np.float64), radius, margin)
+    first, second, between = near_pairs(places.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
         between = np.array([_least_gap(team, poses, bodies[one], bodies[other]) for one, other in pairs], np.float64)
@@ -278,25 +277,6 @@ def _least_gap(team: Team, poses: Floats, some: list[int], others: list[int]) ->
 def _size(team: Team, robot: int) -> str:
     footprint = team.footprint[robot]
     return f"robot radius {footprint.radius:g} m" if isinstance(footprint, Disc) else f"footprint {footprint}"
-
-
-def _near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray, IntArray, Floats]:
-    """Pairs of robots at ``points`` ``(K, d)`` within the margin: the first, the second, and their gap [m]."""
-    axis = int(np.argmax(np.ptp(points, axis=0)))
-    order = np.argsort(points[:, axis], kind="stable")
-    along, reach = points[order, axis], 2 * radius.max() + margin
-    pairs: list[IntArray] = [np.empty((2, 0), np.int64)]
-    for offset in range(1, len(points)):
-        # Robots farther apart along the axis than any two reach need no look; a larger offset brings none nearer.
-        near = np.flatnonzero(along[offset:] - along[:-offset] <= reach)
-        if not len(near):
-            break
-        pairs.append(np.sort(np.stack([order[near], order[near + offset]]), axis=0))
-    first, second = np.concatenate(pairs, axis=1)
-    gaps = np.linalg.norm(points[first] - points[second], axis=1) - radius[first] - radius[second]
-    kept = gaps <= margin
-    by_robot = np.lexsort((first[kept], second[kept]))
-    return first[kept][by_robot], second[kept][by_robot], gaps[kept][by_robot]
 
 
 def _turning_limits(model: Model) -> str:

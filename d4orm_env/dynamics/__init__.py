@@ -1,14 +1,6 @@
 """Robot models, one file each, and what a model of one's own is made of: see ``docs/own_robot.md``."""
 
-from d4orm_env.dynamics.robot_model import (
-    ACCELERATION,
-    OWN_LIMITS,
-    SPEED,
-    TURN_RATE,
-    Limit,
-    Model,
-    ModelFunctions,
-    Ops,
+from d4orm_env.dynamics.formulas import (
     between,
     clip,
     control_scale,
@@ -19,6 +11,7 @@ from d4orm_env.dynamics.robot_model import (
     stopping_speed,
     turn_towards,
 )
+from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE, Limit, Model, ModelFunctions, Ops
 
 __all__ = [
     "ACCELERATION", "OWN_LIMITS", "SPEED", "TURN_RATE", "Limit", "Model", "ModelFunctions", "Ops", "between", "clip",

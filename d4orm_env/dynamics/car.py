@@ -7,6 +7,7 @@ steering angle as states.
 
 from __future__ import annotations
 
+from d4orm_env.dynamics.formulas import clip, planar_approach, turn_towards
 from d4orm_env.dynamics.robot_model import (
     ACCELERATION,
     OWN_LIMITS,
@@ -18,9 +19,6 @@ from d4orm_env.dynamics.robot_model import (
     Ops,
     TimeStep,
     Vector,
-    clip,
-    planar_approach,
-    turn_towards,
 )
 
 MAX_STEERING, MAX_STEERING_RATE, WHEELBASE = range(OWN_LIMITS, OWN_LIMITS + 3)

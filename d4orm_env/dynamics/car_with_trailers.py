@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable
 from itertools import chain
 
+from d4orm_env.dynamics.formulas import between, clip, first_order_approach, turn_towards
 from d4orm_env.dynamics.robot_model import (
     OWN_LIMITS,
     SPEED,
@@ -22,10 +23,6 @@ from d4orm_env.dynamics.robot_model import (
     Ops,
     TimeStep,
     Vector,
-    between,
-    clip,
-    first_order_approach,
-    turn_towards,
 )
 
 MAX_STEERING, MAX_REVERSE_SPEED, WHEELBASE, HITCH_1, HITCH_2, HITCH_3 = (OWN_LIMITS + i for i in (0, 1, 2, 3, 5, 7))

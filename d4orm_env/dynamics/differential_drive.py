@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from d4orm_env.dynamics.formulas import clip, planar_approach, turn_towards
 from d4orm_env.dynamics.robot_model import (
     ACCELERATION,
     SPEED,
@@ -12,9 +13,6 @@ from d4orm_env.dynamics.robot_model import (
     Ops,
     TimeStep,
     Vector,
-    clip,
-    planar_approach,
-    turn_towards,
 )
 
 

@@ -2,19 +2,8 @@
 
 from __future__ import annotations
 
-from d4orm_env.dynamics.robot_model import (
-    ACCELERATION,
-    SPEED,
-    Model,
-    ModelFunctions,
-    Number,
-    Ops,
-    TimeStep,
-    Vector,
-    control_scale,
-    norm_scale,
-    planar_approach,
-)
+from d4orm_env.dynamics.formulas import control_scale, norm_scale, planar_approach
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, Model, ModelFunctions, Number, Ops, TimeStep, Vector
 
 
 def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:

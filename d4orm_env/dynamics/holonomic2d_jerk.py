@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from d4orm_env.dynamics.formulas import control_scale, norm_scale, planar_approach
 from d4orm_env.dynamics.robot_model import (
     ACCELERATION,
     OWN_LIMITS,
@@ -13,9 +14,6 @@ from d4orm_env.dynamics.robot_model import (
     Ops,
     TimeStep,
     Vector,
-    control_scale,
-    norm_scale,
-    planar_approach,
 )
 
 MAX_JERK = OWN_LIMITS

@@ -1,9 +1,8 @@
 """A robot model: its functions, each written once in scalar style, and what they share.
 
 A model is a handful of pure functions on tuples of numbers. They contain no loops, no array library and no float
-literals, so that the CPU engine compiles them with numba, the JAX engine traces them over arrays whose last axis is the
-sample, and CasADi can differentiate them, all from the same source and in the caller's precision. Mathematical
-functions come in through :class:`Ops`.
+literals, so that numba compiles them, JAX traces them over arrays whose last axis is the sample, and CasADi
+differentiates them, in the caller's precision. Mathematical functions come in through :class:`Ops`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ SPEED, ACCELERATION, TURN_RATE = range(3)
 STANDARD_LIMITS = ("max_speed", "max_acceleration", "max_turn_rate")
 OWN_LIMITS = len(STANDARD_LIMITS)
 """Column of the first limit that a model has for itself."""
-
 
 Operand: TypeAlias = Any
 """Another number, or a constant of Python; what a library accepts differs from one to the next."""
@@ -90,7 +88,6 @@ class Ops(NamedTuple):
 
 PYTHON_OPS = Ops(math.cos, math.sin, math.sqrt, min, max, math.atan2, lambda condition, a, b: a if condition else b)
 """Over Python's numbers."""
-
 
 ModelFunction: TypeAlias = Callable[..., Any]
 """It returns what it is given numbers of."""
@@ -203,14 +200,12 @@ class Model:
         functions: The scalar-style functions.
         own_limits: Limits beyond the three that all models have, from column :data:`OWN_LIMITS` on.
         state_limits: ``(state component, column of the limits)`` for components other than speeds that
-            :attr:`ModelFunctions.limit_state` bounds. Components with the same column share it as the limit of their
-            norm.
+            :attr:`ModelFunctions.limit_state` bounds; those with the same column by their norm.
         lower_limits: ``(column, column of its own)`` for limits that hold for positive values only, such as a speed
             forwards: the second one's bounds the magnitude of negative values, such as a speed backwards.
         trailers: ``(state component of its hitch angle, column of its hitch's length)`` of each trailer, from the front
-            on. A hitch angle is what a trailer's heading lags behind that of the body before it.
-        own_angles: State components other than the heading that are angles: to them, as to the
-            heading, a whole turn makes no difference, so that they do not wind up.
+            on; the angle is what its heading lags behind that of the body before it.
+        own_angles: State components other than the heading that are angles, which do not wind up either.
     """
 
     name: str
@@ -293,7 +288,6 @@ class Model:
     def _turn_rate(self, most: list[float], *, moving: bool) -> float:
         """Sought among the states and controls at their limits, which is where models turn fastest."""
         bounds = dict(self.state_limits) | dict.fromkeys(self.speed_indices, SPEED)
-
         lowest = self.lower_bounds(most)
 
         def ends(column: int | None) -> tuple[float, ...]:
@@ -304,62 +298,3 @@ class Model:
         return max(
             abs(self.functions.derivative(x, u, most, PYTHON_OPS)[self.heading_index]) for x in states for u in controls
         )
-
-
-def norm_scale(square: Number, limit: Number, ops: Ops) -> Number:
-    """Factor that brings a vector of this squared length to at most ``limit``; exactly one for a shorter vector."""
-    return limit / ops.sqrt(ops.maximum(square, limit * limit))
-
-
-def control_scale(square: Number, limit: Number, ops: Ops) -> Number:
-    """Return :func:`norm_scale`; NaN where the square has overflowed, lest the control pass for none at all."""
-    return norm_scale(square, limit, ops) + (square - square)
-
-
-def clip(value: Number, limit: Number, ops: Ops) -> Number:
-    return ops.maximum(-limit, ops.minimum(limit, value))
-
-
-def between(value: Number, least: Number, most: Number, ops: Ops) -> Number:
-    """Return the value, or the bound that it is beyond."""
-    return ops.maximum(least, ops.minimum(most, value))
-
-
-def stopping_speed(distance: Number, limits: Vector, h: TimeStep, ops: Ops) -> Number:
-    """Fastest speed from which a robot with a limited acceleration stops within a distance."""
-    acceleration = limits[ACCELERATION]
-    # Braking begins with the next step.
-    lost = acceleration * h.half
-    return ops.minimum(limits[SPEED], ops.sqrt((acceleration + acceleration) * distance + lost * lost) - lost)
-
-
-def share(part: Number, whole: Number, other: Number, ops: Ops) -> Number:
-    """``part / whole``, and no division by zero where both are: ``other`` is any number but zero."""
-    return part / ops.where(whole > 0, whole, other)
-
-
-def planar_approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
-    """:attr:`ModelFunctions.approach` of a planar model with a limited acceleration."""
-    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
-    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
-    pace = share(stopping_speed(distance, limits, h, ops), distance, h.full, ops)
-    return (gap_x * pace, gap_y * pace)
-
-
-def first_order_approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
-    """:attr:`ModelFunctions.approach` of a planar model that takes a new speed at once."""
-    gap_x, gap_y = goal[0] - x[0], goal[1] - x[1]
-    distance = ops.sqrt(gap_x * gap_x + gap_y * gap_y)
-    # It stops at once, and need only not overshoot within a step.
-    pace = share(ops.minimum(limits[SPEED], distance / h.full), distance, h.full, ops)
-    return (gap_x * pace, gap_y * pace)
-
-
-def turn_towards(heading: Number, velocity: Vector, ops: Ops) -> tuple[Number, Number]:
-    """The wanted velocity's part along the heading [m/s], and the turn that brings the heading to it [rad]."""
-    facing_x, facing_y = ops.cos(heading), ops.sin(heading)
-    along = facing_x * velocity[0] + facing_y * velocity[1]
-    across = facing_x * velocity[1] - facing_y * velocity[0]
-    none = along - along
-    # To stand still no heading is better than the present one.
-    return along, ops.where(along * along + across * across > 0, ops.arctan2(across, along), none)

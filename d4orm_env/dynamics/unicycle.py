@@ -2,19 +2,8 @@
 
 from __future__ import annotations
 
-from d4orm_env.dynamics.robot_model import (
-    SPEED,
-    TURN_RATE,
-    Model,
-    ModelFunctions,
-    Number,
-    Ops,
-    TimeStep,
-    Vector,
-    clip,
-    first_order_approach,
-    turn_towards,
-)
+from d4orm_env.dynamics.formulas import clip, first_order_approach, turn_towards
+from d4orm_env.dynamics.robot_model import SPEED, TURN_RATE, Model, ModelFunctions, Number, Ops, TimeStep, Vector
 
 
 def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:

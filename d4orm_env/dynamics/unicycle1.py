@@ -8,15 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from d4orm_env.dynamics.robot_model import (
-    OWN_LIMITS,
-    SPEED,
-    TURN_RATE,
-    Limit,
-    Ops,
-    Vector,
-    between,
-)
+from d4orm_env.dynamics.formulas import between
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, SPEED, TURN_RATE, Limit, Ops, Vector
 from d4orm_env.dynamics.unicycle import UNICYCLE
 
 MAX_REVERSE_SPEED, MAX_RIGHT_TURN_RATE = range(OWN_LIMITS, OWN_LIMITS + 2)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from d4orm_env.dynamics.formulas import between, clip, planar_approach, turn_towards
 from d4orm_env.dynamics.robot_model import (
     ACCELERATION,
     OWN_LIMITS,
@@ -19,10 +20,6 @@ from d4orm_env.dynamics.robot_model import (
     Ops,
     TimeStep,
     Vector,
-    between,
-    clip,
-    planar_approach,
-    turn_towards,
 )
 
 MAX_REVERSE_SPEED, MAX_RIGHT_TURN_RATE, MAX_TURN_ACCELERATION = range(OWN_LIMITS, OWN_LIMITS + 3)

@@ -12,7 +12,7 @@ from numba.np.unsafe import ndarray
 
 from d4orm_env.core import winding
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.dynamics import collision, reward, robot_model, transition
+from d4orm_env.dynamics import collision, formulas, reward, robot_model, transition
 from d4orm_env.engine.parts import PartCompiler
 
 ZERO = np.float32(0)
@@ -47,15 +47,15 @@ INLINED = UNCOUNTED | {"forceinline": True}
 keep the kernels on disk. And for those that take a problem's arrays, which are a long argument to pass by value."""
 inlined: Compiler = numba.njit(nogil=True, **INLINED)
 for _function in (
-    robot_model.norm_scale,
-    robot_model.control_scale,
-    robot_model.clip,
-    robot_model.between,
-    robot_model.stopping_speed,
-    robot_model.share,
-    robot_model.planar_approach,
-    robot_model.first_order_approach,
-    robot_model.turn_towards,
+    formulas.norm_scale,
+    formulas.control_scale,
+    formulas.clip,
+    formulas.between,
+    formulas.stopping_speed,
+    formulas.share,
+    formulas.planar_approach,
+    formulas.first_order_approach,
+    formulas.turn_towards,
     robot_model.runge_kutta,
     winding.unwound,
     transition.advance,
