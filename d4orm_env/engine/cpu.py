@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -82,6 +82,23 @@ class CpuEngine:
             collided=moments.collided,
             margin_violated=moments.violated,
         )
+
+    def score(self, problem: Problem, controls: ArrayLike) -> FloatArray:
+        """See :meth:`d4orm_env.engine.types.Engine.score`.
+
+        Raises:
+            ValueError: If the controls have another shape than ``(M, H, K, m)`` or are not finite.
+        """
+        samples, nobody = checked_controls(problem, controls, batch=True), np.zeros(problem.num_robots, bool)
+        rewards = np.empty((len(samples), problem.num_robots), np.float32)
+
+        def work(part: IntArray) -> None:
+            for sample in range(*part):
+                moments = _rolled_out(problem.arrays, problem.start, nobody, samples[sample])
+                rewards[sample] = moments.rewards[1:].mean(axis=0)
+
+        self._threads.over(len(samples), work)
+        return rewards
 
 
 def _kernels(arrays: ProblemArrays) -> WorldKernels:

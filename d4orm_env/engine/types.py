@@ -50,6 +50,10 @@ class Engine(Protocol):
         """Roll ``controls`` ``(H, K, m)`` out from the problem's start."""
         ...
 
+    def score(self, problem: Problem, controls: ArrayLike) -> FloatArray:
+        """Roll ``M`` samples of controls ``(M, H, K, m)`` out; ``(M, K)`` rewards, the mean over the steps."""
+        ...
+
 
 class ObservationInputs(NamedTuple):
     """Inputs to the observations of ``B`` worlds.
@@ -197,8 +201,8 @@ class WorldEngine(Engine, Protocol):
         ...
 
 
-def checked_controls(problem: Problem, controls: ArrayLike) -> FloatArray:
-    """``controls`` as a contiguous ``(H, K, m)`` float32 array.
+def checked_controls(problem: Problem, controls: ArrayLike, *, batch: bool = False) -> FloatArray:
+    """``controls`` as a contiguous ``(H, K, m)`` float32 array, or with ``batch`` as ``(M, H, K, m)``.
 
     Raises:
         ValueError: If the shape is another, or a value is not finite or so large that its square would not be.
@@ -208,13 +212,14 @@ def checked_controls(problem: Problem, controls: ArrayLike) -> FloatArray:
     except ValueError as error:
         raise ValueError(f"controls must be an array of numbers; {error}") from None
     expected = (problem.horizon, problem.num_robots, problem.control_size)
-    if array.shape != expected:
-        raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}")
+    if array.ndim != 3 + batch or array.shape[batch:] != expected:
+        asked = f"(M, H, K, m) = (M, {', '.join(map(str, expected))})" if batch else f"(H, K, m) = {expected}"
+        raise ValueError(f"controls have shape {array.shape}; expected {asked}")
     if not np.isfinite(array).all():
-        step, robot, component = (int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"controls[{step}, {robot}, {component}] is not finite; every control must be")
+        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+        raise ValueError(f"controls{where} is not finite; every control must be")
     if (np.abs(array) > LARGEST_NUMBER).any():
-        where = tuple(int(i) for i in np.argwhere(np.abs(array) > LARGEST_NUMBER)[0])
+        where = [int(i) for i in np.argwhere(np.abs(array) > LARGEST_NUMBER)[0]]
         raise ValueError(
             f"controls{where} is {array[tuple(where)]:g}; it must be at most {LARGEST_NUMBER:g} in magnitude"
         )

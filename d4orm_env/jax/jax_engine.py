@@ -194,6 +194,17 @@ def _rollout(
     return check_contacts(arrays, worlds.state), (after, contacts)
 
 
+def _rolled_out(problem: Problem, controls: FloatArray) -> tuple[Contacts, tuple[Worlds, Contacts]]:
+    """:func:`_rollout` of ``(M, H, K, m)`` samples from the problem's start."""
+    robots, samples = problem.num_robots, len(controls)
+    start = Worlds(
+        jnp.broadcast_to(problem.start[..., None], (*problem.start.shape, samples)),
+        jnp.zeros((robots, samples), bool),
+        jnp.zeros((robots, problem.control_size, samples), jnp.float32),
+    )
+    return _rollout(problem.team.models, problem.arrays, start, jnp.moveaxis(jnp.asarray(controls), 0, -1))
+
+
 class JaxEngine:
     """The physics in JAX, on whatever device JAX has chosen. Stateless: all instances are alike."""
 
@@ -214,14 +225,8 @@ class JaxEngine:
         Raises:
             ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
         """
-        wanted = checked_controls(problem, controls)
         num_robots = problem.num_robots
-        start = Worlds(
-            jnp.asarray(problem.start[..., None]),
-            jnp.zeros((num_robots, 1), bool),
-            jnp.zeros((num_robots, problem.control_size, 1), jnp.float32),
-        )
-        first, (worlds, contacts) = _rollout(problem.team.models, problem.arrays, start, jnp.asarray(wanted[..., None]))
+        first, (worlds, contacts) = _rolled_out(problem, checked_controls(problem, controls)[None])
         states = np.concatenate([problem.start[None], np.asarray(worlds.state)[..., 0]])
         collided, margin_violated = (
             np.concatenate([np.asarray(first[i])[None, :, 0], np.asarray(contacts[i])[..., 0]]) for i in range(2)
@@ -235,3 +240,12 @@ class JaxEngine:
             collided=collided,
             margin_violated=margin_violated,
         )
+
+    def score(self, problem: Problem, controls: ArrayLike) -> FloatArray:
+        """See :meth:`d4orm_env.engine.types.Engine.score`.
+
+        Raises:
+            ValueError: If the controls have another shape than ``(M, H, K, m)`` or are not finite.
+        """
+        _, (_, contacts) = _rolled_out(problem, checked_controls(problem, controls, batch=True))
+        return np.asarray(contacts[2].mean(axis=0).T)

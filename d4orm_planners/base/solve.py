@@ -153,6 +153,14 @@ class SolveRun:
         """Check whether an iteration must come to its end as it is."""
         return self.time_left == 0 or self.cancelled.is_set()
 
+    def score(self, controls: ArrayLike) -> FloatArray:
+        """``(M, K)`` rewards of ``M`` samples of controls ``(M, H, K, m)``, the mean over the steps.
+
+        Raises:
+            ValueError: If the controls have another shape or are not finite.
+        """
+        return self.engine.score(self.problem, controls)
+
     def denoise(
         self,
         task: SamplingTask,

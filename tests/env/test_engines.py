@@ -131,6 +131,18 @@ def test_engines_step_alike_from_anywhere(name: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
+def test_samples_are_scored_as_they_are_rolled_out(engine: str) -> None:
+    physics, samples = get_engine(engine), np.stack([random_controls(BUSY, seed) for seed in range(5)])
+    expected = [physics.rollout(BUSY, controls).rewards.mean(axis=0) for controls in samples]
+    np.testing.assert_allclose(physics.score(BUSY, samples), expected, rtol=1e-6, atol=1e-6)
+    with pytest.raises(ValueError, match=r"expected \(M, H, K, m\) = \(M, 30, 6, 2\)"):
+        physics.score(BUSY, samples[0])
+    samples[2, 3, 1, 0] = np.nan
+    with pytest.raises(ValueError, match=r"controls\[2, 3, 1, 0\] is not finite"):
+        physics.score(BUSY, samples)
+
+
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
 @pytest.mark.parametrize("name", TEAMS)
 def test_a_rollout_is_its_steps(engine: str, name: str) -> None:
     problem, physics = TEAMS[name], get_engine(engine)
