@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.dynamics.robot_model import ACCELERATION
 
 
 def arrival_steps(arrived: BoolArray) -> NDArray[np.intp]:
@@ -31,16 +32,24 @@ def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
 def mean_squared_jerk(controls: FloatArray, arrived: BoolArray, dt: float) -> float:
     """Mean squared norm of the jerk [m^2/s^6] over robots and over steps before arrival (paper, section VIII-C).
 
-    The jerk is the finite difference of the executed accelerations; for models driven otherwise, of their controls.
-
     Args:
-        controls: ``(H, K, m)`` executed controls.
+        controls: ``(H, K, m)`` executed :func:`accelerations`, of which the jerk is the finite difference.
         arrived: ``(H+1, K)`` bool.
         dt: Time step [s].
     """
     jerk = np.diff(controls.astype(np.float64), axis=0) / dt
     moving = ~arrived[1:-1]
     return float((jerk**2).sum(axis=-1)[moving].mean()) if moving.any() else 0.0
+
+
+def accelerations(problem: Problem, trajectory: Trajectory) -> FloatArray:
+    """``(H, K, m)`` executed controls, or what robots that are driven by their jerk have as accelerations then."""
+    values = trajectory.controls.copy()
+    for robot, model in enumerate(problem.team.robot_models):
+        if indices := [index for index, column in model.state_limits if column == ACCELERATION]:
+            values[:, robot] = 0
+            values[:, robot, : len(indices)] = trajectory.states[1:, robot, indices]
+    return values
 
 
 def stretch(problem: Problem, trajectory: Trajectory) -> np.ndarray:
@@ -84,7 +93,7 @@ def trajectory_metrics(problem: Problem, trajectory: Trajectory) -> dict[str, fl
         "travel_time": float(times.mean()),
         "makespan": float(times.max()),
         "reward": float(trajectory.rewards.mean()),
-        "mean_squared_jerk": mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt),
+        "mean_squared_jerk": mean_squared_jerk(accelerations(problem, trajectory), trajectory.arrived, problem.dt),
         "arrived": float(arrived.sum()),
         "collided": float(collided.sum()),
         "margin_violated": float(trajectory.margin_violated.any(axis=0).sum()),

@@ -13,7 +13,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
-from d4orm_env.core.metrics import mean_squared_jerk, mean_stretch
+from d4orm_env.core.metrics import accelerations, mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
@@ -162,7 +162,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
         all_infos.append(infos)
         outcomes.append(_outcome(env, rewards))
     trajectory = _trajectory(problem, joints, outcomes)
-    jerk = mean_squared_jerk(trajectory.controls, trajectory.arrived, problem.dt)
+    jerk = mean_squared_jerk(accelerations(problem, trajectory), trajectory.arrived, problem.dt)
     metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
     marks = None if all(part is None for part in effects[0]) else marks_of(effects, problem)
     goals = np.stack([joint.goals for joint in joints])

@@ -238,7 +238,25 @@ def with_iterations(team: str, column: str, groups: dict[str, list[Trial]], refe
     return rows
 
 
+def limited_jerk(budget: int) -> list[Block]:
+    """4 and 8 double integrators on the circle, and the same with limits on their jerk (paper, section VIII-C)."""
+    settings = {"d4orm": d4orm(**PAPER)}
+    models = ("holonomic2d", "holonomic2d_jerk")
+    return [Block("paper_circle", size, settings, "d4orm", 20, model) for size in (4, 8) for model in models]
+
+
+def with_jerk(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
+    """:func:`first_solutions` without the tests, and the mean squared norm of the solutions' jerk."""
+    jerks = [trial.mean_squared_jerk for trial in groups[reference] if is_solved(trial)]
+    shown = list(first_solutions(team, column, groups, reference)[0].items())[:-2]
+    return [dict(shown) | {"jerk [m²/s⁶]": f"{np.mean(jerks):.3g}" if jerks else "-"}]
+
+
 COMPARISONS: Mapping[str, Comparison] = {
+    "jerk_limits": Comparison(
+        "D4orm with the paper's preset and limits on the jerk in the robots' dynamics.", "planner", limited_jerk,
+        team="{0.num_robots} of {0.model}", rows=with_jerk,
+    ),
     "contact_penalty": Comparison(
         "Whose reward samples are weighted by, and what a contact costs in it, against the defaults.",
         "credit, penalty", credits_and_penalties, team="{0.scenario}, {0.model}",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, open_problem, stand
 
+from d4orm_env import make_problem, rollout
 from d4orm_env.core.metrics import arrival_times, mean_squared_jerk, trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
@@ -120,6 +121,14 @@ def test_mean_squared_jerk_counts_steps_before_arrival() -> None:
     both = np.concatenate([controls, 9 * controls], axis=1)
     flags = np.concatenate([never, np.arange(5)[:, None] >= 1], axis=1)
     assert mean_squared_jerk(both, flags, 0.5) == pytest.approx((4 + 16 + 20) / 3)
+
+
+def test_the_jerk_of_a_robot_driven_by_its_jerk_is_that() -> None:
+    problem = make_problem("circle", num_robots=2, model="holonomic2d_jerk", horizon=4)
+    controls = np.zeros((4, 2, 2), np.float32)
+    controls[:, 0] = (1, 2)
+    # Of robot_0 1 and 2 m/s^3, of robot_1 none.
+    assert trajectory_metrics(problem, rollout(problem, controls))["mean_squared_jerk"] == pytest.approx(5 / 2)
 
 
 def test_mean_squared_jerk_of_a_single_step_is_zero() -> None:

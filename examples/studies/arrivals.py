@@ -1,0 +1,87 @@
+"""Iterations of D4orm until all robots arrive and until none collides, against the number of robots.
+
+    python -m examples.studies arrivals --seeds 10
+
+The paper says (section IV-C) that more iterations are needed until all arrive as teams grow, and that some robots may
+then collide for the sake of the team's reward. D4orm with the paper's preset on the paper's scenes, forty iterations at
+most; it ends with the first solution.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from examples.outputs import save_table, study_parser, study_rows
+
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+
+Rows = list[dict[str, Any]]
+
+TEAMS = (
+    *(("paper_circle", size) for size in (2, 4, 8, 12, 16)),
+    *(("paper_random", size) for size in (16, 32, 64)),
+)
+MAX_ITERATIONS = 40
+
+
+def solve(scenario: str, num_robots: int, seed: int, **settings: Any) -> dict[str, Any]:
+    """The row of a solve: iterations until all arrived and until it was solved, and the state in the end."""
+    plan = make_planner("d4orm", preset="paper", **settings).solve(
+        make_problem(scenario, num_robots=num_robots, seed=seed), seed=seed, max_iterations=settings["max_iterations"]
+    )
+    arrived = [record.iteration for record in plan.history if not record.num_not_arrived]
+    last = plan.history[-1]
+    return {
+        "scenario": scenario, "robots": num_robots, "seed": seed, "solved": plan.solved,
+        "iterations": plan.iterations, "arrived_after": arrived[0] if arrived else None,
+        "not_arrived": last.num_not_arrived, "in_violation": last.num_margin_violated,
+    }  # fmt: skip
+
+
+def measure(teams: Any, seeds: int, **settings: Any) -> Rows:
+    """A row of every team and seed."""
+    rows = []
+    for scenario, size in teams:
+        rows += [solve(scenario, size, seed, **settings) for seed in range(seeds)]
+        print(rows[-1], flush=True)
+    return rows
+
+
+def median(values: list[int], count: int) -> str:
+    """Median of the values of ``count`` trials, those that are missing counted as never."""
+    return f"{np.median([*values, *[np.inf] * (count - len(values))]):.3g}".replace("inf", "never")
+
+
+def summary(rows: Rows) -> Rows:
+    """A row per team."""
+    table = []
+    for team in dict.fromkeys((row["scenario"], row["robots"]) for row in rows):
+        of = [row for row in rows if (row["scenario"], row["robots"]) == team]
+        left = [row for row in of if not row["solved"]]
+        colliding = [row["in_violation"] for row in left if not row["not_arrived"]]
+        arrived = [row["arrived_after"] for row in of if row["arrived_after"]]
+        table.append(
+            {
+                "scenario": team[0],
+                "robots": team[1],
+                "iterations until all arrive": median(arrived, len(of)),
+                "until solved": median([row["iterations"] for row in of if row["solved"]], len(of)),
+                "solved": f"{len(of) - len(left)} of {len(of)}",
+                "all arrive and some collide": f"{len(colliding)} of {len(of)}",
+                "robots in violation": f"{np.mean(colliding):.3g}" if colliding else "-",
+            }
+        )
+    return table
+
+
+def main() -> None:
+    """Run every team and seed, and write the table."""
+    arguments = study_parser(__doc__, seeds=10).parse_args()
+    measured = partial(measure, TEAMS, arguments.seeds, max_iterations=MAX_ITERATIONS)
+    if arguments.quick:
+        measured = partial(measure, TEAMS[:1], 1, max_iterations=2, num_samples=64, num_steps=10)
+    rows = study_rows(arguments, "arrivals", measured)
+    save_table(summary(rows), arguments.out / "arrivals.csv")
