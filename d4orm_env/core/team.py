@@ -89,7 +89,7 @@ class Team(Frozen):
             discs = [Disc(float(str(size))) for size in radii]  # the decimal that files have
             given = [Train(disc, (disc,) * size) if size else disc for disc, size in zip(discs, trailers, strict=True)]
             radius = None
-        footprints = (given,) * count if isinstance(given, Footprint) else tuple(given)
+        footprints = tuple(given) if isinstance(given, Sequence) else (given,) * count
         if len(footprints) != count:
             raise ValueError(f"footprint has {len(footprints)} entries for {count} robots; give one each, or one")
         for robot, footprint in enumerate(footprints):

@@ -93,8 +93,8 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
         (``arrival="stay"``), and no margin is asked for.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is no such problem, or a type is unknown; the message names all of those.
+        ValueError: If the file cannot be read or is no such problem, or a type is unknown; the message names the file,
+            and all types that are unknown.
     """
     try:
         return _problem(read_yaml(path), MODELS | {name: dict(given) for name, given in (models or {}).items()}, path)
@@ -103,6 +103,8 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
             f"{path}: no multi-robot problem of dynobench, {first_line(error)} is missing or is not what was expected; "
             f"it has environment: min, max, obstacles, and robots: type, start, goal"
         ) from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
 
 
 def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.PathLike[str]) -> Problem:

@@ -67,6 +67,8 @@ def build(settings: Settings, layout: Layout) -> Problem:
         margin=settings.margin,
         goal_radius=settings.goal_radius,
         goal_speed=settings.goal_speed,
+        goal_heading=settings.goal_heading,
+        goal_heading_tolerance=settings.goal_heading_tolerance,
         name=settings.scenario,
         arrival=settings.arrival,
         collision_penalty=settings.collision_penalty,

@@ -43,9 +43,10 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     try:
         content = read_yaml(path)
         is_dynobench = isinstance(content, dict) and "environment" in content
-        problem = load_dynobench(path) if is_dynobench else parse(content)
+        problem = None if is_dynobench else parse(content)
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+    problem = load_dynobench(path) if problem is None else problem
     proofs = [f"robot_{robot} {proof}" for robot, proof in prove_infeasible(problem).items()]
     if proofs:
         more = f", and {len(proofs) - 1} more" if len(proofs) > 1 else ""

@@ -54,6 +54,8 @@ class BuiltIn:
         robot = settings.pop("robot", None)
         team = {} if robot is None else find_robot(robot).settings
         common = {**self._defaults, **team, **size, **settings}
+        if "footprint" in settings:  # the radius follows
+            common["radius"] = settings.get("radius")
         # A value too large for float32 becomes infinite, and is then refused by name.
         with np.errstate(over="ignore"):
             return self._function(Settings(scenario=self.__name__, seed=seed, **common), **own)

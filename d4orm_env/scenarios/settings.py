@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import SupportsFloat
+from typing import Any, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.problem_checks import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import get_model
+from d4orm_env.scenarios.footprint_entries import parsed
 
 MAX_COUNT = 10_000
 """Most robots or obstacles a generator makes: a slip of the finger must not fill the memory."""
@@ -35,7 +36,8 @@ class Settings:
         obstacle_radius: Radius of circular obstacles [m].
         bounds: Of a scenario that is open: a margin [m] around the box in which its robots start and end, or the lower
             and the upper corner ``(2, d)`` [m].
-        radius: Robot radius [m], one or ``K``.
+        radius: Robot radius [m], one or ``K``; 0.15 by default, or that of the footprint.
+        footprint: One of :mod:`d4orm_env.footprints` or ``K``, or as in files, ``{"shape": "box", ...}``.
         margin: Safety margin [m].
         dt: Time step [s].
         horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
@@ -43,6 +45,8 @@ class Settings:
         goal_radius: A robot within it has arrived [m].
         goal_speed: Speed at which a robot may still dock [m/s], one or ``K``;
             see :class:`~d4orm_env.core.problem.Problem`.
+        goal_heading: Heading with which a robot must arrive [rad], one or ``K``, NaN for any.
+        goal_heading_tolerance: How far it may be off [rad], one or ``K``.
         arrival: ``"dock"``: a robot that arrives stays there for good. ``"stay"``: it may be moved again.
         collision_penalty: Taken off the reward per step within the margin of a robot, and of an obstacle.
         max_speed: Speed limit [m/s], one or ``K``.
@@ -61,13 +65,16 @@ class Settings:
     num_obstacles: int = 0
     obstacle_radius: float = 0.15
     bounds: SupportsFloat | list[list[float]] | tuple[Sequence[float], ...] | NDArray[np.floating] | None = None
-    radius: ArrayLike = 0.15
+    radius: ArrayLike | None = None
+    footprint: Any = None
     margin: float = 0.05
     dt: float = 0.1
     horizon: int | None = None
     height: float | None = None
     goal_radius: float = 0.075
     goal_speed: ArrayLike | None = None
+    goal_heading: ArrayLike | None = None
+    goal_heading_tolerance: ArrayLike = 0.1
     arrival: Arrival = "dock"
     collision_penalty: float = 1.0
     max_speed: ArrayLike = 1.0
@@ -105,9 +112,9 @@ class Settings:
     @cached_property
     def team(self) -> Team:
         """The robots."""
-        return Team(
-            self.models, self.radius, self.max_speed, self.max_acceleration, self.max_turn_rate, self.own_limits
-        )
+        shapes = parsed(self.footprint) if isinstance(self.footprint, Mapping) else self.footprint
+        limits = self.max_speed, self.max_acceleration, self.max_turn_rate, self.own_limits
+        return Team(self.models, self.radius, *limits, footprint=shapes)
 
     @property
     def spacing(self) -> float:

@@ -134,6 +134,13 @@ class Controller:
             ValueError: If the states have another shape, or the lag fits no team of this size.
         """
         self._wait_for_late(None)
+        try:
+            self._begin(problem, states, float(time), seed)
+        except BaseException:
+            self._env = None  # there is no team to step
+            raise
+
+    def _begin(self, problem: Problem, states: ArrayLike, time: float, seed: int) -> None:
         self._observer, self._robots = DisturbanceObserver(problem, self._lag), problem
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
@@ -143,7 +150,7 @@ class Controller:
         limits = {name: left * getattr(team, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
         self._open(problem.with_state(start, problem.goal, team=team.replace(**limits)), seed)
         self.policy.reset(self._env, seed=seed)
-        self._time, self._lead = float(time) - problem.dt, np.zeros_like(problem.goal, np.float64)
+        self._time, self._lead = time - problem.dt, np.zeros_like(problem.goal, np.float64)
         self._setpoint = self._described(self._joint, self._joint.controls, held=False)
 
     def step(self, states: ArrayLike, time: float) -> ControlSetpoint:

@@ -102,7 +102,7 @@ def test_own_parameters_are_taken(instance: Path) -> None:
 )
 def test_what_is_wrong_is_told(instance: Path, old: str, new: str, message: str) -> None:
     instance.write_text(INSTANCE.replace(old, new))
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(instance))}: .*{re.escape(message)}"):
         load_dynobench(instance)
 
 

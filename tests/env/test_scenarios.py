@@ -13,6 +13,7 @@ from scenario_support import WALLED, needed, scenario_models
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.footprints import Box, Ellipsoid
 from d4orm_env.scenarios import describe_scenario, list_scenarios, make_problem
 from d4orm_env.scenarios.generators import fibonacci_sphere
 from d4orm_env.scenarios.layout import default_horizon
@@ -405,6 +406,10 @@ BAD = [
     ("circle", {"goal_speed": 1e7}, "goal_speed of robot_0 is 1e"),
     ("circle", {"radius": 0}, "radius of robot_0 is 0"),
     ("circle", {"radius": [0.1, 0.2]}, "radius has shape"),
+    ("circle", {"footprint": 0.3}, r"footprint of robot_0 is 0\.3; give one such as Box"),
+    ("circle", {"footprint": {"shape": "blob"}}, "footprint 'blob' is unknown"),
+    ("circle", {"footprint": Box(0.4, 0.2), "radius": 0.3}, "radius 0.3 is not that of the footprints"),
+    ("circle", {"goal_heading": 0.0}, "a holonomic2d has no heading"),
     ("circle", {"max_speed": math.nan}, "max_speed"),
     ("circle", {"max_acceleration": 1e300}, "max_acceleration.* is inf"),
     ("circle", {"diameter": math.nan}, "diameter is nan"),
@@ -428,6 +433,22 @@ BAD = [
     ("swap", {"spacing": math.inf}, "spacing is inf"),
     ("four_obstacles", {"obstacle_distance": 2.15}, "the start of robot_0 is 0.05.* the margin is 0.05"),
 ]
+
+
+@pytest.mark.parametrize("footprint", [Box(0.4, 0.2), {"shape": "box", "length": 0.4, "width": 0.2}])
+def test_scenarios_take_footprints_and_goal_headings(footprint: Any) -> None:
+    problem = make_problem(
+        "circle", num_robots=3, model="differential_drive", footprint=footprint, goal_heading=0.5,
+        goal_heading_tolerance=0.2,
+    )  # fmt: skip
+    assert problem.team.footprint == (Box(0.4, 0.2),) * 3
+    assert problem.goal_heading.tolist() == [0.5] * 3
+    assert problem.goal_heading_tolerance.tolist() == [np.float32(0.2)] * 3
+
+
+def test_a_footprint_takes_the_place_of_a_scenarios_own_radius() -> None:
+    problem = make_problem("amswarm_2", footprint=Ellipsoid(0.1, 0.1, 0.25))
+    assert problem.team.radius.tolist() == [0.25] * 10
 
 
 @pytest.mark.parametrize(("name", "arguments", "message"), BAD)

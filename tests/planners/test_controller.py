@@ -323,6 +323,8 @@ def test_bad_states_and_lags_are_named() -> None:
         controller.step(problem.start, 0.0)
     with pytest.raises(ValueError, match=r"states have shape \(2, 4\); expected \(K, n\) = \(3, 4\)"):
         controller.begin(problem, problem.start[:2])
+    with pytest.raises(RuntimeError, match=r"call begin\(problem, states\) before step"):
+        controller.step(problem.start, 0.0)
     for lag, message in ((-1, "must not be negative"), ([1, 2], r"one number or one per robot \(3\)")):
         with pytest.raises(ValueError, match=message):
             Controller("go-to-goal", lag=lag).begin(problem, problem.start)

@@ -257,6 +257,19 @@ def test_samples_are_counted_for_every_setting(tmp_path: Path) -> None:
     assert table(tmp_path / "again" / "fewer_samples.csv") == list(rows.values())
 
 
+def test_arrivals_are_counted_by_iterations(tmp_path: Path) -> None:
+    completed("arrivals", tmp_path / "out")
+    (row,) = table(tmp_path / "out" / "arrivals.csv")
+    assert (row["robots"], row["iterations until all arrive"], row["solved"]) == ("2", "1", "1 of 1")
+
+
+def test_jerk_is_smaller_where_it_is_limited(tmp_path: Path) -> None:
+    completed("jerk_limits", tmp_path / "out")
+    free, limited = (float(row["jerk [m²/s⁶]"]) for row in table(tmp_path / "out" / "jerk_limits.csv"))
+    # The jerk's limit is 4 m/s^3.
+    assert limited <= 16 < free
+
+
 def test_contacts_are_charged_by_every_credit(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("contact_penalty", out)
