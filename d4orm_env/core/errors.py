@@ -36,6 +36,14 @@ def unknown(what: str, value: object, known: Iterable[str], *others: str) -> Val
     return ValueError(f"{what} {shown(value)} is unknown; {remedy}{did_you_mean(value, names)}".lstrip())
 
 
+def no_setting(name: str, owner: str, known: Iterable[str]) -> UnknownKeywordError:
+    """The error for a setting that ``owner`` does not take, with the one that was meant perhaps."""
+    names = list(known)
+    return UnknownKeywordError(
+        f"{name!r} is no setting of {owner}; it takes {', '.join(names)}{did_you_mean(name, names)}"
+    )
+
+
 def did_you_mean(value: object, known: Iterable[str]) -> str:
     """The end of a message that names the most similar of the known names; empty if none is."""
     close = get_close_matches(value, known, 1) if isinstance(value, str) and len(value) < 100 else []

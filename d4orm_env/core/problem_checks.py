@@ -121,10 +121,10 @@ def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
                 f"goal_heading of robot_{robot} is {headings[robot]:g}, and a {team.models[robot]} has no heading; "
                 f"give NaN"
             )
-        if not abs(headings[robot]) <= MAX_HEADING:
+        if not abs(headings[robot]) <= np.float32(2 * np.pi):
             raise ValueError(
-                f"goal_heading of robot_{robot} is {headings[robot]:g} rad; it must be at most {MAX_HEADING:g} in "
-                f"magnitude, so take whole turns off"
+                f"goal_heading of robot_{robot} is {headings[robot]:g} rad; it must be at most 2 pi in magnitude, so "
+                f"give radians, without whole turns"
             )
     return headings
 

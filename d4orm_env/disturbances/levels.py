@@ -51,9 +51,9 @@ def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; give one number, or one per control component")
     if not np.isfinite(array).all() or (array < 0).any():
-        raise ValueError(f"{name} is {array.tolist()}; it must be zero or more and finite")
+        raise ValueError(f"{name} is {shown(value)}; it must be zero or more and finite")
     if (array > LARGEST).any():
-        raise ValueError(f"{name} is {array.tolist()}; it must be at most {LARGEST:g}")
+        raise ValueError(f"{name} is {shown(value)}; it must be at most {LARGEST:g}")
     return tuple(array.tolist()) if array.ndim else float(np.asarray(value, np.float64))
 
 

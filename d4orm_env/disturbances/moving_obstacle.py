@@ -247,10 +247,16 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
         radius: Of everyone [m].
 
     Raises:
-        ValueError: If a column is missing, a value is no number, or somebody is at two places at one time.
-        OSError: If the file cannot be read.
+        ValueError: If the file cannot be read, a column is missing, a value is no number, or somebody is at two places
+            at one time.
     """
-    with open(path, newline="", encoding="utf-8") as file:
+    try:
+        file = open(path, newline="", encoding="utf-8")  # noqa: SIM115
+    except OSError as error:
+        raise ValueError(
+            f"{path}: cannot be read ({error.strerror or error}); give a CSV file of pedestrians"
+        ) from None
+    with file:
         reader = csv.DictReader(file)
         missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
         if missing:

@@ -174,6 +174,7 @@ def read_map(path: PathLike, cell: float = 0.6, resolution: float | None = None)
     with _named(file):
         if file.suffix.lower() in IMAGES:
             if resolution is None:
+                file.stat()  # where there is none, that is what to tell
                 raise ValueError("is an image without its map_server YAML file; give resolution=, its metres per pixel")
             return grid_of_fields({"image": file.name, "resolution": resolution, "origin": [0, 0, 0]}, file.parent)
         if resolution is not None:

@@ -141,6 +141,8 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
         ImportError: If the physics needs a library that is not installed.
     """
     whole_number(seed, "seed", 0)
+    if not hasattr(env, "reset"):
+        raise ValueError(f"env is {shown(env)}; give the environment first, then the policy")
     if isinstance(env, gymnasium.Env):
         env = _parallel(env)
     if physics is not None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, shown
-from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, unknown
+from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
 from d4orm_env.core.registry import load_reference, source_digest, written
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
@@ -257,7 +257,7 @@ def _check_keywords(kind: Callable[..., object], config: Mapping[str, object], o
         _refuse_settings(config, owner)
     for name in config:
         if name not in parameters and not any(known.kind is known.VAR_KEYWORD for known in parameters.values()):
-            raise UnknownKeywordError(f"{name!r} is no setting of {owner}; it takes {', '.join(parameters)}")
+            raise no_setting(name, owner, parameters)
     try:
         signature.bind(**config)
     except TypeError as error:

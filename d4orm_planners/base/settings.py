@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
 from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, shown
-from d4orm_env.core.errors import UnknownKeywordError, unknown
+from d4orm_env.core.errors import no_setting, unknown
 from d4orm_env.engine.choice import ENGINES
 
 
@@ -123,7 +123,7 @@ class CheckedSettings:
         known = cls.setting_names(given)
         for name in given:
             if name not in known:
-                raise UnknownKeywordError(f"{name!r} is no setting of {owner}; it takes {', '.join(known)}")
+                raise no_setting(name, owner, known)
         return cls._made_of(given)
 
     @classmethod

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from d4orm_planners.base.plan import Plan
@@ -111,6 +112,8 @@ def export(
         ("least gap to obstacles", f"{report.min_clearance:.3f} m"),
         ("deviation from the plan", f"{report.deviation:.3f} m"),
     ]
+    if report.min_overhead < np.inf:
+        rows.append(("least height above another", f"{report.min_overhead:.3f} m; mind the downwash"))
     if report.pieces is not None:
         rows.append(("polynomials a robot", f"{report.pieces}, {report.num_bytes} bytes of 4096"))
     print_table(f"{format} of {plan.title}", rows)

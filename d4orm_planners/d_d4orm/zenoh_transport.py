@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from d4orm_env.core.arrays import duration
+from d4orm_env.core.errors import no_setting
 from d4orm_env.core.files import require_file
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_planners.d_d4orm.messages import MAX_BYTES
@@ -108,7 +109,7 @@ class ZenohSettings:
             raise ValueError(f"the settings of zenoh must be a mapping of {', '.join(known)}, not {settings!r}")
         for name in settings:
             if name not in known:
-                raise ValueError(f"{name!r} is no setting of zenoh; it takes {', '.join(known)}")
+                raise no_setting(name, "zenoh", known)
         return cls(**settings)
 
     @property

@@ -14,6 +14,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.errors import unknown
+from d4orm_env.core.problem import Problem
 from d4orm_planners.setpoints.polynomials import AXES, PIECE_BYTES, fit_polynomials
 from d4orm_planners.setpoints.rosbag import write_bag
 from d4orm_planners.setpoints.setpoints import Setpoints, sample_motion
@@ -33,6 +34,8 @@ class ExportReport:
         deviation: Largest distance from the plan at its steps [m].
         min_separation: Least gap between two robots [m].
         min_clearance: Least gap to an obstacle or bound [m].
+        min_overhead: Least height of a robot above the centre of another, no farther beside it than both radii and the
+            margin [m]; infinite where none flies over another, or the team moves in the plane.
         pieces: Polynomials a robot, or ``None``.
     """
 
@@ -42,6 +45,7 @@ class ExportReport:
     deviation: float
     min_separation: float
     min_clearance: float
+    min_overhead: float
     pieces: int | None = None
 
     @property
@@ -98,6 +102,8 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         raise unknown("format", form, FORMATS)
     if not np.isfinite(height):
         raise ValueError(f"height is {height!r}; it must be finite")
+    if height and motion.problem.dimension == 3:
+        raise ValueError(f"height is {height:g} m, and this team has heights of its own; leave it out")
     setpoints = sample_motion(motion, rate)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder.parent, prefix=".export") as name:
@@ -115,8 +121,21 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         motion.deviation,
         motion.report.min_separation,
         motion.report.min_clearance,
+        _least_overhead(motion.problem, setpoints.position),
         pieces,
     )
+
+
+def _least_overhead(problem: Problem, places: Floats) -> float:
+    """See :attr:`ExportReport.min_overhead`; ``places`` are ``(T, K, d)`` [m]."""
+    least, reach = np.inf, problem.team.radius.astype(np.float64)
+    if problem.dimension == 2:
+        return least
+    for robot in range(1, problem.num_robots):
+        apart = np.abs(places[:, :robot] - places[:, robot, None])
+        beside = np.hypot(apart[..., 0], apart[..., 1]) <= reach[:robot] + reach[robot] + problem.margin
+        least = min(least, float(apart[..., 2][beside].min(initial=np.inf)))
+    return least
 
 
 def _write_table(path: Path, header: list[str], values: Floats) -> None:

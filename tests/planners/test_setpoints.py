@@ -212,7 +212,7 @@ def test_tables_hold_the_setpoints(plans: dict[str, Plan], tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ["space", "walls", "wheels"])
 def test_polynomials_are_close_to_the_motion(plans: dict[str, Plan], name: str, tmp_path: Path) -> None:
-    plan, height = plans[name], 0.8
+    plan, height = plans[name], 0.0 if name == "space" else 0.8
     report = plan.export("crazyswarm2", tmp_path, height=height)
     s = plan.sample(rate=200)
     assert report.pieces is not None
@@ -314,6 +314,21 @@ def test_bad_exports_are_refused_and_leave_nothing(
     with pytest.raises(ValueError, match=message):
         plans["plane"].export(format, tmp_path / "out", **arguments)
     assert not list(tmp_path.iterdir())
+
+
+def test_heights_belong_to_teams_in_the_plane(plans: dict[str, Plan], tmp_path: Path) -> None:
+    assert plans["plane"].export("csv", tmp_path / "plane").min_overhead == np.inf
+    with pytest.raises(ValueError, match="height is 1 m, and this team has heights of its own; leave it out"):
+        plans["space"].export("csv", tmp_path / "space", height=1.0)
+    assert not (tmp_path / "space").exists()
+
+
+def test_how_low_one_flies_over_another_is_told(tmp_path: Path) -> None:
+    # robot_1 crosses 1 m above robot_0, robot_2 passes 1 m beside it at half of that.
+    start = [[0, 0, 0, 0, 0, 0], [-1, 0, 1, 0, 0, 0], [-1, 1, 0.5, 0, 0, 0]]
+    problem = Problem(Team(("holonomic3d",) * 3), start, [[0, 0, 0], [1, 0, 1], [1, 1, 0.5]])
+    plan = make_planner(engine="cpu").solve(problem, seed=0)
+    assert plan.export("csv", tmp_path / "out").min_overhead == pytest.approx(1, abs=0.05)
 
 
 def test_too_long_a_motion_for_the_memory_on_board_is_refused(
