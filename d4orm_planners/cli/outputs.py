@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
     from d4orm_planners.base.episode import Episode
     from d4orm_planners.base.plan import Plan
+
+LOG_INTERVAL = 60.0
+"""Seconds between lines of progress where there is no terminal."""
 
 
 def episode_rows(episode: Episode) -> list[tuple[str, str]]:
@@ -107,11 +111,23 @@ def solve_progress(
 
 @contextmanager
 def parts_progress(enabled: bool = True) -> Iterator[Callable[[str, int, int], None]]:
-    """Show what is under way, how much is done, and the time; gives what is called with these at every part."""
+    """Show what is under way, how much is done, and the time; gives what is called with these at every part.
+
+    Where stderr is no terminal, a line a minute says so.
+    """
     columns = BarColumn(bar_width=24), TextColumn("{task.completed}/{task.total}  {task.description}")
+    begin = told = time.monotonic()
     with _live_line(columns, enabled) as line:
         task = line.add_task("", total=None)
-        yield lambda what, done, total: line.update(task, description=what, completed=done, total=total)
+
+        def show(what: str, done: int, total: int) -> None:
+            nonlocal told
+            line.update(task, description=what, completed=done, total=total)
+            if enabled and line.disable and time.monotonic() - told >= LOG_INTERVAL:
+                told = time.monotonic()
+                typer.echo(f"{done} of {total}, {told - begin:.0f} s: {what}", err=True)
+
+        yield show
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import pytest
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
+from d4orm_planners.cli import outputs
 
 QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
 
@@ -458,3 +459,14 @@ def test_warmup_says_beforehand_that_nothing_can_be_kept(
     monkeypatch.setattr("d4orm_env.engine.caching._Place._locator_classes", [])
     monkeypatch.setattr("d4orm_env.engine.caching._is_private", lambda folder: True)
     assert "no cache folder can be written to; set NUMBA_CACHE_DIR" in d4orm("warmup").err
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for interval, lines in ((0.0, ["1 of 2, 0 s: a", "2 of 2, 0 s: b"]), (60.0, [])):
+        monkeypatch.setattr(outputs, "LOG_INTERVAL", interval)
+        with outputs.parts_progress() as progress:
+            progress("a", 1, 2)
+            progress("b", 2, 2)
+        assert capsys.readouterr().err.splitlines() == lines
