@@ -246,10 +246,6 @@ def _check_sight(problem: Problem, num_rays: int, line_of_sight: bool) -> None:
         raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
     if num_rays and problem.dimension != 2:
         raise ValueError("rays lie in the plane, and this problem is in space; leave observed_rays out")
-    if num_rays and problem.team.footprint_arrays is not None:
-        raise ValueError(
-            "rays meet robots that are discs, and this team has other footprints; leave footprint or observed_rays out"
-        )
 
 
 def _bounds(problem: Problem, slices: ObservationSlices, slack: BoundsSlack, ray_range: float) -> FloatArray:

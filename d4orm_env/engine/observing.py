@@ -15,7 +15,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import INLINED, ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined
-from d4orm_env.engine.ray_casting import is_blocked
+from d4orm_env.engine.ray_shapes import is_blocked
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import STATE, STRIDE, MotionReader, motion_reader

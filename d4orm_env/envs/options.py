@@ -23,6 +23,13 @@ from d4orm_env.scenarios.problems import ScenarioLike, find_scenario, make_probl
 __all__ = ["EnvOptions"]
 
 
+OBSERVATION = (
+    "observed_path", "observed_robots", "observed_obstacles", "observed_rays", "ray_range", "communication_range",
+    "line_of_sight",
+)  # fmt: skip
+"""Names of the options on what robots observe."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EnvOptions:
     """Options of an environment; every environment takes these as keyword arguments.

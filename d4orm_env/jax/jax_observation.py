@@ -53,7 +53,7 @@ def observe_team(
         arrays.limits[:, 1],
         *_neighbors(arrays, place, velocity, layout),
         *_obstacles(arrays, place, layout.num_obstacles),
-        *cast_rays(arrays, place, heading, layout),
+        *cast_rays(arrays, world.state, place, heading, layout),
     ]
     low, high = layout.low, layout.high
     return jnp.stack([jnp.clip(column, low[i], high[i]) for i, column in enumerate(columns)], axis=1)

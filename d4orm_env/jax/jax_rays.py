@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.jax.jax_footprints import PlacedBodies, place_robots
+
+
+class Others(NamedTuple):
+    """Bodies of all robots, seen from one of them.
+
+    Attributes:
+        x: ``(F,)`` reference points.
+        y: Likewise.
+        radius: ``(F,)`` of discs; -1 of its own bodies.
+        cores: Footprints, as ``(.., F)``; ``None`` of a team of discs.
+    """
+
+    x: Array
+    y: Array
+    radius: Array
+    cores: PlacedBodies | None
 
 
 def cast_rays(
-    arrays: ProblemArrays, place: list[Array], heading: list[Array], layout: ObservationLayout
+    arrays: ProblemArrays, state: Array, place: list[Array], heading: list[Array], layout: ObservationLayout
 ) -> list[Array]:
     """``R`` columns ``(K,)``: how far each ray of every robot reaches [m].
 
     Args:
         arrays: The problem; ``bounds`` is ``None`` where the world has none.
+        state: ``(K, n)``.
         place: Positions, two columns ``(K,)``.
         heading: Their headings' cosines and sines, both zero for robots without.
         layout: Of the observations; static.
@@ -25,11 +46,17 @@ def cast_rays(
     if not layout.num_rays:
         return []
     fan, (x, y), (cosine, sine) = layout.ray_directions, place, heading
-    robots = jnp.arange(len(x))
+    robots, f = jnp.arange(len(x)), arrays.footprints
+    bodies, owner, cores = place, robots, None
+    radius: Array | FloatArray = arrays.radius
+    if f is not None:
+        cores = jax.tree.map(lambda part: part[..., 0], place_robots(f, state[..., None], 2))
+        bodies, radius, owner = [*cores.place], cores.rounding, jnp.asarray(f.robot)
     cosine = jnp.where((cosine == 0) & (sine == 0), 1, cosine)
 
     def of_robot(robot: Array, x: Array, y: Array, cosine: Array, sine: Array) -> Array:
-        others = place[0] - x, place[1] - y, jnp.where(robots == robot, -1, arrays.radius)
+        own = owner == robot
+        others = Others(bodies[0] - x, bodies[1] - y, jnp.where(own, -1, radius), cores)
         aim = cosine * fan[:, 0] - sine * fan[:, 1], sine * fan[:, 0] + cosine * fan[:, 1]
         reach = jax.vmap(lambda ray_x, ray_y: _nearest(arrays, others, x, y, ray_x, ray_y))(*aim)
         return jnp.minimum(reach, layout.ray_range)
@@ -38,11 +65,9 @@ def cast_rays(
     return [reach[:, i] for i in range(layout.num_rays)]
 
 
-def _nearest(
-    arrays: ProblemArrays, others: tuple[Array, Array, Array], x: Array, y: Array, ray_x: Array, ray_y: Array
-) -> Array:
+def _nearest(arrays: ProblemArrays, others: Others, x: Array, y: Array, ray_x: Array, ray_y: Array) -> Array:
     """Distance from ``(x, y)`` along a ray to whatever comes first; the other robots' positions are relative."""
-    found = [_to_discs(*others, ray_x, ray_y), *_to_obstacles(arrays, x, y, ray_x, ray_y)]
+    found = [_to_others(arrays.footprints, others, ray_x, ray_y), *_to_obstacles(arrays, x, y, ray_x, ray_y)]
     if arrays.bounds is not None:
         (low_x, low_y), (high_x, high_y) = arrays.bounds
         leave = jnp.minimum(_through(low_x - x, high_x - x, ray_x)[1], _through(low_y - y, high_y - y, ray_y)[1])
@@ -60,6 +85,32 @@ def are_blocked(arrays: ProblemArrays, place: list[Array], gap: list[Array]) -> 
 
     blocked: Array = jax.vmap(to_obstacle)(place[0], place[1], gap[0] / length, gap[1] / length) < distance
     return blocked
+
+
+def _to_others(f: FootprintArrays | None, others: Others, ray_x: Array, ray_y: Array) -> Array:
+    """``(F,)`` distances to bodies: to discs about the corners of a core that is widened, and to the core."""
+    x, y, radius, cores = others
+    if f is None or cores is None:
+        return _to_discs(x, y, radius, ray_x, ray_y)
+    corners, widened = cores.corners, jnp.where(radius > 0, radius, -1)
+    found = [_to_discs(x + corners[0, j], y + corners[1, j], widened, ray_x, ray_y) for j in range(2)]
+    enter, leave = jnp.zeros(len(x)), jnp.full(len(x), jnp.inf)
+    for j in range(cores.axes.shape[1]):
+        along_x, along_y = cores.axes[:, j]
+        # Beyond the sides of a segment, not beyond its ends; zeros tell nothing.
+        reach = cores.extents[j] + jnp.where(j < jnp.asarray(f.num_corners), cores.rounding, 0)
+        inside, growth = reach + (along_x * x + along_y * y), -(along_x * ray_x + along_y * ray_y)
+        enter, leave = _cut(enter, leave, inside, growth)
+    solid = (jnp.asarray(f.num_axes) > 0) & (radius >= 0)
+    return jnp.minimum(jnp.minimum(*found), jnp.where(solid & (leave >= enter), enter, jnp.inf))
+
+
+def _cut(enter: Array, leave: Array, inside: Array | FloatArray, growth: Array | FloatArray) -> tuple[Array, Array]:
+    """Cut rays to the inner side of lines: ``inside`` at their beginning is positive there, and grows so fast."""
+    cut = -inside / jnp.where(growth == 0, 1, growth)
+    outside = (growth == 0) & (inside < 0)
+    enter = jnp.maximum(enter, jnp.where(growth > 0, cut, 0))
+    return enter, jnp.minimum(leave, jnp.where(growth < 0, cut, jnp.where(outside, -jnp.inf, jnp.inf)))
 
 
 def _to_obstacles(arrays: ProblemArrays, x: Array, y: Array, ray_x: Array, ray_y: Array) -> list[Array]:
@@ -97,10 +148,7 @@ def _to_triangles(triangles: Array | FloatArray, x: Array, y: Array, ray_x: Arra
         along_x, along_y = end_x - corner_x, end_y - corner_y
         inside = along_x * (y - corner_y) - along_y * (x - corner_x)
         growth = along_x * ray_y - along_y * ray_x
-        cut = -inside / jnp.where(growth == 0, 1, growth)
-        outside = (growth == 0) & (inside < 0)
-        enter = jnp.maximum(enter, jnp.where(growth > 0, cut, 0))
-        leave = jnp.minimum(leave, jnp.where(growth < 0, cut, jnp.where(outside, -jnp.inf, jnp.inf)))
+        enter, leave = _cut(enter, leave, inside, growth)
     return jnp.where(leave < enter, jnp.inf, enter)
 
 

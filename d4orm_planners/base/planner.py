@@ -99,6 +99,11 @@ class Planner(ABC):
     def finish(self, search: SolveRun, state: State) -> None:  # noqa: B027 - a hook that most planners need not fill
         """Let go of what the state holds open; called once after :meth:`init`, however the solve ends."""
 
+    def within(self, communication_range: float) -> Planner:
+        """This planner where robots know of others within this range [m] only; itself if it is a central one."""
+        del communication_range
+        return self
+
     def solve(
         self,
         problem: Problem,

@@ -209,7 +209,9 @@ class OpenLoop(StatePolicy):
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         if self.planner is not None:
-            self.plan = self.planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
+            reach = env.unwrapped.options.communication_range
+            planner = self.planner if reach is None else self.planner.within(reach)
+            self.plan = planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
         elif self.plan is not None and self.plan.problem != self.problem:
             raise ValueError(
                 "the plan was made for another problem than the environment's; plan for this one, or keep one with "

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.core.team import DEFAULT_RADIUS
+from d4orm_env.envs.communication import communication_links
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole
@@ -70,6 +71,8 @@ class Orca(StatePolicy):
     All robots give way to each other by halves; docked robots, obstacles and bounds do not give way. ORCA speaks of
     robots that take a new velocity at once. Those of a model with inertia or a heading follow it as well as their
     limits allow, so that they may come closer than ORCA promises. It works in the plane only.
+
+    Where an environment limits whom robots observe, by range or line of sight, each avoids only those it knows of.
     """
 
     name = "orca"
@@ -89,6 +92,8 @@ class Orca(StatePolicy):
         angle = generator(seed, Stream.PREFERRED_DIRECTION).normal(0, self.config.deviation, problem.num_robots)
         self._turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], np.float32)
         self._walls = list(_walls(problem))
+        options = env.unwrapped.options
+        self._known = options.communication_range, options.line_of_sight
 
     def _controls(self, joint: JointState) -> FloatArray:
         problem, goals = self.problem, joint.goals
@@ -96,10 +101,21 @@ class Orca(StatePolicy):
             goals = goals_along_paths(problem, joint.states[:, : problem.dimension], goals)
         preferred = preferred_velocities(problem, joint.states, goals)
         preferred = np.einsum("ijk,kj->ki", self._turn, preferred)
-        return track_velocities(problem, joint.states, self._avoid(joint, preferred))
+        return track_velocities(problem, joint.states, self._avoid_known(joint, preferred))
 
-    def _avoid(self, joint: JointState, preferred: FloatArray) -> FloatArray:
-        """``(K, 2)`` velocities nearest to the preferred ones that avoid everything; zero for docked robots."""
+    def _avoid_known(self, joint: JointState, preferred: FloatArray) -> FloatArray:
+        """:meth:`_avoid`, every robot by itself among those it knows of where these are not all."""
+        if self._known == (None, False):
+            return self._avoid(joint, preferred, np.arange(len(preferred)))
+        links = communication_links(self.problem, joint.states[:, :2], *self._known)
+        alone = [np.flatnonzero(known | (np.arange(len(known)) == robot)) for robot, known in enumerate(links)]
+        return np.stack([self._avoid(joint, preferred, team)[robot] for robot, team in enumerate(alone)])
+
+    def _avoid(self, joint: JointState, preferred: FloatArray, team: IntArray) -> FloatArray:
+        """``(K, 2)`` velocities of these robots, nearest to the preferred ones, that avoid everything and each other.
+
+        Those of docked robots and of others are zero.
+        """
         problem, config = self.problem, self.config
         # Made anew at every step, so that an action depends on the present state alone.
         simulator = self._rvo.RVOSimulator()
@@ -110,7 +126,7 @@ class Orca(StatePolicy):
         radius, max_speed = np.asarray(problem.team.radius) / unit, np.asarray(problem.team.max_speed) / unit
         places = joint.states[:, :2] / unit
         stands = joint.arrived & problem.docks
-        moving = np.flatnonzero(~stands)
+        moving = team[~stands[team]]
         velocities = present_velocities(problem, joint.states, joint.controls) / unit
         for robot in moving:
             simulator.add_agent(
@@ -123,7 +139,7 @@ class Orca(StatePolicy):
                 float(max_speed[robot]),
                 velocities[robot].tolist(),
             )
-        docked = [_disc(places[k, 0], places[k, 1], radius[k]) for k in np.flatnonzero(stands)]
+        docked = [_disc(places[k, 0], places[k, 1], radius[k]) for k in team[stands[team]]]
         for corners in [*(wall / unit for wall in self._walls), *docked]:
             simulator.add_obstacle(corners.tolist())
         simulator.process_obstacles()

@@ -20,6 +20,7 @@ from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.benchmark.env_steps import (
     DISTURBANCES,
+    RAY_BOXES,
     RAYS,
     RIGID,
     measure_env,
@@ -123,7 +124,10 @@ def _environment_parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for what, measurement in (("one environment", measure_env), (f"{settings.num_worlds} worlds", measure_worlds)):
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
-        yield "environments", f"{what} with {RAYS} rays", partial(measurement, settings, 0, num_rays=RAYS)
+        for num_boxes in (0, RAY_BOXES):
+            among = f" among {num_boxes} boxes" if num_boxes else ""
+            sensing = partial(measurement, settings, num_boxes, num_rays=RAYS)
+            yield "environments", f"{what} with {RAYS} rays{among}", sensing
     yield "environments", "rooms, along paths", partial(measure_rooms, settings)
     yield "environments", f"{settings.num_worlds} worlds in JAX", partial(measure_functional, settings)
     for model in RIGID if find_spec("mujoco") else ():

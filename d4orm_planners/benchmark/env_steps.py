@@ -35,8 +35,8 @@ RIGID = ("holonomic2d", "differential_drive")
 """Models that are stepped as rigid bodies, where MuJoCo is installed."""
 
 
-RAYS = 32
-"""Rays of the range sensors of environments that are stepped beside those without."""
+RAYS, RAY_BOXES = 32, 100
+"""Rays of the range sensors of environments that are stepped beside those without, and boxes that they meet."""
 
 
 def measure_env(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
@@ -78,6 +78,33 @@ def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., Non
         return command
 
     return decorate
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationOptions:
+    """Options on what robots observe; what is not given is as the environment has it."""
+
+    observed_robots: Annotated[int | None, typer.Option(help="Nearest robots in an observation.")] = None
+    observed_obstacles: Annotated[int | None, typer.Option(help="Nearest obstacles in an observation.")] = None
+    observed_rays: Annotated[
+        int | None, typer.Option(help="Rays of every robot's range sensor; noise: --disturb ray_noise=0.02.")
+    ] = None
+    ray_range: Annotated[float | None, typer.Option(help="Range of these [m].")] = None
+    observed_path: Annotated[
+        bool | None, typer.Option("--observed-path", help="Direction and length of the shortest path.")
+    ] = None
+    communication_range: Annotated[
+        float | None, typer.Option(help="Distance beyond which no neighbour is observed [m].")
+    ] = None
+    line_of_sight: Annotated[
+        bool | None, typer.Option("--line-of-sight", help="Neighbours behind obstacles are not observed either.")
+    ] = None
+
+    @property
+    def observation(self) -> dict[str, Any]:
+        """Arguments of an environment."""
+        given = {field.name: getattr(self, field.name) for field in fields(ObservationOptions)}
+        return {name: value for name, value in given.items() if value is not None}
 
 
 def _imported(physics: str) -> str:

@@ -16,6 +16,7 @@ from d4orm_planners.cli.common_options import (
     Model,
     NoiseLevel,
     NumRobots,
+    ObservationOptions,
     Quiet,
     ScenarioName,
     ScenarioSettings,
@@ -29,7 +30,7 @@ from d4orm_planners.rl.dataset.write import checked_id, dataset_folder, write_da
 
 
 @dataclass(frozen=True, kw_only=True)
-class DatasetOptions:
+class DatasetOptions(ObservationOptions):
     """Options on demonstrations and their files."""
 
     context: typer.Context
@@ -79,6 +80,7 @@ class DatasetOptions:
                 environment[name] = getattr(self, name)
         if self.disturb:
             environment["disturbances"] = disturbances_at(single_levels(self.disturb))
+        environment |= self.observation
         return Demonstrations(
             policy=self.policy,
             settings=parse_settings(self.settings),

@@ -21,7 +21,15 @@ from d4orm_planners.cli.arguments import (
     parse_settings,
     seed_list,
 )
-from d4orm_planners.cli.common_options import Physics, Quiet, ScenarioSettings, TimeLimit, Workers, takes
+from d4orm_planners.cli.common_options import (
+    ObservationOptions,
+    Physics,
+    Quiet,
+    ScenarioSettings,
+    TimeLimit,
+    Workers,
+    takes,
+)
 from d4orm_planners.cli.outputs import resumable, tell_results
 from d4orm_planners.evaluation.evaluate import run_shard, run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard as page
@@ -66,8 +74,12 @@ STANDARD = (
 """Levels that are run where none are named, from harmless to bad; all robot models have these disturbances."""
 
 
+OF_RAYS = "ray_noise=0,0.02,0.05,0.1"
+"""One more where robots have range sensors."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class StudyOptions:
+class StudyOptions(ObservationOptions):
     """Options on a study, and on how to run it."""
 
     policies: Annotated[
@@ -149,6 +161,7 @@ class StudyOptions:
             scenario_settings=parse_settings(self.scenario_settings, "--scenario-set"),
             time_limit=self.time_limit,
             physics=self.physics,
+            observation=self.observation,
         )
 
 
@@ -237,7 +250,7 @@ class RobustnessOptions(StudyOptions):
 def robustness(options: RobustnessOptions) -> None:
     """Measure how often policies succeed when something goes wrong: noise, delays, pushes and others."""
     if options.control_noise_std is None and options.disturb is None:
-        options = replace(options, disturb=list(STANDARD))
+        options = replace(options, disturb=[*STANDARD, *[OF_RAYS] * bool(options.observed_rays)])
     rates, _ = report(options, write_robustness)
     require_trials(rates)
 

@@ -13,7 +13,7 @@ import rich
 import typer
 
 from d4orm_planners.cli.arguments import names
-from d4orm_planners.cli.common_options import ProblemOptions, takes
+from d4orm_planners.cli.common_options import ObservationOptions, ProblemOptions, takes
 from d4orm_planners.cli.signals import on_signals
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ LAST_WAIT = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlayOptions(ProblemOptions):
+class PlayOptions(ObservationOptions, ProblemOptions):
     """Options on the first scene, and on the page's address."""
 
     policy: Annotated[
@@ -67,7 +67,9 @@ def _playground(options: PlayOptions) -> Playground:
     quieten_viser()
     typer.echo("getting ready; the first time this compiles for a while ...")
     policies = names(options.policy) or ()
-    return Playground(options.problem(), *policies, seed=options.seed, host=options.host, port=options.port)
+    return Playground(
+        options.problem(), *policies, seed=options.seed, host=options.host, port=options.port, **options.observation
+    )
 
 
 def quieten_viser() -> None:

@@ -17,7 +17,15 @@ from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_policy
 from d4orm_planners.base.policy import OpenLoop
 from d4orm_planners.cli.arguments import check_target, names, refuse_options, single_levels
-from d4orm_planners.cli.common_options import Disturb, NoiseLevel, Physics, PictureOptions, ProblemOptions, takes
+from d4orm_planners.cli.common_options import (
+    Disturb,
+    NoiseLevel,
+    ObservationOptions,
+    Physics,
+    PictureOptions,
+    ProblemOptions,
+    takes,
+)
 from d4orm_planners.cli.outputs import episode_rows, print_table, require_success
 
 if TYPE_CHECKING:
@@ -28,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(PictureOptions, ProblemOptions):
+class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
     """Options on the policy and the environment."""
 
     plan_file: Annotated[Path | None, typer.Argument(help="Plan to execute; plans anew without one.")] = None
@@ -57,7 +65,8 @@ class RunOptions(PictureOptions, ProblemOptions):
 
     def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[AnyDisturbance]) -> Episode:
         """An episode of a policy on a problem."""
-        env = open_env(problem, self.physics, control_noise_std=self.control_noise_std, disturbances=disturbances)
+        wrong = {"control_noise_std": self.control_noise_std, "disturbances": disturbances}
+        env = open_env(problem, self.physics, **wrong, **self.observation)
         episode = run_episode(env, policy, seed=self.seed)
         env.close()
         return episode

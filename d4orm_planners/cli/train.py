@@ -44,6 +44,10 @@ class TrainOptions:
     start_from: Annotated[Path | None, typer.Option(help="A policy file of the same algorithm that learns on.")] = None
     network: Annotated[str, typer.Option(help="flat, or sets: neighbours in any order and number.")] = "flat"
     observed_robots: Annotated[int, typer.Option(help="Neighbours in observations.")] = 4
+    observed_rays: Annotated[
+        int, typer.Option(help="Rays of every robot's range sensor; noise: --mixture 'rooms 8 disturb.ray_noise=0.02'.")
+    ] = 0
+    ray_range: Annotated[float, typer.Option(help="Range of these [m].")] = 5.0
     shortest_paths: Annotated[
         bool, typer.Option("--shortest-paths", help="Robots head along their shortest paths; for worlds with walls.")
     ] = False

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,6 +92,7 @@ class Inbox:
         transport: Transport of the messages.
         num_nodes: Number of nodes.
         own: The node that it belongs to, or ``None`` for an observer's.
+        heard: Nodes whose messages reach it; ``None`` for all.
 
     Attributes:
         newest: The newest report of every node heard from, by node.
@@ -99,9 +101,16 @@ class Inbox:
         namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
     """
 
-    def __init__(self, evaluator: Evaluator, transport: Transport, num_nodes: int, own: int | None = None) -> None:
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        transport: Transport,
+        num_nodes: int,
+        own: int | None = None,
+        heard: Set[int] | None = None,
+    ) -> None:
         self._evaluator, self._transport = evaluator, transport
-        self._num_nodes, self._own = num_nodes, own
+        self._num_nodes, self._own, self._heard = num_nodes, own, heard
         self._owner = "the observer" if own is None else f"node {own}"
         self._logged: set[str] = set()
         self.newest: dict[int, Report] = {}
@@ -115,9 +124,12 @@ class Inbox:
         messages = []
         for data in self._transport.collect(timeout):
             try:
-                messages.append(self._decoded(data))
+                message = self._decoded(data)
             except MessageError as error:
                 self._drop(error.kind, str(error))
+                continue
+            if self._heard is None or message.node in self._heard:
+                messages.append(message)
         newest, stale = merge(self.newest, messages)
         for message in stale:
             self._drop("stale", f"number {message.sequence} of node {message.node}, which has sent a newer one")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
@@ -73,6 +73,7 @@ class NodeTask:
         controls: ``(H, K, m)`` to start from; ``None`` for zeros.
         selection: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.selection.choose`.
         k: Number of candidates that it draws from.
+        links: ``(N, N)`` bool: which nodes each one hears; ``None`` for all.
     """
 
     num_nodes: int
@@ -80,6 +81,12 @@ class NodeTask:
     controls: FloatArray | None
     selection: str
     k: int
+    links: BoolArray | None = None
+
+    def heard_by(self, node: int) -> set[int]:
+        """Return the nodes that a node hears."""
+        others = range(self.num_nodes) if self.links is None else np.flatnonzero(self.links[node]).tolist()
+        return set(others) - {node}
 
 
 class Node:
@@ -120,12 +127,12 @@ class Node:
         self.search.cancelled = evaluator.stop
         self.candidate = self.search.current
         self.transport = TrafficStats(transport)
-        self.inbox = Inbox(evaluator, self.transport, task.num_nodes, number)
+        self._others = task.heard_by(number)
+        self.inbox = Inbox(evaluator, self.transport, task.num_nodes, number, self._others)
         self.excluded = 0
         self._task = task
         self._sequence = self._began = sequence
         self._observer = observer
-        self._others = set(range(task.num_nodes)) - {number}
         self._awaited = self._others
 
     def refine(self) -> None:
@@ -164,7 +171,7 @@ class Node:
         """Raise ``ValueError`` if another node has this one's number, and had it first."""
         namesake = self.inbox.namesake
         if namesake is not None and namesake <= self._began:
-            last = len(self._others)
+            last = self._task.num_nodes - 1
             raise ValueError(
                 f"node is {self.number}, and another process on the network is node {self.number} already; give each "
                 f"a number of its own, from 0 to {last}"

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
+from d4orm_env.core.arrays import BoolArray
+from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import available_cores
+from d4orm_env.envs.communication import communication_links
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD
@@ -59,10 +62,23 @@ class DD4orm(Planner):
         """See :meth:`Planner.init`: the nodes, ready to begin."""
         with ExitStack() as opened:
             number = self.config.nodes or search.problem.num_robots
-            task = NodeTask(number, search.seed, search.current.planned, self.config.selection, self.config.k)
+            selection = self.config.selection, self.config.k
+            task = NodeTask(number, search.seed, search.current.planned, *selection, self._links(search.problem))
             zenoh = self.config.zenoh
             crew = self._local_crew(search, task, opened) if zenoh is None else self._network_crew(search, task, zenoh)
             return RunningNodes(crew, opened.pop_all())
+
+    def within(self, communication_range: float) -> DD4orm:
+        """See :meth:`Planner.within`: where the robots are the nodes they hear each other within the range only."""
+        if self.config.nodes is not None or self.config.transport == "zenoh":
+            return self
+        return DD4orm(replace(self.config, communication_range=communication_range))
+
+    def _links(self, problem: Problem) -> BoolArray | None:
+        """Return which nodes hear each other; ``None`` for all."""
+        reach = self.config.communication_range
+        starts = problem.start[:, : problem.dimension]
+        return None if reach is None else communication_links(problem, starts, reach, line_of_sight=False)
 
     def iterate(self, search: SolveRun, state: RunningNodes) -> tuple[RunningNodes, Iteration]:
         """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""

@@ -12,7 +12,7 @@ from pydantic import Field, InstanceOf, SkipValidation
 from d4orm_env.core.arrays import shown
 from d4orm_env.core.errors import unknown
 from d4orm_planners.base.planner import PlannerConfig
-from d4orm_planners.base.settings import NOTHING, Count, Seconds, Whole, one_of
+from d4orm_planners.base.settings import NOTHING, Count, Positive, Seconds, Whole, one_of
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d_d4orm.node_pool import MODES
 from d4orm_planners.d_d4orm.ray_planner import host_and_port
@@ -41,6 +41,9 @@ class DD4ormConfig(PlannerConfig):
         refinement: The settings of that planner. Its ``num_samples`` and ``repair_samples`` are those of all nodes
             together, of which each gets an equal share; what every planner takes is as it is here.
         nodes: Number of nodes, at most 1024; ``None`` for one per robot, as where the robots themselves are the nodes.
+        communication_range: Distance of two robots' starts beyond which their nodes do not hear each other [m], where
+            the robots themselves are the nodes; ``None`` for no limit. What a node hears it may pass on, in what it
+            makes of it. Not over a network, which has its own limits.
         selection: Candidate that a node goes on from: one of the ``k`` candidates of most reward (``"top-k"``), the
             best one (``"max"``), or one of the best of ``k`` clusters (``"k-means"``).
         k: Number of candidates that it draws from.
@@ -59,6 +62,7 @@ class DD4ormConfig(PlannerConfig):
 
     refinement: InstanceOf[DeformationConfig] = field(default_factory=D4ormConfig)
     nodes: Annotated[Count, Field(le=MOST_NODES)] | None = 2
+    communication_range: Positive | None = None
     selection: Annotated[str, one_of(SELECTIONS)] = "top-k"
     k: Count = 4
     mode: Annotated[str, one_of(MODES)] = "sync"
@@ -72,6 +76,11 @@ class DD4ormConfig(PlannerConfig):
         super().__post_init__()
         if self.nodes is not None:
             self.node_planners(self.nodes)
+        if self.communication_range is not None and (self.nodes is not None or self.transport == "zenoh"):
+            raise ValueError(
+                f"communication_range is {self.communication_range:g}, and the nodes are not this process's robots; "
+                "give nodes=None, and transport 'local' or 'ray'"
+            )
         if self.address is not None:
             if self.transport != "ray":
                 raise ValueError(f"address {self.address!r} goes with transport 'ray', not {self.transport!r}")

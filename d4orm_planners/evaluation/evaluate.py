@@ -40,6 +40,7 @@ def evaluate(
     scenario_settings: Mapping[str, object] | None = None,
     time_limit: float | None = None,
     physics: str = "model",
+    observation: Mapping[str, object] | None = None,
     trial_timeout: float | None = None,
     workers: int | None = None,
     ray: str | None = None,
@@ -74,6 +75,7 @@ def evaluate(
         physics: Physics of the robots: ``"model"``, the equations that planners know, ``"mujoco"``, see
             :mod:`d4orm_env.mujoco`, or ``"crazyflow"``, see :mod:`d4orm_env.crazyflow`. Executed controls are not
             judged by :func:`d4orm_env.verify` then.
+        observation: Arguments of the environment on what robots observe, as ``{"observed_rays": 32}``.
         trial_timeout: Seconds after which a trial is ended with an error; ``None`` waits.
         workers: Processes of one thread each, by default as many as there are cores; with 1, and without
             ``trial_timeout``, trials run in this process on all its cores. On a cluster: jobs under way at most.
@@ -100,6 +102,7 @@ def evaluate(
         scenario_settings=scenario_settings or {},
         time_limit=time_limit,
         physics=physics,
+        observation=observation or {},
     )
     trials = run_study(study, out, trial_timeout=trial_timeout, workers=workers, ray=ray, progress=progress)
     rates = success_rates(trials)

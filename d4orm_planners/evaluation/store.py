@@ -24,7 +24,8 @@ class TrialKey(NamedTuple):
 
     Attributes:
         policy: Registry name.
-        config: All settings of the policy, as JSON with sorted keys.
+        config: All settings of the policy, as JSON with sorted keys; under ``observation`` the arguments of the
+            environment on what it observes, where there are any.
         problem: :attr:`d4orm_env.core.problem.Problem.digest`.
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.

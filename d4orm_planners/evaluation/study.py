@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
+from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances import Disturbance
-from d4orm_env.disturbances.disturbance import AnyDisturbance, at_work, checked_disturbances
+from d4orm_env.disturbances.disturbance import AnyDisturbance, checked_disturbances
 from d4orm_env.disturbances.disturbance_registry import attributes_of, disturbance_at
+from d4orm_env.envs.options import OBSERVATION, EnvOptions
+from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import check_physics
@@ -50,6 +53,7 @@ class Study:
     scenario_settings: Mapping[str, object] = field(default_factory=dict)
     time_limit: float | None = None
     physics: str = "model"
+    observation: Mapping[str, object] = field(default_factory=dict)
 
     def groups(self) -> list[list[Job]]:
         """A list of jobs per scenario, model, team size and policy, in that order, with one for every seed.
@@ -62,11 +66,14 @@ class Study:
             replace(condition, physics=self.physics)
             for condition in conditions(self.control_noise_std, self.disturbances)
         )
+        for name in self.observation:
+            if name not in OBSERVATION:
+                raise unknown("observation", name, OBSERVATION)
         policies, seeds = self.configurations(), _checked_seeds(self.seeds)
         cells = self._problems(seeds)
         for problem in (problems[0] for _, problems in cells):
             for condition in under:
-                at_work(condition.disturbances, problem)
+                EnvSetup(EnvOptions.of(problem=problem, disturbances=condition.disturbances, **self.observation))
             check_physics(problem, self.physics)
         return [
             [Job(policy, problem, scenario, seed, under) for seed, problem in zip(seeds, problems)]
@@ -93,7 +100,8 @@ class Study:
 
     def _configuration(self, label: str, policy: PolicyLike, settings: dict[str, object]) -> Configuration:
         named = isinstance(policy, str)
-        choice = Configuration(label, policy if isinstance(policy, str) else label, settings, origin(policy))
+        own = policy if isinstance(policy, str) else label
+        choice = Configuration(label, own, settings, origin(policy), self.observation)
         if self.time_limit is not None and choice.planned:
             settings.setdefault("time_limit", duration(self.time_limit, "time_limit"))
         make_policy(policy, **settings)

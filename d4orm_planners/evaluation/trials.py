@@ -6,7 +6,7 @@ import copy
 import json
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
@@ -82,12 +82,14 @@ class Configuration:
         policy: Its name or import path; the label of one that a program gave itself.
         settings: Those that differ from the defaults.
         given: Argument of :func:`~d4orm_planners.make_policy` for it in any process, if not ``policy``.
+        observation: Arguments of the environment on what robots observe, where they are others than its own.
     """
 
     label: str
     policy: str
     settings: Mapping[str, object]
     given: object = None
+    observation: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def source(self) -> Any:
@@ -96,13 +98,14 @@ class Configuration:
 
     @cached_property
     def config(self) -> str:
-        """All settings, and the digest of a user's source, as JSON with sorted keys.
+        """All settings, the digest of a user's source, and what is observed, as JSON with sorted keys.
 
         Raises:
             ValueError: If a setting has no form in JSON, or a source cannot be read.
         """
         try:
-            return json.dumps(policy_settings(self.source, **self.settings), sort_keys=True)
+            observed = {"observation": dict(self.observation)} if self.observation else {}
+            return json.dumps(policy_settings(self.source, **self.settings) | observed, sort_keys=True)
         except TypeError as error:
             if isinstance(error, UnknownKeywordError):
                 raise
@@ -183,8 +186,8 @@ class Job:
 def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, Any]:
     """Columns of a trial that runs to its end."""
     problem = job.problem
-    noise, disturbances = condition.control_noise_std, condition.disturbances
-    env = open_env(problem, condition.physics, control_noise_std=noise, disturbances=disturbances)
+    wrong = {"control_noise_std": condition.control_noise_std, "disturbances": condition.disturbances}
+    env = open_env(problem, condition.physics, **wrong, **job.policy.observation)
     episode = run_episode(env, policy, seed=job.seed)
     env.close()
     metrics, plan = episode.metrics, policy.plan

@@ -41,6 +41,14 @@ def puck(sections: int, height: float = 1.0) -> trimesh.Trimesh:
     return mesh
 
 
+def slab(outline: NDArray[np.float64]) -> trimesh.Trimesh:
+    """Return the shape of a convex outline ``(n, 2)`` in the plane: a prism of height 1 about it."""
+    corners = outline[np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1) > 1e-9]
+    mesh = _prism(corners, 1.0)
+    mesh.unmerge_vertices()  # so that edges are sharp
+    return mesh
+
+
 def ball(subdivisions: int) -> trimesh.Trimesh:
     """Return the shape of things in space: a sphere of radius 1 about the origin."""
     return trimesh.creation.icosphere(subdivisions=subdivisions)

@@ -8,6 +8,7 @@ import logging
 import socket
 import threading
 import time
+from typing import Any
 
 import viser
 
@@ -39,6 +40,7 @@ class Playground:
         seed: Of the policies, of what goes wrong, and of new goals.
         host: Address of the page; by default on this machine only. Elsewhere the address has a token.
         port: Port of the page; 0 for any free one.
+        **observation: Arguments of :class:`d4orm_env.navigation_v0.parallel_env` on what robots observe.
 
     Attributes:
         address: Address to open in a browser.
@@ -48,10 +50,18 @@ class Playground:
         ValueError: If it cannot be found there, or there is no such policy.
     """
 
-    def __init__(self, problem: Problem, *policies: str, seed: int = 0, host: str = LOOPBACK[0], port: int = 0) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        *policies: str,
+        seed: int = 0,
+        host: str = LOOPBACK[0],
+        port: int = 0,
+        **observation: Any,
+    ) -> None:
         local = host in LOOPBACK
         chosen = _free_port(host, port)
-        self.session = Session(problem, *policies, seed=seed)
+        self.session = Session(problem, *policies, seed=seed, **observation)
         with contextlib.redirect_stdout(io.StringIO()):  # its own words on where it is
             self._server = _Server(
                 host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False

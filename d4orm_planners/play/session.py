@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,9 +47,11 @@ class Session:
         ValueError: If there is no such policy, or it cannot drive there.
     """
 
-    def __init__(self, problem: Problem, *policies: str, seed: int = 0, lifelong: bool = False) -> None:
+    def __init__(
+        self, problem: Problem, *policies: str, seed: int = 0, lifelong: bool = False, **observation: Any
+    ) -> None:
         self._loaded, self.policies = problem, policies or ("d4orm-c2f",)
-        self._terms, self.levels = EpisodeOptions(seed, lifelong), dict[str, float]()
+        self._terms, self.levels = EpisodeOptions(seed, lifelong, observation), dict[str, float]()
         self._drivers = Drivers()
         self.commands = CommandQueue()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0

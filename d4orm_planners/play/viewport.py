@@ -5,8 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -103,6 +104,7 @@ class EpisodeOptions:
 
     seed: int = 0
     lifelong: bool = False
+    observation: Mapping[str, Any] = field(default_factory=dict)
     disturbances: Sequence[AnyDisturbance] = ()
 
 
@@ -119,9 +121,10 @@ class Viewport:
     ) -> None:
         self.name, self._policy, self._scene, self._seed = name, policy, scene, terms.seed
         # A robot stalls within the scene's usual duration, after which this episode goes on all the same.
-        self._env = navigation_v0.parallel_env(
-            problem=scene, lifelong=terms.lifelong, disturbances=terms.disturbances, max_cycles=scene.horizon
-        )
+        options: dict[str, Any] = {
+            "lifelong": terms.lifelong, "disturbances": terms.disturbances, **terms.observation
+        }  # fmt: skip
+        self._env = navigation_v0.parallel_env(problem=scene, max_cycles=scene.horizon, **options)
         self._observations, _ = self._env.reset(seed=terms.seed)
         self._env.max_cycles = MOST_CYCLES
         begin = time.perf_counter()

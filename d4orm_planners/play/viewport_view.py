@@ -15,12 +15,11 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import robot_colors, view_limits
 from d4orm_planners.play import edits
+from d4orm_planners.play.bodies import BodyGroup, PathLines, body_groups, body_places, goal_poses, heading_lines
 from d4orm_planners.play.meshes import (
     NO_LINES,
-    Colors,
     Points,
     ball,
-    bends,
     edges,
     in_space,
     linear,
@@ -31,6 +30,7 @@ from d4orm_planners.play.meshes import (
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 
+Whose: TypeAlias = NDArray[np.intp] | None
 Moved: TypeAlias = Callable[[int, Points, Points, bool], None]
 
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
@@ -41,13 +41,10 @@ TRAIL_STEPS = 30
 TRAIL_SEGMENTS = 8
 """Lines that a trail consists of."""
 
-PLAN_TOLERANCE = 0.1
-"""Error allowed in the line of a path ahead, in radii of a robot."""
-
 PUSH_PER_METER = 1.0
 """Velocity that a robot gets for every metre of the arrow that pushes it [1/s]."""
 
-WIDTHS = {"guidance": 1.5, "plans": 4.0, "trails": 2.0}
+WIDTHS = {"guidance": 1.5, "plans": 4.0, "trails": 2.0, "goal_poses": 2.0}
 """Widths of lines that fade, in pixels."""
 
 LINES_EVERY = 0.1
@@ -71,8 +68,10 @@ class LaneView:
         self._seen, self._lines_at = (-1, False), 0.0
         self._held: dict[tuple[str, int], Points] = {}
         self._trail: list[FloatArray] = []
-        self._knots: dict[str, tuple[FloatArray, list[NDArray[np.intp]]]] = {}
+        self._paths = {name: PathLines(frame.problem) for name in ("plans", "guidance")}
         self._colors = self._own_colors = 255 * robot_colors(frame.problem.num_robots)
+        self._groups = body_groups(frame.problem)
+        self._places: dict[str, Points] = {}
         self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=place)}
         self._add_team(frame)
         self._add_world(frame.problem)
@@ -103,20 +102,30 @@ class LaneView:
             self._seen = seen
             self._color(frame)
         places = self._with_held("robot", in_space(frame.positions(now)))
-        nodes["robots"].batched_positions = places
-        nodes["heading"].points = self._headings(frame, places)
-        nodes["goals"].batched_positions = self._with_held("goal", in_space(frame.goals))
+        goals = self._with_held("goal", in_space(frame.goals))
+        self._places = {"robot": places, "goal": goals}
+        self._move_team(frame, places)
+        nodes["heading"].points = heading_lines(frame.problem, frame.states, places)
+        nodes["goals"].batched_positions = goals
         if len(frame.bodies):
             nodes["bodies"].batched_positions = in_space(frame.body_positions(now))
-        nodes["margins"].visible = self._shown["margins"]
-        if self._shown["margins"]:
-            nodes["margins"].batched_positions = places
         nodes["subgoals"].visible = self._shown["subgoals"] and frame.subgoals is not None
         if frame.subgoals is not None and nodes["subgoals"].visible:
             nodes["subgoals"].batched_positions = in_space(frame.subgoals)
         if now - self._lines_at > LINES_EVERY:
             self._lines_at = now
             self._draw_lines(frame)
+
+    def _move_team(self, frame: Frame, places: Points) -> None:
+        """Move all bodies, their robots to ``places`` ``(K, 3)``."""
+        shown, turns = body_places(frame.problem, frame.states, places)
+        for group in self._groups:
+            margins = self._nodes[f"margins_{group.name}"]
+            margins.visible = self._shown["margins"]
+            for node in (self._nodes[group.name], *[margins] * self._shown["margins"]):
+                node.batched_positions = shown[group.bodies]
+                if turns is not None:
+                    node.batched_wxyzs = turns[group.bodies]
 
     def _with_held(self, kind: str, places: Points) -> Points:
         """Positions, with those that are dragged at the pointer."""
@@ -126,25 +135,24 @@ class LaneView:
         return places
 
     def _add_team(self, frame: Frame) -> None:
-        problem, radius = frame.problem, np.asarray(frame.problem.team.radius, np.float32)
+        problem = frame.problem
+        # Of the robots themselves: the discs round their trailers too would hide everything.
+        radius = np.array([footprint.outer_radius for footprint in problem.team.footprint], np.float32)
         flat = problem.dimension == 2
-        body, diamond = (puck(24), puck(4, 0.2)) if flat else (ball(2), ball(0))
-        high = 0.5 * radius if flat else radius
-        mark = 1.5 * radius if flat else 1.4 * radius
-        margin, dot = radius + np.float32(problem.margin), 0.35 * radius
-        shapes = {
-            "robots": (body, radius, high, self._colors, 1.0),
-            "goals": (diamond, mark, mark, self._colors, 0.6 if flat else 0.35),
-            "margins": (body, margin, 0.2 * high if flat else margin, np.array(MARGIN), 0.25),
-            "subgoals": (ball(0), dot, dot, self._colors, 0.9),
-        }
+        mark, dot = 1.5 * radius if flat else 1.4 * radius, 0.35 * radius
         places, goals = in_space(frame.positions(time.perf_counter())), in_space(frame.goals)
-        for name, (mesh, wide, tall, colors, opacity) in shapes.items():
-            scales = np.stack([wide, wide, tall], axis=1)
-            self._add_many(name, mesh, goals if name == "goals" else places, scales, colors, opacity)
-        self._drag("robots", "robot", lambda index, place, _: lambda problem: edits.move_robot(problem, index, place))
+        shown = body_places(problem, frame.states, places)[0]
+        for group in self._groups:
+            at, colors = shown[group.bodies], self._colors[group.robots]
+            self._add_many(group.name, group.mesh, at, group.scales, colors, 1.0)
+            self._add_many(f"margins_{group.name}", group.margin[0], at, group.margin[1], np.array(MARGIN), 0.25)
+            move = lambda index, place, _: lambda problem: edits.move_robot(problem, index, place)  # noqa: E731
+            self._drag(group.name, "robot", move, group.robots)
+            self._drag_pushes(group)
+        diamond = puck(4, 0.2) if flat else ball(0)
+        self._add_many("goals", diamond, goals, np.stack([mark] * 3, axis=1), self._colors, 0.6 if flat else 0.35)
+        self._add_many("subgoals", ball(0), places, np.stack([dot] * 3, axis=1), self._colors, 0.9)
         self._drag("goals", "goal", lambda index, place, _: lambda problem: edits.move_goal(problem, index, place))
-        self._drag_pushes()
 
     def _add_bodies(self, frame: Frame) -> None:
         """Add the dynamic obstacles."""
@@ -183,7 +191,9 @@ class LaneView:
                 thickness=2.0, thickness_units="screen",
             )  # fmt: skip
 
-    def _drag(self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit]) -> None:
+    def _drag(
+        self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit], whose: Whose = None
+    ) -> None:
         """Let a shape be dragged: it follows the pointer, and where it is let go the scene is changed."""
         node = self._nodes[name]
 
@@ -197,24 +207,30 @@ class LaneView:
             d = self._frame.problem.dimension
             self._session.edit(edit(index, (at + shift)[:d], shift[:d]), self._index)
 
-        self._follow_hand(node, kind, moved)
+        self._follow_hand(node, kind, moved, whose=whose)
 
-    def _drag_pushes(self) -> None:
+    def _drag_pushes(self, group: BodyGroup) -> None:
         """Let robots be pushed: the page draws an arrow, and where it is let go the robot gets its velocity."""
 
         def moved(index: int, at: Points, arrow: Points, ended: bool) -> None:
             if ended:
                 self._session.push(index, PUSH_PER_METER * arrow[: self._frame.problem.dimension], self._index)
 
-        self._follow_hand(self._nodes["robots"], "robot", moved, "shift")
+        self._follow_hand(self._nodes[group.name], "robot", moved, "shift", group.robots)
 
-    def _follow_hand(self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None) -> None:
-        """Call ``moved(number, place, shift so far, ended)`` while one of a node's shapes is dragged."""
+    def _follow_hand(
+        self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, whose: Whose = None
+    ) -> None:
+        """Call ``moved(number, place, shift so far, ended)`` while one of a node's shapes is dragged.
+
+        The number is that of the shape, or what ``whose`` ``(N,)`` has for it.
+        """
         grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 
         @node.on_drag("left", modifier=modifier)
         async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:  # one after the other
-            index, hand = event.instance_index or 0, (event.client_id, event.instance_index or 0)
+            instance = event.instance_index or 0
+            index, hand = instance if whose is None else int(whose[instance]), (event.client_id, instance)
             if event.phase == "start":
                 at = self._place_of(kind, index)
                 grips[hand] = (at, self._pointed(event, at))
@@ -231,8 +247,7 @@ class LaneView:
 
     def _place_of(self, kind: str, index: int) -> Points:
         """``(3,)`` where the page shows it; the session may be further on."""
-        many = {"robot": "robots", "goal": "goals"}.get(kind)
-        return np.array(self._nodes[kind].position if many is None else self._nodes[many].batched_positions[index])
+        return np.array(self._places[kind][index] if kind in self._places else self._nodes[kind].position)
 
     def _pointed(self, event: viser.SceneNodeDragEvent[viser.SceneNodeHandle], at: Points) -> Points:
         """Return the pointer's position: on the plane that planar robots drive on, or as far off as the shape."""
@@ -250,7 +265,8 @@ class LaneView:
         self._colors = self._own_colors + (0.5 * (255 - self._own_colors) if self._shown["dark"] else 0)
         colors = np.where(frame.arrived[:, None], 0.5 * (self._paper + self._colors), self._colors)
         colors = np.where(frame.collided[:, None], np.array(CONTACT), colors)
-        self._nodes["robots"].batched_colors = linear(colors)
+        for group in self._groups:
+            self._nodes[group.name].batched_colors = linear(colors[group.robots])
         self._nodes["goals"].batched_colors = self._nodes["subgoals"].batched_colors = linear(self._colors)
 
     @property
@@ -267,30 +283,11 @@ class LaneView:
             lines["trails"] = polylines(trail, self._colors, self._paper, (0.2, 1.0), knots)
         for name, path, shades in (("plans", frame.plan, (1.0, 0.4)), ("guidance", frame.guidance, (0.8, 0.25))):
             if path is not None and len(path) > 1 and self._shown[name]:
-                lines[name] = self._path_lines(name, path, shades, frame.problem)
+                lines[name] = self._paths[name].drawn(path, self._colors, self._paper, shades)
+        poses, owners = goal_poses(frame.problem, self._places["goal"])
+        lines["goal_poses"] = poses, linear(np.repeat(self._colors[owners][:, None], 2, axis=1))
         for name, (points, colors) in lines.items():
             self._nodes[name].points, self._nodes[name].colors = points, colors
-
-    def _path_lines(
-        self, name: str, path: FloatArray, shades: tuple[float, float], problem: Problem
-    ) -> tuple[Points, Colors]:
-        """Lines of the paths ahead, looked for only when these are others."""
-        if name not in self._knots or not np.array_equal(self._knots[name][0], path):
-            tolerance = PLAN_TOLERANCE * np.asarray(problem.team.radius)
-            knots = [bends(path[:, robot], float(tolerance[robot])) for robot in range(path.shape[1])]
-            self._knots[name] = (path, knots)
-        return polylines(path, self._colors, self._paper, shades, self._knots[name][1])
-
-    def _headings(self, frame: Frame, places: Points) -> Points:
-        """``(N, 2, 3)`` lines from the centre to the front of robots that have one."""
-        models, radius = frame.problem.team.robot_models, np.asarray(frame.problem.team.radius)
-        drives = [(robot, model.heading_index) for robot, model in enumerate(models) if model.heading_index is not None]
-        points = np.zeros((len(drives), 2, 3), np.float32)
-        for row, (robot, index) in enumerate(drives):
-            angle = frame.states[robot, index]
-            points[row] = places[robot] + np.array([0, 0, 0.3 * radius[robot]])
-            points[row, 1, :2] += radius[robot] * np.array([np.cos(angle), np.sin(angle)])
-        return points
 
 
 def _mover(kind: str, index: int) -> Callable[[int, FloatArray, FloatArray], edits.Edit]:

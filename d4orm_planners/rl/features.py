@@ -36,7 +36,7 @@ class Features:
 
     The ``F`` features of an observation are all of order one: velocity (``d``) in units of the speed limit; heading
     (2); direction to the goal (``d``); two functions of the distance to it; share of the time left; radius;
-    acceleration over speed limit. For each
+    acceleration over speed limit; two functions of the gap along each ray, from the frame's first axis on. For each
     neighbour: presence, direction (``d``), two functions of the gap, relative velocity (``d``), and, with velocities
     kept as they are, when the two come closest and how close. For each obstacle: presence, direction (``d``), two
     functions of the gap.
@@ -44,7 +44,8 @@ class Features:
     Attributes:
         slices: Slices of an observation.
         turned: Whether controls are vectors of the world.
-        frame: ``"goal"`` or ``"heading"``: where the first axis of a robot's frame points.
+        frame: ``"goal"`` or ``"heading"``: where the first axis of a robot's frame points; with rays and without a
+            heading along the ray nearest to the goal, so that rays of one frame are those of any other.
     """
 
     slices: ObservationSlices
@@ -65,8 +66,8 @@ class Features:
 
     @property
     def own_size(self) -> int:
-        """Number of those of the robot itself, which come first."""
-        return 2 * self.slices.dimension + 7
+        """Number of those of the robot itself and of its rays, which come first."""
+        return 2 * self.slices.dimension + 7 + 2 * self.slices.num_rays
 
     @property
     def neighbor_size(self) -> int:
@@ -132,6 +133,9 @@ class Features:
         frame = _unit(goal[:, :2] if self.frame == "goal" else observations[:, own.heading])
         # On the goal itself any direction will do.
         frame[(frame == 0).all(axis=1), 0] = 1
+        rays = observations[:, self.slices.rays]
+        if self.frame == "goal" and self.slices.num_rays:
+            frame, rays = self._along_rays(frame, rays)
         parts = [
             _into(frame, observations[:, own.velocity]) / max_speed,
             _into(frame, observations[:, own.heading]),
@@ -140,6 +144,7 @@ class Features:
             observations[:, own.time_left],
             observations[:, own.radius],
             observations[:, own.max_acceleration] / max_speed,
+            *_scales(np.maximum(rays - observations[:, own.radius], 0)),
             self._neighbors(frame, observations).reshape(count, -1),
             self._obstacles(frame, observations).reshape(count, -1),
         ]
@@ -179,6 +184,13 @@ class Features:
             controls = _into(frames, within.astype(np.float32))
         actions: FloatArray = np.clip(controls / limits, -1, 1)
         return actions
+
+    def _along_rays(self, frame: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Frames ``(N, 2)`` turned to the nearest rays, and rays ``(N, R)`` from these on, counter-clockwise."""
+        directions = self.slices.ray_directions
+        first = (frame @ directions.T).argmax(axis=1)
+        order = (first[:, None] + np.arange(len(directions))) % len(directions)
+        return directions[first], np.take_along_axis(rays, order, axis=1)
 
     def _neighbors(self, frame: FloatArray, observations: FloatArray) -> FloatArray:
         own, part, seen = self.slices.own, self.slices.neighbor, self.slices.neighbors(observations)

@@ -13,7 +13,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
-from d4orm_planners.rl.network import SUFFIX, Network, load_network
+from d4orm_planners.rl.network import SUFFIX, Network, load_network, range_sensors
 from d4orm_planners.tracking.steering import drive_to_goal, goals_along_paths, must_brake
 
 if TYPE_CHECKING:
@@ -107,8 +107,9 @@ class LearnedPolicy(Policy):
         if (path := self._file()) != self._actor.path:
             self._use(path)
         agent, self._env = env.possible_agents[0], env
-        if isinstance(self._actor, _NetworkActor) and env.unwrapped.options.observed_rays:
-            raise ValueError(f"the policy in {self._actor.path.name} reads no rays; leave observed_rays out")
+        if isinstance(self._actor, _NetworkActor):
+            options = env.unwrapped.options
+            self._actor.check_rays(range_sensors(options.observed_rays, options.ray_range))
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
@@ -186,6 +187,14 @@ class _NetworkActor:
                 f"the policy in {self.path.name} was trained for observations of {features.slices.size} numbers, "
                 f"and this environment's have shape {observation_shape}; make it with {robots}, "
                 f"observed_obstacles={header.num_obstacles}, and do not wrap its observations"
+            )
+
+    def check_rays(self, given: str) -> None:
+        """Refuse other range sensors than those of the training; their numbers could pass for neighbours."""
+        if (trained := self.network.header.range_sensors) != given:
+            raise ValueError(
+                f"the policy in {self.path.name} was trained with {trained}, and this environment has {given}; make it "
+                "as in training"
             )
 
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:

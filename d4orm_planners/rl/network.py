@@ -48,6 +48,8 @@ class Header(BaseModel):
         dimension: Position dimensions of the observations.
         num_neighbors: Robots in an observation.
         num_obstacles: Obstacles in an observation.
+        num_rays: Rays of its range sensor; ``None`` is none.
+        ray_range: Range of that [m]; ``None`` without rays.
         activation: Between the layers.
         squashed: Whether the output goes through tanh.
         layers: Number of layers; those of sets come before them and are not counted.
@@ -67,6 +69,8 @@ class Header(BaseModel):
     dimension: int = Field(ge=2, le=3)
     num_neighbors: int = Field(ge=0, le=1000)
     num_obstacles: int = Field(ge=0, le=1000)
+    num_rays: int | None = Field(default=None, ge=1, le=1000)
+    ray_range: float | None = Field(default=None, gt=0)
     activation: str
     squashed: bool
     layers: int = Field(ge=1, le=16)
@@ -76,10 +80,21 @@ class Header(BaseModel):
     brakes: Literal[True] | None = None
     training: dict[str, object]
 
+    @property
+    def range_sensors(self) -> str:
+        """The range sensors that it reads, as :func:`range_sensors` says it."""
+        return range_sensors(self.num_rays or 0, self.ray_range or 0.0)
+
     def text(self) -> str:
         """Return it as JSON, which earlier versions read where it says nothing that they do not know."""
-        unsaid = {name for name in ("encoder", "frame", "shortest_paths", "brakes") if getattr(self, name) is None}
+        optional = ("num_rays", "ray_range", "encoder", "frame", "shortest_paths", "brakes")
+        unsaid = {name for name in optional if getattr(self, name) is None}
         return self.model_dump_json(exclude=unsaid)
+
+
+def range_sensors(number: int, reach: float) -> str:
+    """The arguments of an environment whose robots have so many rays of this range [m]."""
+    return f"observed_rays={number}, ray_range={reach:g}" if number else "observed_rays=0"
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +115,8 @@ class Network:
     def features(self) -> Features:
         """Features that it sees."""
         head = self.header
-        features = Features.of(ObservationSlices(head.dimension, head.num_neighbors, head.num_obstacles), head.model)
+        sizes = head.dimension, head.num_neighbors, head.num_obstacles
+        features = Features.of(ObservationSlices(*sizes, num_rays=head.num_rays or 0), head.model)
         return replace(features, frame=head.frame or "goal")
 
     @property

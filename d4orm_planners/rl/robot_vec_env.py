@@ -97,9 +97,10 @@ class RobotVecEnv(SharedVecEnv):
             kwargs["progress"] = "path"
         self._env = NavigationVectorEnv(num_worlds, scenario, num_robots, **kwargs)
         problem, layout = self._env.problem, self._env.layout
-        _check_learnable(problem, layout.num_rays)
+        _check_learnable(problem)
         self.problem = problem
-        slices = ObservationSlices(layout.dimension, layout.num_neighbors, layout.num_obstacles)
+        sizes = layout.dimension, layout.num_neighbors, layout.num_obstacles
+        slices = ObservationSlices(*sizes, num_rays=layout.num_rays)
         self.features = Features.of(slices, problem.team.models[0])
         self.shortest_paths = shortest_paths
         self.num_worlds = num_worlds
@@ -243,13 +244,11 @@ class RobotVecEnv(SharedVecEnv):
         return [seed] * self.num_envs
 
 
-def _check_learnable(problem: Problem, num_rays: int) -> None:
-    """Refuse teams and observations that no policy is learned for."""
+def _check_learnable(problem: Problem) -> None:
+    """Refuse teams that no policy is learned for."""
     if not problem.docks:
         raise ValueError("arrival is 'stay', and one robot's episode ends where it docks; train with arrival='dock'")
     if len(models := set(problem.team.models)) > 1:
         raise ValueError(
             f"the team mixes {', '.join(sorted(models))}; one policy is learned for robots of one model, so give model="
         )
-    if num_rays:
-        raise ValueError("networks of d4orm train read no rays; leave observed_rays out, or use another library's")

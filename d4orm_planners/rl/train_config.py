@@ -26,6 +26,8 @@ VALIDATION_SEED = 0
 Many = Annotated[Count, Field(le=100_000)]
 """Robots, worlds or episodes at once: beyond, their observations would fill the memory."""
 Seed = Annotated[Whole, Field(ge=0)]
+MOST_OBSERVED = 1000
+"""Robots, or rays, in an observation at most."""
 
 
 _INSTANCES, _STEPS_PER_INSTANCE = 256, 25_000
@@ -48,6 +50,8 @@ class TrainConfig(CheckedSettings):
         seed: Of everything that is drawn.
         model: Robot model; ``None`` is the scenario's own.
         validation_worlds: Episodes per evaluation.
+        observed_rays: Rays of every robot's range sensor, see :class:`~d4orm_env.envs.options.EnvOptions`.
+        ray_range: Range of that [m].
         scenario_settings: Arguments of the scenario.
     """
 
@@ -56,6 +60,8 @@ class TrainConfig(CheckedSettings):
     seed: Seed = 0
     model: str | None = None
     validation_worlds: Many = 100
+    observed_rays: Annotated[Whole, Field(ge=0, le=MOST_OBSERVED)] = 0
+    ray_range: Positive = 5.0
     scenario_settings: Mapping[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -77,7 +83,12 @@ class TrainConfig(CheckedSettings):
         their number.
         """
         settings = self.task(scenario, self.num_robots).settings
-        return {"scenario": scenario, "model": self.model_in(scenario), **settings}
+        return {"scenario": scenario, "model": self.model_in(scenario), **settings, **self.sensors}
+
+    @property
+    def sensors(self) -> dict[str, Any]:
+        """Arguments of environments that say which range sensors the robots have."""
+        return {"observed_rays": self.observed_rays, "ray_range": self.ray_range}
 
     def task(self, scenario: str, num_robots: int) -> TrainTask:
         """The same scenario with a team of that size."""
@@ -94,7 +105,7 @@ class TrainConfig(CheckedSettings):
             ValueError: If one policy cannot be learned for the team.
         """
         task = self.task(self.scenario, self.num_robots)
-        return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **options)
+        return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **{**self.sensors, **options})
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Return the header of a policy file: what a model does not tell."""
@@ -105,6 +116,8 @@ class TrainConfig(CheckedSettings):
             "dimension": slices.dimension,
             "num_neighbors": slices.num_neighbors,
             "num_obstacles": slices.num_obstacles,
+            "num_rays": slices.num_rays or None,
+            "ray_range": self.ray_range if slices.num_rays else None,
             "frame": None if frame == "goal" else frame,
             "shortest_paths": worlds.shortest_paths or None,
             "brakes": bool(np.isfinite(worlds.problem.goal_speed).any()) or None,
@@ -185,7 +198,7 @@ class TrainingSettings(TrainConfig):
     stages: Annotated[Count, Field(le=1000)] = 50
     start_from: PathText | None = None
     network: Annotated[str, one_of(NETWORKS)] = "flat"
-    observed_robots: Annotated[Whole, Field(ge=0, le=1000)] = 4
+    observed_robots: Annotated[Whole, Field(ge=0, le=MOST_OBSERVED)] = 4
     shortest_paths: bool = False
     learning_rate: Annotated[Positive, Field(le=1)] | None = None
     learner_settings: Mapping[str, Number] = field(default_factory=dict)
@@ -282,4 +295,5 @@ class TrainingSettings(TrainConfig):
     @property
     def _options(self) -> dict[str, Any]:
         """Options of the environments."""
-        return {"observed_robots": self.observed_robots, "reward": self.reward, "shortest_paths": self.shortest_paths}
+        own = {"observed_robots": self.observed_robots, "shortest_paths": self.shortest_paths}
+        return {**self.sensors, **own, "reward": self.reward}

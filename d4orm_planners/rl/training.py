@@ -23,7 +23,7 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
 from d4orm_planners.rl.checkpoints import Checkpoints
 from d4orm_planners.rl.curve import Evaluation, evaluate_network
-from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network
+from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network, range_sensors
 from d4orm_planners.rl.sb3_network import leave_as_they_are, network_of, set_network
 from d4orm_planners.rl.train_config import MIXTURE, VALIDATION_SEED, Drawn, Stage, TrainingSettings, make_stages
 
@@ -102,6 +102,12 @@ class _TrainingRun:
             raise ValueError(
                 f"start_from is {path}, which sees the world from another frame ({network.features.frame}) than is "
                 f"trained for ({wanted}); give a policy that was trained for robots of this model"
+            )
+        mine = range_sensors(self.settings.observed_rays, self.settings.ray_range)
+        if network.header.range_sensors != mine:
+            raise ValueError(
+                f"start_from is {path}, a policy for {network.header.range_sensors}, and {mine} is asked for; give the "
+                "same, or another policy"
             )
         if network.header.shortest_paths and not self.settings.shortest_paths:
             raise ValueError(

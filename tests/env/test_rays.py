@@ -17,7 +17,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Intruder, Occlusion, RayNoise, StateNoise
-from d4orm_env.footprints import Box
 from d4orm_env.jax import functional
 from d4orm_env.jax.functional_env import FunctionalEnv
 
@@ -203,10 +202,6 @@ def test_pure_functions_have_noise_too() -> None:
         ({"problem": SCENE, "observed_rays": -1}, "observed_rays is -1"),
         ({"problem": SCENE, "observed_rays": 4, "ray_range": 0}, "ray_range is 0"),
         ({"problem": SCENE, "disturbances": [RayNoise(0.1)]}, "give observed_rays"),
-        (
-            {"problem": SCENE.replace(team=Team(("unicycle",) * 2, footprint=Box(0.5, 0.3))), "observed_rays": 4},
-            "discs",
-        ),
     ],
 )
 def test_what_cannot_be_measured_is_an_error(arguments: dict[str, Any], message: str) -> None:

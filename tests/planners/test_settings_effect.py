@@ -93,6 +93,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "repair_penalty": (0.5, {"max_iterations": 6, "repair_samples": 64, "repair_steps": 20}),
     "planner": ("d4orm-d", {}),
     "nodes": (3, {}),
+    "communication_range": (1.0, {"nodes": None, "max_iterations": 4}),
     "selection": ("max", {"nodes": 4, "k": 4, "max_iterations": 4}),
     "k": (1, {"nodes": 4, "max_iterations": 4}),
     "mode": ("async", {}),
