@@ -118,7 +118,8 @@ class _Course:
         self._shapes = ConvexBodies.of(problem.team) if problem.team.shapes else None
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
-        displacements = [self._displacement(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]
+        # Copies, or they would keep those at all sub-steps.
+        displacements = [self._displacement(steps)[:, -1].copy() for steps in self._parts(horizon, self._numbers)]
         self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *displacements]), axis=0)
 
     def bodies(self, docking: Docking) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
