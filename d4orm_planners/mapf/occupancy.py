@@ -58,21 +58,21 @@ class Occupancy:
         self._visits, self._counts = np.empty((num_robots, 64, 3), np.int32), np.zeros(num_robots, np.int64)
         self._known = np.zeros(num_robots)
 
-    def put(self, robots: IntArray | int, positions: Floats | float) -> None:
-        """Let robots move otherwise: ``(T + 1,)`` or ``(T + 1, R, 3)`` positions [m]."""
+    def put(self, robots: IntArray | BoolArray | int, positions: Floats | float) -> None:
+        """Let robots, by number or mask, move otherwise: ``(T + 1, 3)`` or ``(T + 1, R, 3)`` positions [m]."""
         self.positions[:, robots] = positions
         self._known[robots] = 0.0
 
     def around(self, need: Floats) -> Others:
         """Return the motions around a robot that keeps so far ``(K,)`` from each [m]."""
         waiting = np.flatnonzero((need > 0) & (need != self._known))
-        while len(waiting):
+        while True:
             done = note_motions(self._cells, self.positions, waiting, need, self._boxes, self._visits, self._counts)
             self._known[waiting[:done]] = need[waiting[:done]]
+            if done == len(waiting):
+                return Others(self.positions, need, self._boxes, self._visits, self._counts)
             waiting = waiting[done:]
-            if len(waiting):
-                self._visits = np.concatenate([self._visits, np.empty_like(self._visits)], axis=1)
-        return Others(self.positions, need, self._boxes, self._visits, self._counts)
+            self._visits = np.concatenate([self._visits, np.empty_like(self._visits)], axis=1)
 
 
 @compiled
@@ -251,19 +251,19 @@ def bucket_of(buckets: Buckets, block: Whole, x: float, y: float) -> Whole:
 
 
 @compiled
-def last_passage(others: Others, place: Floats, near: IntArray) -> int:
-    """The last step at which another comes too near to a place; -1 if none does."""
+def last_passage(others: Others, place: Floats, near: IntArray) -> Whole:
+    """The last step at which another comes too near to a place, -1 if none does; ``near`` ``(K + 1,)`` is scratch."""
     point = (place[0], place[1], place[2])
     for block in range(others.boxes.shape[0] - 1, -1, -1):
         first, last = block * BLOCK, min((block + 1) * BLOCK, others.positions.shape[0])
-        latest = -1
+        latest = np.int64(-1)
         for number in range(find_near_boxes(others, block, point, point, near)):
             i = near[number]
-            for step in range(max(first, latest + 1), last):
+            for step in range(first, last):
                 dx, dy = others.positions[step, i, 0] - place[0], others.positions[step, i, 1] - place[1]
                 dz = others.positions[step, i, 2] - place[2]
                 if dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
-                    latest = step
+                    latest = max(latest, np.int64(step))
         if latest >= 0:
             return latest
-    return -1
+    return np.int64(-1)

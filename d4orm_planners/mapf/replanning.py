@@ -14,8 +14,8 @@ from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.spaces import Space, is_free_line
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, bucket_of, last_passage, sort_boxes
-from d4orm_planners.mapf.pibt import Footprints
 from d4orm_planners.mapf.roadmap import Roadmap
+from d4orm_planners.mapf.roadmap_costs import Footprints
 from d4orm_planners.mapf.safe_intervals import Intervals, free_intervals, interval_at
 
 
@@ -133,10 +133,27 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
     return found
 
 
-@register_jitable(nogil=True, **OPTIONS)
+class _Search(NamedTuple):
+    """The search for one robot's path.
+
+    Attributes:
+        others: Motions of the others.
+        buckets: The same by where edges near to them have their middles.
+        safe: The safe intervals.
+        came: Entry of the tree that comes first to each of them; -1 for none.
+        dock: Step until which the robot must not come to its goal for good; -1 for none.
+    """
+
+    others: Others
+    buckets: Buckets
+    safe: Intervals
+    came: Ints
+    dock: Whole
+
+
+@compiled
 def _departure(
-    safe: Intervals,
-    came: Ints,
+    search: _Search,
     tree: IntArray,
     entry: Whole,
     head: Whole,
@@ -149,8 +166,7 @@ def _departure(
     """The next departure from an entry of the tree that comes to a safe interval before all others.
 
     Args:
-        safe: The safe intervals.
-        came: Entry of the tree that comes first to each of them.
+        search: The search.
         tree: Nodes, departures, arrivals, entries before and intervals.
         entry: The entry.
         head: Node to drive to.
@@ -163,6 +179,7 @@ def _departure(
     Returns:
         Departure, arrival and interval, or -1 for the interval if there is none.
     """
+    safe = search.safe
     while depart < safe.ends[tree[entry, 4]]:
         lost = trip.launch if depart > tree[entry, 2] or tree[entry, 3] < 0 else 0
         until = depart + steps + lost
@@ -171,7 +188,7 @@ def _departure(
         there = interval_at(safe, head, until)
         if there == safe.first[head + 1]:
             break
-        before = came[there]
+        before = search.came[there]
         if safe.begins[there] > until:
             depart += safe.begins[there] - until
         elif before >= 0 and tree[before, 2] <= until:
@@ -183,6 +200,60 @@ def _departure(
         else:
             return depart, until, np.int64(there)
     return depart, depart, np.int64(-1)
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _follow_edge(
+    search: _Search,
+    roadmap: Roadmap,
+    e: Whole,
+    left: float,
+    trip: Trip,
+    dock: Whole,
+    tree: IntArray,
+    entry: Whole,
+    used: int,
+    heap: list[tuple[float, np.int64]],
+) -> tuple[IntArray, int]:
+    """Enter whatever is come to from an entry by an edge, see :func:`_departure`; the tree, and its entries in use."""
+    nodes, node, head, depart = roadmap.nodes, tree[entry, 0], np.int64(roadmap.heads[e]), tree[entry, 2]
+    steps, failures = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0
+    while True:
+        depart, until, there = _departure(search, tree, entry, head, steps, left, trip, dock, depart)
+        if there < 0:
+            return tree, used
+        if not _is_edge_free(search.others, search.buckets, nodes[node], nodes[head], depart, until):
+            # Whoever stands in the way often does so for long.
+            failures += 1
+            depart += 1 + failures // 4
+            continue
+        if used == tree.shape[0]:
+            tree = np.concatenate((tree, np.empty((used, 5), np.int64)))
+        tree[used, 0], tree[used, 1], tree[used, 2] = head, depart, until
+        tree[used, 3], tree[used, 4], search.came[there] = entry, there, used
+        heapq.heappush(heap, (until + left, np.int64(used)))
+        used, depart = used + 1, depart + 1
+
+
+@compiled
+def _is_way(roadmap: Roadmap, bodies: Footprints, k: Whole, node: Whole, e: Whole) -> bool:
+    """Check whether a robot can take an edge from a node: it fits, leads to the goal, and does not dock in passing."""
+    nodes, head, goal = roadmap.nodes, np.int64(roadmap.heads[e]), bodies.goals[k]
+    if roadmap.room[e] < bodies.reach[k] or not bodies.costs[k, head] < np.inf:
+        return False
+    aside = (bodies.docked + bodies.slack / 2) ** 2
+    docks = bodies.docks and head != goal
+    return not (docks and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside)
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _begin(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> _Search:
+    goal = roadmap.nodes[bodies.goals[k]]
+    # Nobody may come near its goal once it stands there for good.
+    dock = np.int64(-1) if trip.dwell >= 0 else last_passage(others, goal, np.empty(len(others.need) + 1, np.int64))
+    buckets = sort_boxes(others, roadmap.nodes, roadmap.lengths.max() / 2, trip.latest // BLOCK + 1)
+    safe = free_intervals(others, roadmap.starts[k], roadmap.nodes.shape[0], trip.latest + 1)
+    return _Search(others, buckets, safe, np.full(safe.begins.shape[0], -1, np.int32), dock)
 
 
 @cached_kernel(variant="path", **OPTIONS)
@@ -201,57 +272,28 @@ def find_path(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, tr
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no path.
     """
-    goal, start, nodes, costs = bodies.goals[k], np.int64(roadmap.starts[k]), roadmap.nodes, bodies.costs[k]
-    # Nobody may come near its goal once it stands there for good.
-    near = np.empty(others.need.shape[0] + 1, np.int64)
-    dock = np.int64(last_passage(others, nodes[goal], near)) if trip.dwell < 0 else np.int64(-1)
-    buckets = sort_boxes(others, nodes, roadmap.lengths.max() / 2, trip.latest // BLOCK + 1)
-    safe = free_intervals(others, start, nodes.shape[0], trip.latest + 1)
-    # The entry of ``tree`` that comes first to each interval.
-    came = np.full(safe.begins.shape[0], -1, np.int32)
-    aside = (bodies.docked + bodies.slack / 2) ** 2
-    tree = np.empty((1024, 5), np.int64)
-    tree[0, 0], tree[0, 1], tree[0, 2], tree[0, 3], tree[0, 4] = start, 0, 0, -1, safe.first[start]
-    used, passing = 1, Trip(trip.stride, trip.launch, trip.latest, np.int64(-1))
-    came[safe.first[start]] = 0
-    heap = [(np.float64(costs[start]) / trip.stride, np.int64(0))]
+    goal, start, costs = bodies.goals[k], np.int64(roadmap.starts[k]), bodies.costs[k]
+    search, passing = (
+        _begin(roadmap, bodies, others, k, trip),
+        Trip(trip.stride, trip.launch, trip.latest, np.int64(-1)),
+    )
+    tree, used = np.empty((1024, 5), np.int64), 1
+    tree[0, 0], tree[0, 1], tree[0, 2], tree[0, 3], tree[0, 4] = start, 0, 0, -1, search.safe.first[start]
+    search.came[search.safe.first[start]] = 0
+    heap = [(float(costs[start]) / trip.stride, np.int64(0))]
     while len(heap) > 0:
         _, entry = heapq.heappop(heap)
         node = tree[entry, 0]
-        if came[tree[entry, 4]] != entry:
+        if search.came[tree[entry, 4]] != entry:
             continue
-        if node == goal and tree[entry, 2] > dock:
+        if node == goal and tree[entry, 2] > search.dock:
             return _followed_back(tree, entry)
         if node == goal and bodies.docks:
             continue
         for e in range(roadmap.first[node], roadmap.first[node + 1]):
-            head = np.int64(roadmap.heads[e])
-            if roadmap.room[e] < bodies.reach[k] or not costs[head] < np.inf:
-                continue
-            if (
-                bodies.docks
-                and head != goal
-                and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside
-            ):
-                continue
-            left, steps = costs[head] / trip.stride, np.int64(np.ceil(roadmap.lengths[e] / trip.stride))
-            motion = trip if head == goal else passing
-            bound = dock if head == goal and bodies.docks else np.int64(-1)
-            depart: Whole = tree[entry, 2]
-            failures = 0
-            while True:
-                depart, until, there = _departure(safe, came, tree, entry, head, steps, left, motion, bound, depart)
-                if there < 0:
-                    break
-                if not _is_edge_free(others, buckets, nodes[node], nodes[head], depart, until):
-                    # Whoever stands in the way often does so for long.
-                    failures += 1
-                    depart += 1 + failures // 4
-                    continue
-                if used == tree.shape[0]:
-                    tree = np.concatenate((tree, np.empty((used, 5), np.int64)))
-                tree[used, 0], tree[used, 1], tree[used, 2] = head, depart, until
-                tree[used, 3], tree[used, 4], came[there] = entry, there, used
-                heapq.heappush(heap, (until + left, np.int64(used)))
-                used, depart = used + 1, depart + 1
+            if _is_way(roadmap, bodies, k, node, e):
+                head = np.int64(roadmap.heads[e])
+                motion = trip if head == goal else passing
+                dock, left = search.dock if head == goal and bodies.docks else np.int64(-1), costs[head] / trip.stride
+                tree, used = _follow_edge(search, roadmap, e, left, motion, dock, tree, entry, used, heap)
     return np.empty((0, 3), np.int64)
