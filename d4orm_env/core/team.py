@@ -259,11 +259,13 @@ class Team(Frozen):
         """
         return DEFAULT_RADIUS * (float(self.radius.max()) / float(np.float32(DEFAULT_RADIUS)))
 
-    @property
+    @cached_property
     def turning_radius(self) -> FloatArray:
         """``(K,)`` radius of the smallest circle that each can drive [m]; zero for those that turn in place."""
         models = zip(self.robot_models, self.limits, strict=True)
-        return np.array([model.turning_radius(limits) for model, limits in models], np.float32)
+        radius = np.array([model.turning_radius(limits) for model, limits in models], np.float32)
+        radius.setflags(write=False)
+        return radius
 
     def select(self, robots: Sequence[int]) -> Team:
         """The team of these robots only, in the order given."""

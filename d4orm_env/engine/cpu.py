@@ -34,6 +34,10 @@ class CpuEngine:
             after.state[1], after.control[1], after.docked[1], after.collided[1], after.violated[1], after.rewards[1]
         )
 
+    def move(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> FloatArray:
+        """See :meth:`d4orm_env.engine.types.Engine.move`."""
+        return _rolled_out(arrays, states, arrived, controls, checked=False).state
+
     def observe_worlds(
         self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
     ) -> None:
@@ -112,13 +116,18 @@ def _view(layout: ObservationLayout) -> ObservationSpec:
     )
 
 
-def _rolled_out(arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray) -> WorldArrays:
-    """The ``H+1`` moments of a team from states ``(K, n)`` on under controls ``(H, K, m)``, clipped here."""
+def _rolled_out(
+    arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray, *, checked: bool = True
+) -> WorldArrays:
+    """The ``H+1`` moments of a team from states ``(K, n)`` on under controls ``(H, K, m)``, clipped here.
+
+    Unless they are ``checked``, contacts are not looked for, and there are no rewards.
+    """
     arrays, rows = typed(arrays), len(controls) + 1
     state = np.empty((rows, *states.shape), np.float32)
     control = np.zeros((rows, *controls.shape[1:]), np.float32)
     arrived, collided, violated = np.zeros((3, rows, len(states)), np.bool_)
-    rewards = np.empty(arrived.shape, np.float32)
+    rewards = np.empty((rows if checked else 0, len(states)), np.float32)
     state[0], arrived[0], control[1:] = states, docked, controls
     goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
     nothing = np.empty((0, 0, 2 * goal.shape[-1] + 1), np.float32)

@@ -25,7 +25,7 @@ from d4orm_env.engine.tiles import (
     robot_mover,
 )
 from d4orm_env.engine.types import MOVED, RESET, SKIP, STEP, WorldBatch
-from d4orm_env.engine.world_tiles import check_contacts, load, load_world, store_world
+from d4orm_env.engine.world_tiles import allocate_boxes, check_contacts, load, load_world, store_world
 
 
 @compiled
@@ -137,7 +137,7 @@ def advance_worlds_kernel(
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE)
-        near = np.empty((num_robots, 3), np.uint64)
+        near, boxes = np.empty((num_robots, 3), np.uint64), allocate_boxes(arrays)
         sensed = allocate_sensed(num_robots, 0, dimension, view)
         for index in range(tile_range[0], tile_range[1]):
             first = index * TILE
@@ -149,7 +149,7 @@ def advance_worlds_kernel(
             measure_goal_distance(num_robots, dimension, w)
             if moving:
                 _move_tile(move_robot, arrays, batch, orders, first, count, w)
-            check_contacts(arrays, batch, first, w, near)
+            check_contacts(arrays, batch, first, w, boxes, near)
             for b in range(first, first + count):
                 if orders[b] == SKIP:
                     continue

@@ -34,6 +34,11 @@ from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, square
 STATE, CONTROL, GOAL, DOCKED, DISTANCE2, BUFFER, ROWS = 0, 6, 10, 13, 14, 15, 17
 STRIDE = ROWS * TILE
 
+BIG_TEAM = 128
+"""Robots from which on pairs are told apart by boxes: where worlds differ that takes a tenth longer at most."""
+WIDER = np.float32(1 + 2.0**-6)
+"""Factor by which the distance of boxes that are apart is stretched for rounding."""
+
 # Columns of ``near``.
 ROBOT, OBSTACLE, DYNAMIC = 0, 1, 2
 RobotMover: TypeAlias = Callable[[ProblemArrays, int, FloatArray], None]
@@ -126,15 +131,51 @@ def place_team(f: FootprintArrays | None, num_robots: int, w: FloatArray) -> Non
             place_bodies(f, k, w[k * STRIDE + STATE * TILE : (k + 1) * STRIDE], w, POSE * TILE, num_robots * STRIDE)
 
 
+@compiled
+def enclose_team(count: int, w: FloatArray, boxes: FloatArray) -> None:
+    """Find the lowest and the highest places of robots in the first worlds of a tile, if it is a big team.
+
+    In moments of one world, which are near to each other, most pairs are so seen to be apart. ``boxes`` ``(K, 2, d)``
+    is output, ``(0, 2, d)`` for a smaller team.
+    """
+    for k in range(boxes.shape[0]):
+        for axis in range(boxes.shape[2]):
+            first = k * STRIDE + (STATE + axis) * TILE
+            low = high = w[first]
+            for s in range(1, count):
+                low, high = min(low, w[first + s]), max(high, w[first + s])
+            boxes[k, 0, axis], boxes[k, 1, axis] = low, high
+
+
+@inlined
+def _is_apart(boxes: FloatArray, k: int, other: int, reach: np.float32) -> bool:
+    """Check whether two robots' boxes are farther apart than ``reach``."""
+    apart = False
+    for axis in range(boxes.shape[2]):
+        gap = max(boxes[k, 0, axis] - boxes[other, 1, axis], boxes[other, 0, axis] - boxes[k, 1, axis])
+        apart |= gap > WIDER * reach
+    return apart
+
+
 @inlined
 def mark_pairs(
-    arrays: ProblemArrays, extra: np.float32, w: FloatArray, buffer: FloatArray, near: NDArray[np.uint64]
+    arrays: ProblemArrays,
+    extra: np.float32,
+    w: FloatArray,
+    buffer: FloatArray,
+    boxes: FloatArray,
+    near: NDArray[np.uint64],
 ) -> None:
-    """Flag every two robots closer than their footprints plus ``extra``; ``buffer`` is two rows to overwrite."""
+    """Flag every two robots closer than their footprints plus ``extra``; ``buffer`` is two rows to overwrite.
+
+    ``boxes`` are those of :func:`enclose_team`.
+    """
     f, poses = arrays.footprints, arrays.radius.shape[0] * STRIDE
     for k in range(1, arrays.radius.shape[0]):
         for other in range(k):
             reach = arrays.radius[k] + arrays.radius[other] + extra
+            if boxes.shape[0] > 0 and _is_apart(boxes, k, other, reach):
+                continue
             a, b, dimension = k * STRIDE, other * STRIDE, arrays.goal.shape[1]
             touch = near_pair(reach, a, b, dimension, w)
             touch = refine_pair(f, k, other, touch, extra, dimension, w, a, b, w, POSE * TILE, poses, buffer)

@@ -46,6 +46,13 @@ class Engine(Protocol):
         """
         ...
 
+    def move(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> FloatArray:
+        """``(T+1, K, n)`` states of the team from ``states`` ``(K, n)`` on under ``controls`` ``(T, K, m)``.
+
+        As in :meth:`step`, but contacts are not looked for.
+        """
+        ...
+
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """Roll ``controls`` ``(H, K, m)`` out from the problem's start."""
         ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
@@ -12,10 +13,11 @@ from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import reward
 from d4orm_env.engine import obstacles
-from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
+from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined
 from d4orm_env.engine.footprint_contacts import POSE, meets_body, refine_static
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
+    BIG_TEAM,
     BUFFER,
     CONTROL,
     DISTANCE2,
@@ -27,6 +29,7 @@ from d4orm_env.engine.tiles import (
     ROWS,
     STATE,
     STRIDE,
+    enclose_team,
     mark_pairs,
     place_team,
 )
@@ -134,6 +137,13 @@ def _mark_bodies(
                     near[k, DYNAMIC] |= np.uint64(1) << np.uint64(s)
 
 
+@register_jitable(nogil=True, **OPTIONS)
+def allocate_boxes(arrays: ProblemArrays) -> FloatArray:
+    """Make room for the boxes of a team; see :func:`~d4orm_env.engine.tiles.enclose_team`."""
+    num_robots, dimension = arrays.goal.shape
+    return np.empty((num_robots if num_robots >= BIG_TEAM else 0, 2, dimension), np.float32)
+
+
 @inlined
 def _bit(mask: np.uint64, s: int) -> np.uint64:
     return (mask >> np.uint64(s)) & np.uint64(1)
@@ -141,18 +151,27 @@ def _bit(mask: np.uint64, s: int) -> np.uint64:
 
 @compiled
 def check_contacts(
-    arrays: ProblemArrays, worlds: WorldArrays | WorldBatch, first: int, w: FloatArray, near: NDArray[np.uint64]
+    arrays: ProblemArrays,
+    worlds: WorldArrays | WorldBatch,
+    first: int,
+    w: FloatArray,
+    boxes: FloatArray,
+    near: NDArray[np.uint64],
 ) -> None:
-    """Complete the flags of contacts and margin violations of the worlds of a tile, then compute the rewards."""
+    """Complete the flags of contacts and margin violations of the worlds of a tile, then compute the rewards.
+
+    ``boxes`` of :func:`allocate_boxes` are overwritten, and so is ``near`` ``(K, 3)``.
+    """
     num_robots, count = arrays.radius.shape[0], min(TILE, worlds.state.shape[0] - first)
     poses = num_robots * STRIDE
     place_team(arrays.footprints, num_robots, w)
+    enclose_team(count, w, boxes)
     for k in range(num_robots):
         near[k, ROBOT] = near[k, OBSTACLE] = near[k, DYNAMIC] = NOWHERE
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
-        mark_pairs(arrays, extra, w, w[BUFFER * TILE : ROWS * TILE], near)
+        mark_pairs(arrays, extra, w, w[BUFFER * TILE : ROWS * TILE], boxes, near)
         for k in range(num_robots):
             robot = w[k * STRIDE : (k + 1) * STRIDE]
             places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]

@@ -23,7 +23,7 @@ from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, pose_rows, robot_mover
 from d4orm_env.engine.types import ObservationInputs, WorldBatch
-from d4orm_env.engine.world_tiles import WorldArrays, check_contacts, load, load_world, store_world
+from d4orm_env.engine.world_tiles import WorldArrays, allocate_boxes, check_contacts, load, load_world, store_world
 
 
 @cache
@@ -31,7 +31,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
     """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
     ``moments`` is a :class:`WorldArrays` of ``H+1`` rows, of which the first is the start and has no control. The
-    motion comes first; then 64 moments at a time are checked, as if they were worlds.
+    motion comes first; then 64 moments at a time are checked, as if they were worlds, as far as there are rewards.
     """
     move_robot = robot_mover(names)
 
@@ -40,23 +40,29 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
         use_wide_registers()
         num_robots, dimension = arrays.goal.shape
         w = aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE)
-        near = np.empty((num_robots, 3), np.uint64)
+        near, boxes = np.empty((num_robots, 3), np.uint64), allocate_boxes(arrays)
         lane = np.int64(0)  # a literal zero would compile what it is passed to once more
         state, docked = moments.state, moments.docked
         for t in range(1, state.shape[0]):
             # Loops, because numba takes seconds to compile assignments of slices.
+            idle = arrays.docks
             for k in range(num_robots):
                 for i in range(state.shape[2]):
                     state[t, k, i] = state[t - 1, k, i]
                 docked[t, k] = docked[t - 1, k]
+                idle &= docked[t, k]
+                for i in range(moments.control.shape[2]):
+                    idle &= moments.control[t, k, i] == 0
+            if idle:
+                continue
             load_world(moments, t, lane, w)
             for k in range(num_robots):
                 move_robot(arrays, k, w)
             store_world(moments, t, lane, w)
-        for first in range(0, state.shape[0], TILE):
+        for first in range(0, moments.rewards.shape[0], TILE):
             load(moments, first, w)
             measure_goal_distance(num_robots, dimension, w)
-            check_contacts(arrays, moments, first, w, near)
+            check_contacts(arrays, moments, first, w, boxes, near)
 
     return roll_out
 

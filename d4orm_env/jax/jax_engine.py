@@ -205,6 +205,11 @@ def _rolled_out(problem: Problem, controls: FloatArray) -> tuple[Contacts, tuple
     return _rollout(problem.team.models, problem.arrays, start, jnp.moveaxis(jnp.asarray(controls), 0, -1))
 
 
+@partial(jax.jit, static_argnums=0)
+def _move(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, controls: Array) -> Array:
+    return roll_out(models, arrays, worlds, controls).state
+
+
 class JaxEngine:
     """The physics in JAX, on whatever device JAX has chosen. Stateless: all instances are alike."""
 
@@ -218,6 +223,13 @@ class JaxEngine:
         collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in contacts)
         state, docked, control = (np.asarray(value)[..., 0] for value in worlds)
         return StepResult(state, control, docked, collided, margin_violated, rewards)
+
+    def move(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> FloatArray:
+        """See :meth:`d4orm_env.engine.types.Engine.move`."""
+        before = states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls[0])[..., None]
+        worlds = Worlds(*map(jnp.asarray, before))
+        after = _move(names_of_codes(arrays.model_codes), arrays, worlds, jnp.asarray(controls)[..., None])
+        return np.concatenate([states[None], np.asarray(after)[..., 0]])
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """See :meth:`d4orm_env.engine.types.Engine.rollout`.

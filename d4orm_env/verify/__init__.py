@@ -118,7 +118,8 @@ class _Course:
         self._shapes = ConvexBodies.of(problem.team) if problem.team.shapes else None
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
-        displacements = [self._displacement(steps)[:, -1] for steps in self._parts(horizon, self._numbers)]
+        # Copies, or they would keep those at all sub-steps.
+        displacements = [self._displacement(steps)[:, -1].copy() for steps in self._parts(horizon, self._numbers)]
         self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *displacements]), axis=0)
 
     def bodies(self, docking: Docking) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -161,12 +162,13 @@ class _Course:
 
     def _parts(self, horizon: int, numbers: int) -> Iterator[slice]:
         size = max(1, MAX_NUMBERS // numbers)
-        return (slice(first, first + size) for first in range(0, horizon, size))
+        return (slice(first, min(first + size, horizon)) for first in range(0, horizon, size))
 
     def stretches(self, docking: Docking, num_pairs: int) -> Iterator[Stretch]:
-        """All steps, with a body for every reading of every robot, at rest once it docks."""
+        """All steps, up to the first at which all are at rest, with a body for every reading of every robot."""
         horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
         stop = np.minimum(docking.steps, horizon)
+        horizon = min(horizon, int(docking.steps.max()) + 1)
         docked = self.ends[stop, robot]
         for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
             displacement, place = self._displacement(steps), self.ends[:-1][steps]

@@ -116,17 +116,15 @@ class TeamMotion:
         heading, speed = np.where(self.wheeled, state[:, 2], 0.0), np.where(self.wheeled, state[:, 3], 0.0)
         has_velocity = ~(self.wheeled | self.first_order)[:, None]
         velocity = np.where(has_velocity, state[:, self.size : 2 * self.size], 0.0)
-        velocities, speeds, paces = [], [], []
-        for command, acceleration, thrust in zip(commands, self._acceleration, self._thrust):
+        self._velocity, self._speed, self.pace = np.empty_like(commands), *np.empty((2, *commands.shape[:2]))
+        for step, command in enumerate(commands):
             velocity = np.where(self.first_order[:, None], command, velocity)
-            velocities.append(velocity)
-            speeds.append(speed)
-            velocity = velocity + acceleration * dt
+            self._velocity[step], self._speed[step] = velocity, speed
+            velocity = velocity + self._acceleration[step] * dt
             pace = norm(velocity)
             velocity = velocity * (self.max_speed / np.maximum(pace, self.max_speed))[:, None]
-            speed = np.clip(speed + thrust * dt, -self.max_speed, self.max_speed)
-            paces.append(np.where(self.wheeled, np.abs(speed), np.minimum(pace, self.max_speed)))
-        self._velocity, self._speed, self.pace = np.array(velocities), np.array(speeds), np.array(paces)
+            speed = np.clip(speed + self._thrust[step] * dt, -self.max_speed, self.max_speed)
+            self.pace[step] = np.where(self.wheeled, np.abs(speed), np.minimum(pace, self.max_speed))
         self._heading = np.cumsum(np.concatenate([heading[None], self._turn_rate * dt]), axis=0)
 
     def displacement(self, steps: slice, sub_steps: int) -> Floats:

@@ -172,4 +172,27 @@ _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
         "iterations": lambda row: f"{row['iterations'].median:.1f}",
         "travel time, s": lambda row: f"{row['travel_time'].median:.2f}",
     }),
+    "big teams": _tabulated("First plan of the recommended planner", {
+        "scenario": itemgetter("scenario"),
+        "robots": itemgetter("num_robots"),
+        "solved": lambda row: f"{row['solved']} of {row['seeds']}",
+        "planning, s": lambda row: seconds(row["seconds"]),
+        "slowest, s": lambda row: f"{row['seconds'].largest:.2f}",
+        "travel time, s": lambda row: f"{row['travel_time'].median:.2f}",
+    }),
+    "improvement": _tabulated("Improving a plan in little time", {
+        "scenario": itemgetter("scenario"),
+        "robots": itemgetter("num_robots"),
+        "limit, ms": lambda row: f"{row['limit'] * 1e3:.0f}",
+        "took, ms": lambda row: milliseconds(row["seconds"]),
+        "better": lambda row: f"{row['gained']} of {row['seeds']}",
+        "reward gained": lambda row: f"{row['gain'].median:.4f}",
+    }),
+    "big loops": _tabulated("Control loops of D4orm-C2F for big teams", {
+        "robots": itemgetter("num_robots"),
+        "first coarse plan, s": lambda row: f"{row['start']:.1f}",
+        "loop, ms": lambda row: milliseconds(row["loop"]),
+        "95%, ms": lambda row: f"{row['loop_95'] * 1e3:.0f}",
+        "contacts": itemgetter("contacts"),
+    }),
 }  # fmt: skip

@@ -18,6 +18,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
+from d4orm_planners.benchmark.big_teams import measure_big_loops, measure_big_team, measure_improvement
 from d4orm_planners.benchmark.env_steps import (
     DISTURBANCES,
     RAY_BOXES,
@@ -101,6 +102,19 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
             for num_robots in settings.plan_robots:
                 work = partial(_measure_plans, settings, engine, preset, num_robots)
                 yield "plans", f"first plans of {num_robots} robots on {engine}", work
+    yield from _big_team_parts(settings)
+
+
+def _big_team_parts(settings: BenchmarkSettings) -> Iterator[Part]:
+    for scenario, sizes in (("random", settings.big_random), ("warehouse", settings.big_warehouse)):
+        for size in sizes:
+            plan = partial(measure_big_team, scenario, size, settings.big_seeds, settings.big_time_limit)
+            yield "big teams", f"first plans of {size} robots, {scenario}", plan
+    for size in settings.improved_robots:
+        work = partial(measure_improvement, "random", size, settings.big_seeds, settings.improving_limit)
+        yield "improvement", f"improving plans of {size} robots", work
+    for size in settings.loop_robots:
+        yield "big loops", f"control loops of {size} robots", partial(measure_big_loops, size, settings.loops)
 
 
 def _denoising_parts(settings: BenchmarkSettings, fast: Set[str]) -> Iterator[Part]:

@@ -13,7 +13,8 @@ from d4orm_planners.base.settings import CheckedSettings, Count, Positive, Sampl
 
 ENGINES = ("cpu", "jax", "plain")
 SECTIONS = (
-    "denoising", "threads", "environments", "obstacles", "index", "robots", "startup", "memory", "plans",
+    "denoising", "threads", "environments", "obstacles", "index", "robots", "startup", "memory", "plans", "big teams",
+    "improvement", "big loops",
 )  # fmt: skip
 MODELS = (*COMMON, "unicycle", "unicycle1", "unicycle2", "car", "holonomic2d_jerk", "holonomic3d_drag")
 
@@ -47,6 +48,14 @@ class BenchmarkSettings(CheckedSettings):
         obstacles: Numbers of boxes among the paths of 8 robots.
         far_obstacles: The same of boxes far away; also what environments are stepped among.
         map_cells: Cells along a side of the maps whose index of obstacles is timed.
+        big_random: Team sizes for the first plan of the recommended planner on open ground.
+        big_warehouse: The same in warehouses.
+        big_seeds: Seeds of these, and of the plans that are improved.
+        big_time_limit: Seconds per plan of these.
+        improved_robots: Team sizes whose first plans are improved.
+        improving_limit: Time that this may take [s].
+        loop_robots: Team sizes for control loops of D4orm-C2F.
+        loops: Their number.
     """
 
     sections: tuple[str, ...] = SECTIONS
@@ -70,6 +79,14 @@ class BenchmarkSettings(CheckedSettings):
     obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
     far_obstacles: tuple[Count, ...] = (200,)
     map_cells: tuple[Count, ...] = (32, 256)
+    big_random: tuple[Robots, ...] = (1000, 2000)
+    big_warehouse: tuple[Robots, ...] = (100, 200)
+    big_seeds: Count = 3
+    big_time_limit: Positive = 120.0
+    improved_robots: tuple[Robots, ...] = (8, 24)
+    improving_limit: Positive = 0.05
+    loop_robots: tuple[Robots, ...] = (64, 512)
+    loops: Count = 30
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -98,5 +115,12 @@ QUICK: Mapping[str, object] = {
     "memory_robots": 16,
     "obstacles": (4, 200),
     "map_cells": (32,),
+    "big_random": (100,),
+    "big_warehouse": (16,),
+    "big_seeds": 2,
+    "big_time_limit": 10.0,
+    "improved_robots": (8,),
+    "loop_robots": (16,),
+    "loops": 10,
 }
 """Settings of a benchmark of about a minute, for a first look."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -12,8 +11,6 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import (
@@ -25,16 +22,11 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     rest_of,
     subgoal_indices,
 )
+from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, StagnationMonitor, keep_time
 from d4orm_planners.d4orm_c2f.line_of_sight import visible_subgoals
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.d4orm_c2f.warm_start import episode_of
-from d4orm_planners.d4orm_d.planner import D4ormD
-from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.sampling_types import SamplingEngine
-from d4orm_planners.hybrid.planner import Hybrid
-from d4orm_planners.hybrid.settings import HybridConfig
-from d4orm_planners.mapf.planner import RoadmapSolution
 from d4orm_planners.mapf.relay import relay_paths
 from d4orm_planners.tracking.steering import straight_drives
 
@@ -84,26 +76,19 @@ class CoarsePlanTracker:
         last_step: int,
     ) -> None:
         self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
-        self._last_step, self._astray = last_step, config.replan_distance * problem.stride
+        self._astray = config.replan_distance * problem.stride
         self._refiner, self._background, self._replanning = refiner, background, replanning
         self._late: tuple[JointState, BoolArray] | None = None
-        # Paths that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
-        # the team does not get on there may be no other paths.
-        self._planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
+        self._planning = CoarsePlanning(config, seed, None if lifelong else last_step)
 
     def begin(self, joint: JointState, docked: BoolArray) -> None:
         """Plan for the episode, in which those ``docked`` ``(K,)`` stay where they are."""
         everybody = np.ones(self.problem.num_robots, bool)
         self._patience, self.stuck = StagnationMonitor(joint), ~everybody
-        self.guidance, self.index = self.plan(joint, docked, self._warm_start(joint), self._config.coarse_iterations), 0
+        warm = self._planning.warm_start(self.problem, joint)
+        self.guidance = self._planning.plan(self.problem, joint, docked, warm, self._config.coarse_iterations)
+        self.index = 0
         self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
-
-    def _warm_start(self, joint: JointState) -> FloatArray | None:
-        """``(H_c, K, m)`` what a policy does from where the team is, if the coarse plan is to begin with that."""
-        if self._config.warm_start is None:
-            return None
-        coarse = coarse_problem(self.problem.with_state(joint.states, joint.goals), self._config.coarse_factor)
-        return episode_of(self._config.warm_start, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps))
 
     def _follow(self, joint: JointState, guidance: CoarseWaypoints, anew: BoolArray) -> None:
         """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
@@ -112,57 +97,6 @@ class CoarsePlanTracker:
         self.index, self._indices = 0, np.zeros(len(joint.goals), int)
         self._goals, self._began = joint.goals, joint.steps
         self._nearest, self._nearest_at = float("inf"), joint.steps
-
-    def plan(
-        self,
-        joint: JointState,
-        docked: BoolArray,
-        initial: FloatArray | None,
-        iterations: int,
-        thorough: bool = False,
-    ) -> CoarsePlan:
-        """Plan for the whole team from where it is, until a plan passes the checks (Algorithm 4, lines 1 to 3)."""
-        # Whoever has docked at the rim of its goal could leave it within a coarse step.
-        goals = np.where(docked[:, None], joint.states[:, : self.problem.dimension], joint.goals)
-        coarse = coarse_problem(self.problem.with_state(joint.states, goals), self._config.coarse_factor)
-        chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
-        left = (self._last_step - joint.steps) // self._config.coarse_factor
-        if (
-            not self._lifelong
-            and 0 < left < coarse.horizon
-            and not chosen.failed.any()
-            and not chosen.trajectory.arrived[left].all()
-        ):
-            # It would come too late. Plans that come too late are none, if there are others.
-            in_time = coarse.with_state(coarse.start, coarse.goal, horizon=left)
-            hurried, other = self._planned(in_time, joint.steps, initial, iterations, thorough)
-            if not hurried.failed.any():
-                return other
-        return guidance
-
-    def _planned(
-        self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
-    ) -> tuple[Candidate, CoarsePlan]:
-        """The first plan that passes the checks, or the best one."""
-        planner = self._thorough if thorough else self._planner
-        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, step), self._config.check_interval
-        start = None if initial is None else initial[: coarse.horizon]
-        search = SolveRun(planner, coarse, seed, start, check_interval=interval)
-        chosen, ordered = search.current, False
-        for number in range(iterations):
-            if not chosen.failed.any():
-                break
-            search.advance()
-            if number == 0:
-                ordered = isinstance(search.state, RoadmapSolution)
-            chosen = search.current if search.current.rank >= search.best.rank else search.best
-            if not search.current.failed.any():
-                chosen = search.current
-        plan = chosen.trajectory
-        path = interpolate(plan.positions, self._config.coarse_factor)
-        return chosen, CoarsePlan(
-            problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered
-        )
 
     def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
@@ -237,7 +171,10 @@ class CoarsePlanTracker:
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
         initial = self._beginning(joint, keep & (not lost))
-        work, anew = partial(self.plan, joint, docked, initial, iterations, thorough), ~keep | lost
+        work, anew = (
+            partial(self._planning.plan, self.problem, joint, docked, initial, iterations, thorough),
+            ~keep | lost,
+        )
         if self._config.deadline is None:
             self._follow(joint, work(), anew)
             return True
@@ -332,7 +269,7 @@ class CoarsePlanTracker:
     def _refined(self, guidance: CoarsePlan, index: int, seed: int) -> CoarsePlan:
         """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
         left, controls = rest_of(guidance, index, self._config.coarse_factor)
-        search = SolveRun(self._planner, left, seed, controls, self._refiner)
+        search = SolveRun(self._planning.planner, left, seed, controls, self._refiner)
         search.advance()
         done = guidance.problem.horizon - left.horizon
         before, after = guidance.states[: done + 1], search.best.trajectory
@@ -341,17 +278,3 @@ class CoarsePlanTracker:
         all_controls = np.concatenate([guidance.controls[:done], after.controls])
         path = interpolate(positions, self._config.coarse_factor)
         return replace(guidance, controls=all_controls, states=states, path=path)
-
-
-def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> Planner:
-    """The planner of coarse plans: hybrid, with or without rerouting, or D4orm-D with its preset."""
-    given: dict[str, Any] = {
-        "engine": config.engine,
-        "num_samples": config.coarse_samples,
-        "num_steps": config.coarse_steps,
-        "repair_steps": config.coarse_repair_steps,
-        "improve": True,
-    }
-    if config.coarse_preset is None:
-        return Hybrid(HybridConfig(**given, reroute=reroute, improver="denoising"))
-    return D4ormD(D4ormDConfig(**{**D4ormD.presets[config.coarse_preset], **given}))

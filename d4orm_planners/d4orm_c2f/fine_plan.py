@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.envs.joint_state import JointState
@@ -17,6 +17,8 @@ from d4orm_planners.tracking.steering import track_velocities
 
 SHORTER = 3
 """Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise."""
+NEAREST = 256
+"""Pairs among which the least gap is looked for at first."""
 
 
 class Prediction(NamedTuple):
@@ -146,26 +148,38 @@ class Window:
         times = self.problem.dt * np.arange(1, horizon + 1, dtype=np.float32)[:, None, None]
         return MovingObstacles(seen[:, :d] + times * seen[:, d : 2 * d], seen[:, -1])
 
-    def _with_stop(self, window: Problem, controls: FloatArray, steps: int, docked: BoolArray) -> FloatArray:
+    def _with_stop(
+        self, window: Problem, controls: FloatArray, states: FloatArray, steps: int, docked: BoolArray
+    ) -> FloatArray:
         """The first ``steps`` controls, and after them those that bring everyone to rest as soon as can be.
+
+        Args:
+            window: The problem.
+            controls: ``(H_predict, K, m)``.
+            states: ``(H_predict + 1, K, n)`` that they lead to.
+            steps: Number of controls that are executed.
+            docked: ``(K,)`` robots that have docked by then.
 
         Returns:
             ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
         """
         stopping = np.zeros((len(controls) + self._stop_steps, *controls.shape[1:]), np.float32)
         stopping[:steps] = controls[:steps]
-        states = self._engine.rollout(window, stopping[: len(controls)]).states[steps]
-        still = np.zeros(window.goal.shape, np.float32)
+        present, still = states[steps], np.zeros(window.goal.shape, np.float32)
         for t in range(steps, steps + self._stop_steps):
-            stopping[t] = track_velocities(window, states, still)
-            states = self._engine.step(window.arrays, states, docked, stopping[t]).states
+            stopping[t] = track_velocities(window, present, still)
+            present = self._engine.move(window.arrays, present, docked, stopping[t : t + 1])[1]
         return stopping
+
+    def _states(self, window: Problem, controls: FloatArray) -> FloatArray:
+        """``(T+1, K, n)`` states that controls ``(T, K, m)`` lead to."""
+        return self._engine.move(window.arrays, window.start, np.zeros(window.num_robots, bool), controls)
 
     def stop(self, joint: JointState, docked: BoolArray) -> FloatArray:
         """``(H_predict + S, K, m)`` controls that bring everyone to rest now."""
         nothing = self.no_controls()
         present = self.problem.with_state(joint.states, joint.goals, horizon=len(nothing))
-        return self._with_stop(present, nothing, 0, docked)
+        return self._with_stop(present, nothing, present.start[None], 0, docked)
 
     def _safe_mix(
         self, window: Problem, fresh: FloatArray, special: BoolArray, sampled: FloatArray, now: Situation
@@ -180,20 +194,22 @@ class Window:
         horizon = len(fresh)
         before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
         before[: len(now.left)] = now.left
-        controls = self._with_stop(window, fresh, horizon, now.docked)
+        states = self._states(window, fresh)
+        controls = self._with_stop(window, fresh, states, horizon, now.docked)
         window_to_rest = window.with_state(window.start, window.goal, horizon=len(controls))
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
         trajectory, violated = self._violations(window_to_rest, controls, now)
         if (held := violated & special).any():
             fresh = np.where(held[:, None], sampled, fresh)
-            controls[:, held] = self._with_stop(window, fresh, horizon, now.docked)[:, held]
+            states = self._states(window, fresh)
+            controls[:, held] = self._with_stop(window, fresh, states, horizon, now.docked)[:, held]
             trajectory, violated = self._violations(window_to_rest, controls, now)
         while (violating := violated & (steps > 0)).any():
             steps[violating] //= SHORTER
             steps[steps < self._config.execute_horizon] = 0
             for number in np.unique(steps[violating]):
-                fewer = self._with_stop(window, fresh, int(number), now.docked) if number else before
+                fewer = self._with_stop(window, fresh, states, int(number), now.docked) if number else before
                 chosen = violating & (steps == number)
                 controls[:, chosen] = fewer[:, chosen]
             trajectory, violated = self._violations(window_to_rest, controls, now)
@@ -242,7 +258,21 @@ def least_gap(problem: Problem, positions: FloatArray) -> float:
     first, second = np.triu_indices(problem.num_robots, 1)
     if not len(first):
         return float("inf")
+    # Pairs by how far the boxes round their paths are apart; those too far apart to be the nearest are left out.
+    low, high, apart2 = positions.min(axis=0), positions.max(axis=0), np.zeros(len(first), positions.dtype)
+    for axis in range(positions.shape[2]):
+        gap = np.maximum(low[first, axis] - high[second, axis], low[second, axis] - high[first, axis])
+        apart2 += np.maximum(gap, 0) ** 2
+    least = np.sqrt(apart2) - radius[first] - radius[second]
+    few = np.argpartition(least, min(NEAREST, len(least)) - 1)[:NEAREST]
+    near = least <= _gaps(positions, radius, first[few], second[few]).min() + problem.rounding
+    return float(_gaps(positions, radius, first[near], second[near]).min())
+
+
+def _gaps(positions: FloatArray, radius: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
+    """``(P,)`` least gaps between the surfaces of two robots each [m]."""
     gap2 = np.zeros((len(positions), len(first)), positions.dtype)
     for axis in range(positions.shape[2]):
         gap2 += (positions[:, first, axis] - positions[:, second, axis]) ** 2
-    return float((np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]).min())
+    gaps: FloatArray = np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]
+    return gaps

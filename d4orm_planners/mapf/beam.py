@@ -18,17 +18,21 @@ class Beam(NamedTuple):
         states: ``(N, n)``.
         velocities: ``(N, d)``.
         faults: ``(N,)`` robots met, block by block.
-        bounds: ``(N,)`` what they cost at least, as it seems [s].
+        costs: ``(N,)`` what they cost at least, as it seems, but for that [s].
+        bounds: ``(N,)`` what they cost at least, robots met so far included [s].
         before: ``(N,)`` number of the path that each goes on from: in the beam before, or ever.
         moves: ``(N,)`` what was done in the last block.
+        paths: ``(N, BLOCK, d)`` positions in it [m].
     """
 
     states: FloatArray
     velocities: FloatArray
     faults: Floats
+    costs: Floats
     bounds: Floats
     before: IntArray
     moves: IntArray
+    paths: FloatArray
 
 
 class PathTree(NamedTuple):
@@ -46,15 +50,15 @@ class PathTree(NamedTuple):
 
 
 @register_jitable(nogil=True, **OPTIONS)
-def make_beam(size: int, n: int, d: int) -> Beam:
+def make_beam(size: int, n: int, d: int, steps: int) -> Beam:
     return Beam(
         np.empty((size, n), np.float32), np.empty((size, d), np.float32), np.empty(size), np.empty(size),
-        np.empty(size, np.int64), np.empty(size, np.int64),
+        np.empty(size), np.empty(size, np.int64), np.empty(size, np.int64), np.empty((size, steps, d), np.float32),
     )  # fmt: skip
 
 
 @compiled
-def _is_like_another(new: Beam, node: Whole, kept: Beam, size: int, dedup2: float) -> bool:
+def is_like_another(new: Beam, node: Whole, kept: Beam, size: int, dedup2: float) -> bool:
     """Check whether a path is about where one of those kept is, about as fast."""
     for other in range(size):
         gap2, change2 = 0.0, 0.0
@@ -69,41 +73,15 @@ def _is_like_another(new: Beam, node: Whole, kept: Beam, size: int, dedup2: floa
 
 
 @compiled
-def _keep(new: Beam, node: Whole, kept: Beam, number: Whole) -> None:
+def keep(new: Beam, node: Whole, kept: Beam, size: int, numbers: IntArray, ever: PathTree) -> None:
+    """Keep a path as the next one of the beam, with its number among all ever kept, which ``numbers`` is told."""
     for i in range(new.states.shape[1]):
-        kept.states[number, i] = new.states[node, i]
+        kept.states[size, i] = new.states[node, i]
     for axis in range(new.velocities.shape[1]):
-        kept.velocities[number, axis] = new.velocities[node, axis]
-    kept.faults[number] = new.faults[node]
-    kept.before[number], kept.moves[number] = new.before[node], new.moves[node]
-
-
-@register_jitable(nogil=True, **OPTIONS)
-def keep_best(new: Beam, count: int, kept: Beam, numbers: IntArray, best: float, dedup2: float, ever: PathTree) -> int:
-    """Keep the most promising of ``count`` paths, of those that are alike the better one.
-
-    Args:
-        new: The paths.
-        count: How many there are.
-        kept: The beam, output.
-        numbers: ``(width,)`` their numbers among all paths ever kept, output.
-        best: Cost that a path must come below [s].
-        dedup2: Square of the distance within which two are alike.
-        ever: All paths ever kept, changed.
-
-    Returns:
-        How many are kept.
-    """
-    size = 0
-    for node in np.argsort(new.bounds[:count], kind="mergesort"):
-        if size == numbers.shape[0] or new.bounds[node] >= best:
-            break
-        if not _is_like_another(new, node, kept, size, dedup2):
-            _keep(new, node, kept, size)
-            number = ever.used[0]
-            ever.before[number], ever.moves[number], numbers[size] = new.before[node], new.moves[node], number
-            ever.used[0], size = number + 1, size + 1
-    return size
+        kept.velocities[size, axis] = new.velocities[node, axis]
+    kept.faults[size], number = new.faults[node], ever.used[0]
+    ever.before[number], ever.moves[number], numbers[size] = new.before[node], new.moves[node], number
+    ever.used[0] = number + 1
 
 
 @compiled

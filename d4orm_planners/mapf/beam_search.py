@@ -6,11 +6,13 @@ turns off by some angle. After every block the most promising of the paths so fa
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
@@ -26,7 +28,7 @@ from d4orm_env.engine.stepping import Docking, docking_of, models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_checks import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
-from d4orm_planners.mapf.beam import PathTree, keep_best, make_beam, trace_back
+from d4orm_planners.mapf.beam import Beam, PathTree, is_like_another, keep, make_beam, trace_back
 from d4orm_planners.mapf.motion_primitives import Moves, aiming
 from d4orm_planners.tracking.tracker import tracker, velocity_step
 
@@ -101,6 +103,47 @@ def _count_beside(
                 count += 1
                 break
     return count
+
+
+@compiled
+def _count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
+    """Count those whom a path through a block meets there."""
+    robot, (first, last) = queries.robots[r], steps_of(table, block)
+    count = count_near(table, robot, queries.others.without[r], path, first, block)
+    return count + _count_beside(table, robot, queries.others, r, path, first, last)
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _keep_best(
+    new: Beam, count: int, kept: Beam, numbers: IntArray, best: float, rules: BeamRules, ever: PathTree,
+    table: PathTable, queries: Queries, r: int, block: Whole,
+) -> int:  # fmt: skip
+    """Keep the most promising of ``count`` paths, of those that are alike the better one; return how many.
+
+    Most are worse than those kept whomever they meet. So that is counted of one only when its turn comes, which then
+    comes again.
+    """
+    order, after, size = np.argsort(new.bounds[:count], kind="mergesort"), 0, 0
+    counted = [(0.0, np.int64(0)) for _ in range(0)]
+    dedup2 = rules.dedup_distance * rules.dedup_distance
+    while size < numbers.shape[0] and (after < count or len(counted) > 0):
+        is_next = after < count
+        if is_next and len(counted) > 0:
+            is_next = (new.bounds[order[after]], order[after]) < counted[0]
+        node = order[after] if is_next else heapq.heappop(counted)[1]
+        after += is_next
+        if new.bounds[node] >= best:
+            break
+        if is_like_another(new, node, kept, size, dedup2):
+            continue
+        if is_next:
+            new.faults[node] += _count_met(table, queries, r, new.paths[node], block)
+            new.bounds[node] = rules.contact * new.faults[node] + new.costs[node]
+            heapq.heappush(counted, (new.bounds[node], node))
+        else:
+            keep(new, node, kept, size, numbers, ever)
+            size += 1
+    return size
 
 
 @compiled
@@ -200,12 +243,12 @@ def search_kernel(name: str) -> Search:
     ) -> None:  # fmt: skip
         num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
         last_busy = min(num_blocks - 1, table.moving[0] + 1)
-        beam, new = make_beam(width, n, d), make_beam(width * num_moves, n, d)
+        # One more, to be overwritten.
+        beam, new = make_beam(width, n, d, 0), make_beam(width * num_moves + 1, n, d, table.block)
         ever = PathTree(
             np.empty(width * num_blocks, np.int64), np.empty(width * num_blocks, np.int64), np.empty(1, np.int64)
         )
         numbers, did = np.empty(width, np.int64), np.empty(num_blocks, np.int64)
-        path = np.empty((table.block, d), np.float32)
         for r in range(part[0], part[1]):
             robot, begin = queries.robots[r], queries.blocks[r]
             goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
@@ -219,16 +262,16 @@ def search_kernel(name: str) -> Search:
                 steps, count = steps_of(table, block), 0
                 for node in range(size):
                     for number in range(num_moves):
+                        path = new.paths[count]
                         state, velocity, at_goal, cost, faults = drive_block(
                             arrays, moves, number, beam.states[node], beam.faults[node], goal, at, limits, docking,
                             reach, steps, path,
                         )  # fmt: skip
                         if rules.contact * faults + cost >= best:
                             continue
-                        faults += count_near(table, robot, queries.others.without[r], path, steps[0], block)
-                        faults += _count_beside(table, robot, queries.others, r, path, steps[0], steps[1])
                         if at_goal:
                             # It stays there: whoever comes by later counts too.
+                            faults += _count_met(table, queries, r, path, block)
                             faults += _count_passing(table, robot, queries.others, r, path, block, last_busy)
                             if rules.contact * faults + cost < best:
                                 best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
@@ -237,11 +280,10 @@ def search_kernel(name: str) -> Search:
                             new.velocities[count, axis] = velocity[axis]
                         for i in range(n):
                             new.states[count, i] = state[i]
-                        new.bounds[count] = rules.contact * faults + cost
+                        new.costs[count], new.bounds[count] = cost, rules.contact * faults + cost
                         new.faults[count], new.before[count], new.moves[count] = faults, numbers[node], number
                         count += 1
-                dedup2 = rules.dedup_distance * rules.dedup_distance
-                size = keep_best(new, count, beam, numbers, best, dedup2, ever)
+                size = _keep_best(new, count, beam, numbers, best, rules, ever, table, queries, r, block)
                 if size == 0:
                     break
             found[r] = best_move >= 0

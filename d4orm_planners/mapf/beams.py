@@ -66,12 +66,14 @@ def _search(
     """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and arrivals, of robots of one model that did as given."""
     found, search = np.zeros(len(u), bool), search_kernel(model.name)
     arrays, table = team.problem.arrays, team.index.table
+    # Some searches take many times as long as others: who is done takes the next one.
+    waiting = iter(range(len(u)))
 
-    def look(part: IntArray) -> None:
-        for first in range(part[0], part[1]):
+    def look(_: IntArray) -> None:
+        for number in waiting:
             if team.search.should_stop():
                 break
-            search(arrays, table, moves, rules, queries, np.array((first, first + 1)), u, x, found)
+            search(arrays, table, moves, rules, queries, np.array((number, number + 1)), u, x, found)
 
     Threads(available_cores()).over(len(u), look)
     return u, x, found

@@ -8,52 +8,24 @@ have any size and nodes lie anywhere, and the sequence gives the precedence wher
 
 from __future__ import annotations
 
-import heapq
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Ints, Whole
+from d4orm_env.core.arrays import BoolArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.mapf.near_neighbours import squared_gap
 from d4orm_planners.mapf.roadmap import Roadmap
+from d4orm_planners.mapf.roadmap_costs import Footprints, passes_too_near
 
 FREE, MOVING, DONE = 0, 1, 2
 """Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""
 STAY, NOTHING = -1, -2
-IDLE, TIE, ROUNDING = 1 / 3, 1 / 150, 2.0**-27
-"""Detour that a robot rather makes than stay where it is, one that is as good as none, and what is rounding, in radii
-of the largest robot."""
-
-
-class Footprints(NamedTuple):
-    """The robots.
-
-    Attributes:
-        radius: ``(K,)`` [m].
-        size: The largest of them [m].
-        reach: ``(K,)`` radius and margin to obstacles [m].
-        margin: Between robots [m].
-        slack: Distance beyond it that they keep where they can [m].
-        docked: Distance from its goal at which a robot may stop [m].
-        docks: Whether a robot that has arrived stays there for good.
-        starts: ``(K,)`` int64 nodes.
-        goals: ``(K,)`` int64 nodes.
-        costs: ``(K, N)`` float32 length of the path from every node to each robot's goal [m].
-    """
-
-    radius: Floats
-    size: float
-    reach: Floats
-    margin: float
-    slack: float
-    docked: float
-    docks: bool
-    starts: IntArray
-    goals: IntArray
-    costs: FloatArray
+IDLE, TIE = 1 / 3, 1 / 150
+"""Detour that a robot rather makes than stay where it is, and one that is as good as none, in radii of the largest
+robot."""
 
 
 class PibtWorkspace(NamedTuple):
@@ -80,90 +52,6 @@ class PibtWorkspace(NamedTuple):
     options: IntArray
     worth: Floats
     moves: IntArray
-
-
-@compiled
-def _gap(points: Floats, u: Whole, v: Whole) -> float:
-    return np.sqrt(squared_gap(points, u, points, v, points, v))
-
-
-@compiled
-def _too_near(
-    roadmap: Roadmap, bodies: Footprints, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
-) -> bool:
-    """Check whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way between two nodes.
-
-    Starts and goals may be nearer to each other than robots keep: then it may leave its own, and come to its own, if it
-    comes no nearer on the way.
-    """
-    hard = bodies.radius[k] + bodies.radius[i] + bodies.margin
-    docked = bodies.docks and u == bodies.goals[i]
-    need = hard + (bodies.slack / 2 + bodies.docked if docked else bodies.slack)
-    if gap >= need:
-        return False
-    if tail == bodies.starts[k] or tail == bodies.goals[k]:
-        need = min(need, _gap(roadmap.nodes, u, tail))
-    if head == bodies.goals[k]:
-        need = min(need, max(_gap(roadmap.nodes, u, head), hard))
-    return gap < need - ROUNDING * bodies.size
-
-
-@compiled
-def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
-    """Check whether an edge is closed to a robot for good: it would dock in passing, or be too near a docked one.
-
-    ``docked`` ``(N,)`` is the robot docked at each node, -1 for none.
-    """
-    head = np.int64(roadmap.heads[e])
-    if roadmap.room[e] < bodies.reach[k]:
-        return True
-    if not bodies.docks:
-        return False
-    for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
-        u = np.int64(roadmap.near[number])
-        if u == bodies.goals[k]:
-            if u != head and u != tail and roadmap.gaps[number] < bodies.docked + bodies.slack / 2:
-                return True
-        elif docked[u] >= 0:
-            i = docked[u]
-            if i != k and _too_near(roadmap, bodies, k, tail, head, i, u, roadmap.gaps[number]):
-                return True
-    return False
-
-
-@cached_kernel(variant="costs", **OPTIONS)
-def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
-    """Length of a robot's shortest path from every node to one; ``costs`` ``(N,)`` is output."""
-    costs[:] = np.inf
-    heap = [(0.0, np.int64(end))]
-    costs[end] = 0.0
-    while len(heap) > 0:
-        cost, n = heapq.heappop(heap)
-        if cost > costs[n]:
-            continue
-        for e in range(roadmap.first[n], roadmap.first[n + 1]):
-            head = np.int64(roadmap.heads[e])
-            # Compared as they are kept, in single precision, or rounding would let nodes come up for ever.
-            through = np.float32(cost + roadmap.lengths[e])
-            if through < costs[head] and not closed(roadmap, bodies, docked, k, n, e):
-                costs[head] = through
-                heapq.heappush(heap, (np.float64(through), head))
-
-
-@cached_kernel(variant="open", **OPTIONS)
-def is_open(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
-    """Check whether no docked robot closes the path that a robot at a node would take by these costs."""
-    if not costs[at] < np.inf:
-        return False
-    while at != bodies.goals[k]:
-        best, edge = costs[at], -1
-        for e in range(roadmap.first[at], roadmap.first[at + 1]):
-            if costs[roadmap.heads[e]] < best and roadmap.room[e] >= bodies.reach[k]:
-                best, edge = costs[roadmap.heads[e]], e
-        if edge < 0 or closed(roadmap, bodies, docked, k, at, edge):
-            return False
-        at = np.int64(roadmap.heads[edge])
-    return True
 
 
 @compiled
@@ -227,7 +115,7 @@ def _blocking_robot(
         i = scratch.who[u]
         if i < 0 or i == k:
             continue
-        if _too_near(roadmap, bodies, k, at, head, i, u, roadmap.gaps[number]):
+        if passes_too_near(roadmap, bodies, k, at, head, i, u, roadmap.gaps[number]):
             if scratch.state[i] != FREE:
                 return -2
             if found < 0:
@@ -236,9 +124,38 @@ def _blocking_robot(
     for above in range(depth):
         i, end = scratch.robots[above], np.int64(roadmap.heads[scratch.edges[above]])
         gap = np.sqrt(squared_gap(nodes, head, nodes, positions[i], nodes, end))
-        if _too_near(roadmap, bodies, i, positions[i], end, k, head, gap):
+        if passes_too_near(roadmap, bodies, i, positions[i], end, k, head, gap):
             return -2
     return found
+
+
+@compiled
+def _push(
+    roadmap: Roadmap,
+    bodies: Footprints,
+    scratch: PibtWorkspace,
+    positions: IntArray,
+    depth: int,
+    k: Whole,
+    seed: int,
+) -> None:
+    """Have a robot look for an edge, for those before it to get past unless it is the first."""
+    scratch.robots[depth], scratch.edges[depth], scratch.tried[depth] = k, NOTHING, 0
+    scratch.state[k] = MOVING
+    _rank_options(roadmap, bodies, scratch, depth, k, positions[k], depth > 0, seed)
+
+
+@compiled
+def _next_edge(roadmap: Roadmap, scratch: PibtWorkspace, positions: IntArray, depth: int, forced: Whole) -> Whole:
+    """The next edge that a robot tries; :data:`NOTHING` if it stays. The first must go to node ``forced``, if any."""
+    anywhere = depth > 0 or forced < 0
+    while True:
+        e = scratch.options[depth, scratch.tried[depth]]
+        if e == NOTHING or (e == STAY and (anywhere or forced == positions[scratch.robots[depth]])):
+            return np.int64(NOTHING)
+        scratch.tried[depth] += 1
+        if e != STAY and (anywhere or roadmap.heads[e] == forced):
+            return e
 
 
 @compiled
@@ -254,55 +171,32 @@ def _move(
 ) -> int:
     """Let a robot move, and before it those that are in its way; how many moves there are then.
 
-    Args:
-        roadmap: The roadmap.
-        bodies: The robots.
-        scratch: Working space.
-        positions: ``(K,)`` the robots' nodes, changed in place.
-        root: The robot.
-        forced: The node that it must go to; -1 for where it likes.
-        seed: Of ties.
-        count: Moves so far.
+    ``forced`` is the node that it must go to, -1 for where it likes, ``count`` the moves so far; ``positions`` is
+    changed. See :func:`step_team`.
     """
     depth = 0
-    scratch.robots[0], scratch.edges[0], scratch.tried[0] = root, NOTHING, 0
-    scratch.state[root] = MOVING
-    _rank_options(roadmap, bodies, scratch, 0, root, positions[root], False, seed)
+    _push(roadmap, bodies, scratch, positions, depth, root, seed)
     while depth >= 0:
-        k = scratch.robots[depth]
-        if scratch.edges[depth] == NOTHING:
-            e = scratch.options[depth, scratch.tried[depth]]
-            if e < 0:
-                leave_it = e == NOTHING or forced < 0 or forced == positions[k] or depth > 0
-                if not leave_it:
-                    scratch.tried[depth] += 1
-                    continue
-                scratch.state[k] = DONE
-                depth -= 1
-                if depth >= 0:
-                    scratch.edges[depth] = NOTHING  # Who does not make way blocks this edge.
-                continue
-            scratch.tried[depth] += 1
-            if depth == 0 and forced >= 0 and roadmap.heads[e] != forced:
-                continue
-            scratch.edges[depth] = e
-        e = scratch.edges[depth]
-        blocker = _blocking_robot(roadmap, bodies, scratch, positions, k, e, depth)
+        k, e = scratch.robots[depth], scratch.edges[depth]
+        if e == NOTHING:
+            e = scratch.edges[depth] = _next_edge(roadmap, scratch, positions, depth, forced)
+        blocker = np.int64(-1) if e == NOTHING else _blocking_robot(roadmap, bodies, scratch, positions, k, e, depth)
         if blocker == -2:
             scratch.edges[depth] = NOTHING
         elif blocker >= 0:
             depth += 1
-            scratch.robots[depth], scratch.edges[depth], scratch.tried[depth] = blocker, NOTHING, 0
-            scratch.state[blocker] = MOVING
-            _rank_options(roadmap, bodies, scratch, depth, blocker, positions[blocker], True, seed)
+            _push(roadmap, bodies, scratch, positions, depth, blocker, seed)
         else:
-            head = np.int64(roadmap.heads[e])
-            scratch.who[positions[k]], scratch.who[head] = -1, k
-            positions[k] = head
-            scratch.moves[count, 0], scratch.moves[count, 1] = k, e
-            count += 1
             scratch.state[k] = DONE
             depth -= 1
+            if e == NOTHING:
+                if depth >= 0:
+                    scratch.edges[depth] = NOTHING  # Who does not make way blocks this edge.
+                continue
+            head = np.int64(roadmap.heads[e])
+            scratch.who[positions[k]], scratch.who[head], positions[k] = -1, k, head
+            scratch.moves[count, 0], scratch.moves[count, 1] = k, e
+            count += 1
     return count
 
 

@@ -17,9 +17,10 @@ from d4orm_planners.base.settings import Count
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
 from d4orm_planners.mapf.lns import search_neighbourhoods
-from d4orm_planners.mapf.pibt import fill_costs
 from d4orm_planners.mapf.roadmap import lay_roadmap
-from d4orm_planners.mapf.roadmap_team import Replanning, RoadmapPaths, TeamRollout, drive_moves, is_compiled
+from d4orm_planners.mapf.roadmap_costs import fill_costs
+from d4orm_planners.mapf.roadmap_lns import RoadmapPaths
+from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves, is_compiled
 
 if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap import Roadmap

@@ -9,18 +9,17 @@ from itertools import product
 import numpy as np
 from numba import types
 
-from d4orm_env.core.arrays import FloatArray, Floats, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.paths.spaces import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
-from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
+from d4orm_planners.mapf.occupancy import Occupancy, Others, find_meetings
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
-from d4orm_planners.mapf.replanning import Trip, find_path, straighten, touches
+from d4orm_planners.mapf.replanning import Trip, find_path, straighten
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
-from d4orm_planners.mapf.safe_intervals import Others
 from d4orm_planners.tracking.path_drives import drive_routes
 from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
@@ -45,8 +44,6 @@ LATER = 30
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
 """Distances beyond radii and margin that a path is planned to keep, where starts and goals allow it, and keeps; and
 what starts and goals themselves must be apart less, for rounding."""
-NEARNESS = 10 / 3
-"""Random distance by which a robot may be farther away and still be replanned with another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +124,11 @@ class Replanning:
         """The team with new paths for some robots, planned in their order; ``None`` if one finds none, or in time."""
         last = int(driven.arrivals.max())
         changed = TeamRollout(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
-        changed.places[:, robots] = FAR
+        occupancy = Occupancy(self.cells, changed.places)
+        occupancy.put(robots, FAR)
         latest = np.minimum(driven.arrivals + LATER, last)
         for robot in robots.tolist():
-            if should_stop() or not self.replan_one(changed, robot, int(latest[robot]), random):
+            if should_stop() or not self.replan_one(changed, occupancy, robot, int(latest[robot]), random):
                 return None
         return changed
 
@@ -162,28 +160,23 @@ class Replanning:
     ) -> TeamRollout | None:
         """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
         steps, waiting, num_robots = len(driven.controls), robots.tolist(), self.problem.num_robots
-        settled = np.ones(num_robots, bool)
-        settled[robots] = False
+        settled, met = np.ones((2, num_robots), bool)
+        settled[robots], occupancy = False, Occupancy(self.cells, driven.places)
         while waiting and not should_stop():
             most -= 1
             if most < 0:
                 return None
             robot = int(waiting.pop())
             for hard in (1.0, 0.5, 0.0):
-                around = driven.places.copy()
-                around[:, settled & (random.random(num_robots) >= hard)] = FAR
-                here = TeamRollout(driven.controls, around, driven.arrivals)
-                if self.replan_one(here, robot, steps, random):
+                minded = ~settled | (random.random(num_robots) < hard)
+                if self.replan_one(driven, occupancy, robot, steps, random, minded):
                     break
             else:
                 return None
-            driven.places[:, robot] = around[:, robot]
-            separation = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + TOUCH * self.size
-            there = driven.places[1 : self.leaves(int(driven.arrivals[robot]))]
-            gaps = np.sqrt(((there - there[:, robot, None]) ** 2).sum(axis=2))
-            displaced = settled & (gaps < np.minimum(separation, self.ends_apart[robot])).any(axis=0)
-            displaced[robot] = False
-            driven.places[:, displaced] = FAR
+            others = occupancy.around(self.separation(robot, KEEP))._replace(need=self.separation(robot, TOUCH))
+            find_meetings(others, driven.places[: self.leaves(int(driven.arrivals[robot])), robot], met)
+            displaced = settled & met
+            occupancy.put(displaced, FAR)
             settled &= ~displaced
             settled[robot] = True
             waiting[:0] = random.permutation(np.flatnonzero(displaced)).tolist()
@@ -193,25 +186,50 @@ class Replanning:
         """The step from which on a robot that arrives at a step is no obstacle any more, if any."""
         return None if self.dwell is None else arrival + self.dwell + 1
 
-    def replan_one(self, driven: TeamRollout, robot: int, latest: int, random: np.random.Generator) -> bool:
-        """Plan a robot's path around all others in ``driven``, which is changed; whether that succeeds."""
-        haste = 1 - random.random() * LEISURE
-        return any(self.find_and_drive(driven, robot, latest, cruise * haste, cut) for cruise, cut in SPEED_PROFILES)
+    def separation(self, robot: int, beyond: float) -> Floats:
+        """``(K,)`` how far a robot keeps from each other beyond radii and margin, where ends are so far apart [m]."""
+        reach = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + beyond * self.size
+        need: Floats = np.minimum(reach, self.ends_apart[robot])
+        need[robot] = 0.0
+        return need
 
-    def find_and_drive(self, driven: TeamRollout, robot: int, latest: int, cruise: float, cut: float) -> bool:
-        """The same in one of the :data:`SPEED_PROFILES`."""
-        roadmap, bodies, steps = self.roadmap, self.bodies, len(driven.controls)
-        separation = bodies.radius[robot] + bodies.radius + bodies.margin
-        others = Others(driven.places, np.minimum(separation + KEEP * self.size, self.ends_apart[robot]))
+    def replan_one(
+        self,
+        driven: TeamRollout,
+        occupancy: Occupancy,
+        robot: int,
+        latest: int,
+        random: np.random.Generator,
+        minded: BoolArray | None = None,
+    ) -> bool:
+        """Plan a robot's path around those that it minds in ``driven``, which is changed; whether that succeeds."""
+        haste, others = 1 - random.random() * LEISURE, occupancy.around(self.separation(robot, KEEP))
+        if minded is not None:
+            others = others._replace(need=np.where(minded, others.need, 0.0))
+        for cruise, cut in SPEED_PROFILES:
+            drive = self.find_and_drive(others, robot, latest, cruise * haste, cut)
+            if drive is not None:
+                driven.controls[:, robot], places, driven.arrivals[robot] = drive
+                occupancy.put(robot, places)
+                if self.dwell is not None:
+                    driven.places[self.leaves(drive[2]) :, robot] = FAR
+                return True
+        return False
+
+    def find_and_drive(
+        self, others: Others, robot: int, latest: int, cruise: float, cut: float
+    ) -> tuple[FloatArray, Floats, int] | None:
+        """Controls, places and arrival of a robot in one of the :data:`SPEED_PROFILES`, if that succeeds."""
+        roadmap, bodies, steps = self.roadmap, self.bodies, len(others.positions) - 1
         dwell = -1 if self.dwell is None else self.dwell
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
             trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell)
-            path = find_path(roadmap, self.cells, bodies, others, robot, trip)
+            path = find_path(roadmap, bodies, others, robot, trip)
             if len(path):
                 break
         else:
-            return False
+            return None
         reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
         left = straighten(roadmap, bodies, self.space, others, robot, reach, path)
         nodes, departs, arrives = path[:left].T
@@ -220,64 +238,23 @@ class Replanning:
         # As soon as it can, or else by the clock of its path.
         for backs_up, hurrying in product(self.turns[robot], (True, False)):
             drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
-            if self.fits(
-                Others(driven.places, np.minimum(separation + TOUCH * self.size, others.need)), robot, drive, latest
-            ):
-                driven.controls[:, robot], driven.places[:, robot], driven.arrivals[robot] = drive
-                if self.dwell is not None:
-                    driven.places[self.leaves(drive[2]) :, robot] = FAR
-                return True
-        return False
+            if self.fits(others, robot, drive, latest):
+                return drive
+        return None
 
     def fits(self, others: Others, robot: int, drive: tuple[FloatArray, Floats, int], latest: int) -> bool:
         """Check whether a robot's rollout ends in time, clear of all others and of obstacles."""
         _, places, arrival = drive
-        if arrival > latest or touches(others, robot, places[: self.leaves(arrival)]):
+        if arrival > latest:
+            return False
+        touch, met = np.minimum(self.separation(robot, TOUCH), others.need), np.empty(len(others.need), bool)
+        find_meetings(others._replace(need=touch), places[: self.leaves(arrival)], met)
+        if met.any():
             return False
         if self.space is None:
             return True
         room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
         return bool(room.min() > min(self.bodies.reach[robot] + TOUCH * self.size, self.own_room[robot]))
-
-
-@dataclass
-class RoadmapPaths:
-    """Low-level planner of :func:`~d4orm_planners.mapf.lns.search_neighbourhoods`: paths in space and time.
-
-    Attributes:
-        replanning: Search for paths.
-        solution: Rollout of the team.
-        most: Robots that are replanned together, at most.
-        should_stop: Asked before every path.
-    """
-
-    replanning: Replanning
-    solution: TeamRollout
-    most: int
-    should_stop: Callable[[], bool]
-    groups: int = 1
-
-    @property
-    def cost(self) -> tuple[int, int]:
-        """See :meth:`TeamRollout.cost`."""
-        return self.solution.cost(self.replanning.problem.horizon)
-
-    def odds(self, random: np.random.Generator) -> Odds:
-        """See :meth:`LowLevelPlanner.odds`: often one of those that come too late."""
-        driven, replanning = self.solution, self.replanning
-        delay = np.maximum(driven.arrivals - replanning.alone, 1.0)
-        late = driven.arrivals > replanning.problem.horizon
-        if late.any() and random.random() < 0.5:
-            delay[~late] = 0.0
-        sizes = (1, min(len(delay), self.most))
-        return Odds(delay, driven.places, driven.arrivals, NEARNESS * replanning.size, sizes)
-
-    def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
-        """See :meth:`LowLevelPlanner.replan`; what is worse is never accepted."""
-        for robots in groups:
-            changed = self.replanning.replan(self.solution, robots, random, self.should_stop)
-            if changed is not None and changed.cost(self.replanning.problem.horizon) < self.cost:
-                self.solution = changed
 
 
 def is_compiled(problem: Problem) -> bool:

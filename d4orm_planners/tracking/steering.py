@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -205,9 +206,15 @@ def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals
 
 def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:
     """The models of the team, each with its robots."""
-    models = problem.team.models
-    for name in dict.fromkeys(models):
-        yield MODELS[name], [robot for robot, model in enumerate(models) if model == name]
+    for name, robots in _robots_by_name(problem.team.models):
+        yield MODELS[name], list(robots)
+
+
+@lru_cache(maxsize=64)
+def _robots_by_name(models: tuple[str, ...]) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """Return the names of the models of a team, each with its robots."""
+    own = {name: tuple(k for k, model in enumerate(models) if model == name) for name in dict.fromkeys(models)}
+    return tuple(own.items())
 
 
 @dataclass(frozen=True)

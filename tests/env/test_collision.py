@@ -19,7 +19,9 @@ from d4orm_env.core.world import World
 from d4orm_env.dynamics.collision import axis_gap, leaves
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.engine.cpu import CpuEngine
+from d4orm_env.engine.tiles import BIG_TEAM
 from d4orm_env.engine.types import MOVED, WorldBatch
+from d4orm_env.scenarios import make_problem
 
 RADIUS, MARGIN = 0.25, 0.25
 CONTACT, MARGIN_ONLY, CLEAR = (True, True), (False, True), (False, False)
@@ -237,3 +239,27 @@ def test_a_dynamic_obstacle_costs_the_penalty_once(
     progress = np.float32(1) - worlds.distance[0, 0] * worlds.inverse[0, 0]
     assert worlds.rewards[0, 0] == progress - 2 * kinds
     assert (worlds.steps[0], worlds.violations[0, 0]) == (1, flags[1])
+
+
+def test_a_big_team_meets_whom_it_comes_near_to() -> None:
+    """From some number of robots on pairs that are far apart are told by boxes."""
+    num_robots = BIG_TEAM + 2
+    problem = make_problem("random", num_robots=num_robots, seed=0).replace(horizon=70)
+    random = np.random.default_rng(0)
+    controls = random.normal(size=(70, num_robots, 2)).astype(np.float32)
+    trajectory = CpuEngine().rollout(problem, controls)
+    gaps = np.linalg.norm(trajectory.positions[:, :, None] - trajectory.positions[:, None], axis=3)
+    gaps[:, np.arange(num_robots), np.arange(num_robots)] = np.inf
+    radius = np.asarray(problem.team.radius)
+    near = (gaps - radius - radius[:, None]).min(axis=2)
+    undecided = np.abs(near - problem.margin) < 1e-5
+    outside = (
+        problem.world.clearance(trajectory.positions.reshape(-1, 2)).reshape(near.shape) <= radius + problem.margin
+    )
+    np.testing.assert_array_equal(
+        trajectory.margin_violated[~undecided], ((near <= problem.margin) | outside)[~undecided]
+    )
+    assert 0 < trajectory.margin_violated.sum() < trajectory.margin_violated.size
+    nobody = np.zeros(num_robots, bool)
+    moved = CpuEngine().move(problem.arrays, problem.start, nobody, controls)
+    np.testing.assert_array_equal(moved, trajectory.states)

@@ -18,7 +18,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.choice import get_engine
-from d4orm_env.geometry.world_index import FEW, MAX_BYTES, build_index, nearest_distance
+from d4orm_env.geometry.grid_refinement import FEW
+from d4orm_env.geometry.world_index import MAX_BYTES, build_index, nearest_distance
 from d4orm_env.verify.geometry import polygon_approach
 from d4orm_planners import make_planner
 from d4orm_planners.tracking.steering import straight_drives
@@ -80,7 +81,7 @@ def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int,
 def test_crowded_cells_keep_only_who_can_be_nearest(dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
     shapes, points = random_world(5, dimension, 400).shapes, np.random.default_rng(5).uniform(-5, 5, (20000, dimension))
     short = build_index(shapes, 0.25, 1.0)
-    monkeypatch.setattr("d4orm_env.geometry.world_index.CROWDED", 10**6)
+    monkeypatch.setattr("d4orm_env.geometry.grid_refinement.CROWDED", 10**6)
     long = build_index(shapes, 0.25, 1.0)
     assert len(short.items) < 0.8 * len(long.items)
     distances = [nearest_distance(shapes, index, points) for index in (short, long)]

@@ -45,6 +45,12 @@ TINY: dict[str, Any] = {
     "obstacles": (3,),
     "far_obstacles": (5,),
     "map_cells": (4,),
+    "big_random": (3,),
+    "big_warehouse": (2,),
+    "big_seeds": 1,
+    "improved_robots": (3,),
+    "loop_robots": (3,),
+    "loops": 2,
 }
 
 

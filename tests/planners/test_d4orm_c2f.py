@@ -535,7 +535,10 @@ def test_who_docked_at_the_rim_of_its_goal_stays_there_in_new_plans(seed: int) -
     states[docked] = 0
     rim = problem.goal + 0.99 * problem.goal_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
     states[docked, :2] = rim[docked]
-    plan = policy._guide.plan(joint._replace(states=states, arrived=docked), docked, None, 20, thorough=True)
+    guide = policy._guide
+    plan = guide._planning.plan(
+        guide.problem, joint._replace(states=states, arrived=docked), docked, None, 20, thorough=True
+    )
     assert np.linalg.norm(plan.path[:, docked] - states[docked, :2], axis=2).max() <= problem.goal_radius
 
 

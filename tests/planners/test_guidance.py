@@ -18,12 +18,13 @@ from d4orm_planners import make_planner
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.lacam import TeamMoves, find_moves
 from d4orm_planners.mapf.lns import search_neighbourhoods
+from d4orm_planners.mapf.occupancy import Occupancy
 from d4orm_planners.mapf.planner import needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
-from d4orm_planners.mapf.roadmap_team import Replanning, RoadmapPaths, TeamRollout, drive_moves
-from d4orm_planners.mapf.safe_intervals import Others
+from d4orm_planners.mapf.roadmap_lns import RoadmapPaths
+from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
 from d4orm_planners.tracking.pursuit import gear_towards
 from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock
@@ -273,9 +274,9 @@ def test_a_path_in_space_and_time_lets_others_pass(fault: str) -> None:
     if fault == "ahead":
         places[100:200, 1] = np.linspace([0, 0, 0], [3, 3, 0], 100)
         places[200:, 1] = [3, 3, 0]
-    others = Others(places, np.full(2, 0.41))
+    others = Occupancy(replanning.cells, places).around(np.array([0.0, 0.41]))
     bodies = replanning.bodies
-    path = find_path(roadmap, replanning.cells, bodies, others, 0, Trip(0.09, 4, 400, -1))
+    path = find_path(roadmap, bodies, others, 0, Trip(0.09, 4, 400, -1))
     assert path[0].tolist() == [roadmap.starts[0], 0, 0]
     assert path[-1, 0] == roadmap.goals[0]
     assert (path[1:, 1] >= path[:-1, 2]).all()

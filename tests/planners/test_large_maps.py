@@ -19,8 +19,9 @@ from d4orm_planners import make_planner
 from d4orm_planners.mapf import roadmap as roadmaps
 from d4orm_planners.mapf.lacam import TeamOnRoadmap as Searched
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
+from d4orm_planners.mapf.occupancy import Occupancy
 from d4orm_planners.mapf.roadmap import lay_roadmap
-from d4orm_planners.mapf.safe_intervals import Others, find_visits, free_intervals, interval_at
+from d4orm_planners.mapf.safe_intervals import free_intervals, interval_at
 
 
 def caves(rows: int, columns: int, seed: int) -> np.ndarray:
@@ -136,9 +137,8 @@ def test_paths_are_refined_beyond_the_limit_that_made_them_coarse(monkeypatch: p
 
 
 @numba.njit
-def _intervals(cells, others, k, start, steps, first, begins, ends, asked, answers):  # type: ignore[no-untyped-def]
-    visits, last = find_visits(cells, others, k, steps)
-    safe = free_intervals(visits, last, start, steps)
+def _intervals(others, start, num_nodes, steps, first, begins, ends, asked, answers):  # type: ignore[no-untyped-def]
+    safe = free_intervals(others, start, num_nodes, steps)
     first[:] = safe.first
     count = len(safe.begins)
     begins[:count], ends[:count] = safe.begins, safe.ends
@@ -164,8 +164,9 @@ def test_safe_intervals_are_those_of_every_step_looked_at(seed: int, num_robots:
     first, begins, ends = np.empty(31, np.int64), np.empty(4000, np.int64), np.empty(4000, np.int64)
     asked = np.stack(np.meshgrid(np.arange(30), np.arange(steps), indexing="ij"), axis=-1).reshape(-1, 2)
     answers = np.empty(len(asked), np.int64)
-    cells = sort_into_cells(nodes, 0.5)
-    _intervals(cells, Others(positions, need), 0, start, steps, first, begins, ends, asked, answers)
+    need[0] = 0.0
+    others = Occupancy(sort_into_cells(nodes, 0.5), positions).around(need)
+    _intervals(others, start, len(nodes), steps, first, begins, ends, asked, answers)
     for node in range(30):
         own = slice(first[node], first[node + 1])
         free = np.flatnonzero(np.diff(np.pad(~near[node], 1).astype(int))).reshape(-1, 2)

@@ -1,0 +1,269 @@
+"""Positions of a team at every step, as the search for one robot's path among all others reads them.
+
+What every search needs of a robot's motion is worked out once: its boxes in blocks of steps, and its visits to nodes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from d4orm_env.core.arrays import BoolArray, Floats, IntArray, Whole
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
+from d4orm_planners.mapf.near_neighbours import Cells, cells_about, items_in
+
+BLOCK = 16
+"""Steps for which it is known at once whether a robot is about."""
+WIDER = 1 + 2.0**-20
+"""Factor by which distances are stretched for rounding."""
+EVER = 1 << 30
+"""Step after the last visit of a robot that stays."""
+
+
+class Others(NamedTuple):
+    """Motions of all robots around one.
+
+    Attributes:
+        positions: ``(T + 1, K, 3)`` float64; afterwards they stay where they are [m].
+        need: ``(K,)`` how far the robot that is replanned keeps from each [m]; zero from whom it does not mind, and
+            from itself.
+        boxes: ``(B, 6, K)`` the lowest and the highest positions in every block of steps [m].
+        visits: ``(K, V, 3)`` int32 nodes that each comes so near to, the first step and the one after the last.
+        counts: ``(K,)`` int64 the number of visits of each.
+    """
+
+    positions: Floats
+    need: Floats
+    boxes: Floats
+    visits: NDArray[np.int32]
+    counts: IntArray
+
+
+class Occupancy:
+    """Positions of a team, which changes robot by robot.
+
+    Args:
+        cells: The nodes.
+        positions: ``(T + 1, K, 3)`` float64 [m]; not copied.
+    """
+
+    def __init__(self, cells: Cells, positions: Floats) -> None:
+        rows, num_robots, _ = positions.shape
+        self._cells, self.positions = cells, positions
+        self._boxes = np.empty((-(-rows // BLOCK), 6, num_robots))
+        self._visits, self._counts = np.empty((num_robots, 64, 3), np.int32), np.zeros(num_robots, np.int64)
+        self._known = np.zeros(num_robots)
+
+    def put(self, robots: IntArray | BoolArray | int, positions: Floats | float) -> None:
+        """Let robots, by number or mask, move otherwise: ``(T + 1, 3)`` or ``(T + 1, R, 3)`` positions [m]."""
+        self.positions[:, robots] = positions
+        self._known[robots] = 0.0
+
+    def around(self, need: Floats) -> Others:
+        """Return the motions around a robot that keeps so far ``(K,)`` from each [m]."""
+        waiting = np.flatnonzero((need > 0) & (need != self._known))
+        while True:
+            done = note_motions(self._cells, self.positions, waiting, need, self._boxes, self._visits, self._counts)
+            self._known[waiting[:done]] = need[waiting[:done]]
+            if done == len(waiting):
+                return Others(self.positions, need, self._boxes, self._visits, self._counts)
+            waiting = waiting[done:]
+            self._visits = np.concatenate([self._visits, np.empty_like(self._visits)], axis=1)
+
+
+@compiled
+def _fill_boxes(positions: Floats, i: Whole, boxes: Floats) -> None:
+    for block in range(boxes.shape[0]):
+        for axis in range(3):
+            low, high = np.inf, -np.inf
+            for step in range(block * BLOCK, min((block + 1) * BLOCK, positions.shape[0])):
+                place = positions[step, i, axis]
+                low, high = min(low, place), max(high, place)
+            boxes[block, axis, i], boxes[block, axis + 3, i] = low, high
+
+
+@compiled
+def _fill_visits(
+    cells: Cells, positions: Floats, i: Whole, need: float, visits: NDArray[np.int32], last: NDArray[np.int32]
+) -> int:
+    """Number of a robot's visits; as many as there is room for are written. ``last`` ``(N,)`` is -1, and is again."""
+    nodes, rows, used, step = cells.points, positions.shape[0], 0, 0
+    while step < rows:
+        place = positions[step, i]
+        # Who stands still is looked at once.
+        end = step + 1
+        while end < rows and (
+            positions[end, i, 0] == place[0] and positions[end, i, 1] == place[1] and positions[end, i, 2] == place[2]
+        ):
+            end += 1
+        (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, place, place, need)
+        for ci in range(low_i, high_i):
+            for cj in range(low_j, high_j):
+                first, after_last = items_in(cells, ci, cj, low_k, high_k)
+                for number in range(first, after_last):
+                    n = cells.items[number]
+                    dx, dy, dz = nodes[n, 0] - place[0], nodes[n, 1] - place[1], nodes[n, 2] - place[2]
+                    if dx * dx + dy * dy + dz * dz >= need * need:
+                        continue
+                    v = last[n]
+                    if v < 0 or visits[v, 2] < step:
+                        if used == visits.shape[0]:
+                            return used + 1
+                        v, used = np.int32(used), used + 1
+                        visits[v, 0], visits[v, 1], last[n] = n, step, v
+                    visits[v, 2] = end if end < rows else EVER
+        step = end
+    for v in range(used):
+        last[visits[v, 0]] = -1
+    return used
+
+
+@cached_kernel(variant="note", **OPTIONS)
+def note_motions(
+    cells: Cells, positions: Floats, robots: IntArray, need: Floats, boxes: Floats, visits: NDArray[np.int32],
+    counts: IntArray,
+) -> int:  # fmt: skip
+    """Work out what :class:`Others` says of robots; the last three are output.
+
+    Returns:
+        How many of the robots are done; there is no room for the visits of the next one.
+    """
+    last = np.full(cells.points.shape[0], -1, np.int32)
+    for number in range(robots.shape[0]):
+        i = robots[number]
+        counts[i] = _fill_visits(cells, positions, i, need[i], visits[i], last)
+        if counts[i] > visits.shape[1]:
+            return number
+        _fill_boxes(positions, i, boxes)
+    return robots.shape[0]
+
+
+@compiled
+def find_near_boxes(
+    others: Others, block: Whole, low: tuple[float, float, float], high: tuple[float, float, float], near: IntArray
+) -> int:
+    """Find who may be too near to a box in a block of steps: how many they are; ``near`` ``(K + 1,)`` is output."""
+    boxes, count = others.boxes[block], 0
+    for i in range(others.need.shape[0]):
+        need = others.need[i]
+        near[count] = i
+        count += (
+            (need > 0)
+            & (boxes[0, i] - need <= high[0])
+            & (boxes[3, i] + need >= low[0])
+            & (boxes[1, i] - need <= high[1])
+            & (boxes[4, i] + need >= low[1])
+            & (boxes[2, i] - need <= high[2])
+            & (boxes[5, i] + need >= low[2])
+        )
+    return count
+
+
+@cached_kernel(variant="meetings", **OPTIONS)
+def find_meetings(others: Others, places: Floats, met: BoolArray) -> None:
+    """Find to whom places ``(S + 1, 3)`` are nearer than is needed, after the start; ``met`` ``(K,)`` is output."""
+    met[:], near = False, np.empty(others.need.shape[0] + 1, np.int64)
+    for block in range((places.shape[0] - 1) // BLOCK + 1):
+        first, last = max(block * BLOCK, 1), min((block + 1) * BLOCK, places.shape[0])
+        x, y, z = places[first:last, 0], places[first:last, 1], places[first:last, 2]
+        if first == last:
+            break
+        for number in range(
+            find_near_boxes(others, block, (x.min(), y.min(), z.min()), (x.max(), y.max(), z.max()), near)
+        ):
+            i = near[number]
+            for step in range(first, last):
+                dx, dy = others.positions[step, i, 0] - places[step, 0], others.positions[step, i, 1] - places[step, 1]
+                dz = others.positions[step, i, 2] - places[step, 2]
+                if dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
+                    met[i] = True
+                    break
+
+
+class Buckets(NamedTuple):
+    """Robots by where lines must have their middles in order to come near to them, in a grid over the plane.
+
+    Attributes:
+        low: Lowest corner [m].
+        width: Size of a cell [m].
+        size: Cells along both axes.
+        first: ``(B C + 1,)`` int64 where the robots of each cell in each block begin in ``items``.
+        items: int32 numbers of robots.
+    """
+
+    low: tuple[float, float]
+    width: float
+    size: tuple[int, int]
+    first: IntArray
+    items: NDArray[np.int32]
+
+
+@inlined
+def _range_of(low: float, width: float, size: int, lowest: float, highest: float) -> tuple[int, int]:
+    """The first cell along an axis that a stretch touches, and the one after its last; beyond the grid none."""
+    first, last = (lowest - low) / width, (highest - low) / width
+    if first >= size or last < 0:
+        return 0, 0
+    return int(max(first, 0.0)), int(min(last, size - 1.0)) + 1
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def sort_boxes(others: Others, points: Floats, half: float, num_blocks: int) -> Buckets:
+    """Sort the boxes in so many blocks, for lines between some of these points that are no longer than ``2 half``."""
+    x, y = points[:, 0].min(), points[:, 1].min()
+    spread = half * WIDER + others.need.max()
+    width = 2 * spread
+    size = (int((points[:, 0].max() - x) / width) + 1, int((points[:, 1].max() - y) / width) + 1)
+    boxes, count = others.boxes, size[0] * size[1]
+    first, items = np.zeros(num_blocks * count + 1, np.int64), np.empty(0, np.int32)
+    # First they are counted, then entered from the end of each cell's part.
+    for entered in range(2):
+        for block in range(num_blocks):
+            for i in range(others.need.shape[0]):
+                if others.need[i] <= 0:
+                    continue
+                low_i, high_i = _range_of(x, width, size[0], boxes[block, 0, i] - spread, boxes[block, 3, i] + spread)
+                low_j, high_j = _range_of(y, width, size[1], boxes[block, 1, i] - spread, boxes[block, 4, i] + spread)
+                for ci in range(low_i, high_i):
+                    for cj in range(low_j, high_j):
+                        cell = block * count + ci * size[1] + cj
+                        if entered:
+                            first[cell] -= 1
+                            items[first[cell]] = i
+                        else:
+                            first[cell] += 1
+        if not entered:
+            for cell in range(1, first.shape[0]):
+                first[cell] += first[cell - 1]
+            items = np.empty(first[-1], np.int32)
+    return Buckets((x, y), width, size, first, items)
+
+
+@inlined
+def bucket_of(buckets: Buckets, block: Whole, x: float, y: float) -> Whole:
+    """The cell in a block that the middle of a line lies in."""
+    i = int((x - buckets.low[0]) / buckets.width)
+    return (block * buckets.size[0] + i) * buckets.size[1] + int((y - buckets.low[1]) / buckets.width)
+
+
+@compiled
+def last_passage(others: Others, place: Floats, near: IntArray) -> Whole:
+    """The last step at which another comes too near to a place, -1 if none does; ``near`` ``(K + 1,)`` is scratch."""
+    point = (place[0], place[1], place[2])
+    for block in range(others.boxes.shape[0] - 1, -1, -1):
+        first, last = block * BLOCK, min((block + 1) * BLOCK, others.positions.shape[0])
+        latest = np.int64(-1)
+        for number in range(find_near_boxes(others, block, point, point, near)):
+            i = near[number]
+            for step in range(first, last):
+                dx, dy = others.positions[step, i, 0] - place[0], others.positions[step, i, 1] - place[1]
+                dz = others.positions[step, i, 2] - place[2]
+                if dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
+                    latest = max(latest, np.int64(step))
+        if latest >= 0:
+            return latest
+    return np.int64(-1)
