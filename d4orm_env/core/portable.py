@@ -148,7 +148,7 @@ def sin_cos(x: Floats) -> tuple[Floats, Floats]:
 
 
 def sin_cos_of(x: float) -> tuple[float, float]:
-    """:func:`sin_cos` of one number, in a twentieth of the time."""
+    """:func:`sin_cos` of one number, in a fifteenth of the time."""
     if not abs(x) < _REDUCED_EXACTLY:
         sine, cosine = sin_cos(np.float64(x))
         return float(sine), float(cosine)
