@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, wraps
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,8 @@ from d4orm_env.dynamics.robot_model import Ops
 
 Real: TypeAlias = Any
 """An array or a number, float32 or float64, whichever the arguments are."""
+Part = TypeVar("Part", Floats, float)
+"""Arrays of float64, or one number of Python."""
 Function = Callable[..., Real]
 
 _TWO_OVER_PI = 6.36619772367581382433e-01
@@ -145,6 +147,18 @@ def sin_cos(x: Floats) -> tuple[Floats, Floats]:
     return np.where(x == 0, x, first)[()], second[()]  # minus zero keeps its sign
 
 
+def sin_cos_of(x: float) -> tuple[float, float]:
+    """:func:`sin_cos` of one number, in a fifteenth of the time."""
+    if not abs(x) < _REDUCED_EXACTLY:
+        sine, cosine = sin_cos(np.float64(x))
+        return float(sine), float(cosine)
+    multiple = float(round(x * _TWO_OVER_PI))
+    high, low = _remainder(x, multiple)
+    quadrant, sine, cosine = int(multiple) & 3, _sine(high, low), _cosine(high, low)
+    first, second = (cosine, sine) if quadrant & 1 else (sine, cosine)
+    return (-first if quadrant & 2 else first) if x else x, -second if (quadrant + 1) & 2 else second
+
+
 @_in_float64
 def arctan2(y: Floats, x: Floats) -> Floats:
     """Angle of the point ``(x, y)`` [rad], from minus pi to pi."""
@@ -199,7 +213,7 @@ NUMPY_OPS = Ops(cos, sin, np.sqrt, np.minimum, np.maximum, arctan2, np.where)
 """Functions that the robot models need, over NumPy arrays."""
 
 
-def _polynomial(x: Floats, coefficients: tuple[float, ...]) -> Floats:
+def _polynomial(x: Part, coefficients: tuple[float, ...]) -> Part:
     """``coefficients[0] + coefficients[1] * x + ...``, by Horner's rule."""
     total = coefficients[-2] + x * coefficients[-1]
     for coefficient in coefficients[-3::-1]:
@@ -207,7 +221,7 @@ def _polynomial(x: Floats, coefficients: tuple[float, ...]) -> Floats:
     return total
 
 
-def _sine(high: Floats, low: Floats) -> Floats:
+def _sine(high: Part, low: Part) -> Part:
     """Sine of ``high + low`` within a quarter of pi of zero."""
     square = high * high
     cube = square * high
@@ -215,7 +229,7 @@ def _sine(high: Floats, low: Floats) -> Floats:
     return high - ((square * (0.5 * low - cube * rest) - low) - cube * _SINE[0])
 
 
-def _cosine(high: Floats, low: Floats) -> Floats:
+def _cosine(high: Part, low: Part) -> Part:
     """Cosine of ``high + low`` within a quarter of pi of zero."""
     square = high * high
     half = 0.5 * square
@@ -239,11 +253,7 @@ def _reduced(x: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
     some_huge = huge.any()
     small = np.where(huge, 0.0, x) if some_huge else x
     multiple = np.rint(small * _TWO_OVER_PI)
-    rest, first = _difference(small - multiple * _HALF_PI[0], multiple * _HALF_PI[1])
-    rest, second = _difference(rest, multiple * _HALF_PI[2])
-    error = (first + second) - multiple * _HALF_PI[3]
-    high = rest + error
-    low = (rest - high) + error
+    high, low = _remainder(small, multiple)
     quadrant = multiple.astype(np.int64) & 3
     if some_huge:
         quadrant, high, low = (np.array(part) for part in (quadrant, high, low))
@@ -253,7 +263,16 @@ def _reduced(x: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
     return quadrant, high, low
 
 
-def _difference(a: Floats, b: Floats) -> tuple[Floats, Floats]:
+def _remainder(x: Part, multiple: Part) -> tuple[Part, Part]:
+    """What is left of ``x`` over a multiple of pi/2, high and low part."""
+    rest, first = _difference(x - multiple * _HALF_PI[0], multiple * _HALF_PI[1])
+    rest, second = _difference(rest, multiple * _HALF_PI[2])
+    error = (first + second) - multiple * _HALF_PI[3]
+    high = rest + error
+    return high, (rest - high) + error
+
+
+def _difference(a: Part, b: Part) -> tuple[Part, Part]:
     """``a - b`` rounded, and what rounding lost (Knuth)."""
     result = a - b
     part = result - a

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -10,18 +10,26 @@ from d4orm_env.core.arrays import FloatArray, Floats, Whole
 from d4orm_env.core.footprint_arrays import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled
 from d4orm_env.engine.elementary import cosine, sine
 from d4orm_env.engine.footprint_contacts import POSE, touches_static
 from d4orm_env.engine.simd import TILE
 from d4orm_planners.manoeuvres.heaps import Heap, pop, push
-from d4orm_planners.manoeuvres.primitives import SECTOR, SECTORS, Primitives
+from d4orm_planners.manoeuvres.kinds import SECTOR, SECTORS
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
 
 TURN = 2 * np.pi
-BUFFER = (2 + POSE) * TILE
-"""Numbers that contacts are found in: two cores and a pose."""
 WIDER, LATER = 1.2, 20
 """Poses count from which a robot takes at most so many times as long as from its start, and so many steps more."""
+
+
+Pose: TypeAlias = tuple[float, float, float, float, float, float]
+"""Position, heading and hitch angles."""
+
+
+def buffer_size(footprints: FootprintArrays) -> int:
+    """Numbers that contacts are found in: two cores, and a pose of each body."""
+    return (2 + POSE * len(footprints.robot)) * TILE
 
 
 class RobotBody(NamedTuple):
@@ -44,6 +52,10 @@ class RobotBody(NamedTuple):
     parts: int
 
 
+Placed: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32]
+"""A body's heading as a unit vector, and its position."""
+
+
 class PoseLattice(NamedTuple):
     """Cells of positions and sectors of headings: poses in the same are taken for one.
 
@@ -53,6 +65,7 @@ class PoseLattice(NamedTuple):
         size: ``(2,)`` cells along x and y.
         heading: Middle of the first sector [rad].
         sectors: Number of sectors; one for a robot without a heading.
+        modes: Number of modes.
     """
 
     low: Floats
@@ -60,6 +73,7 @@ class PoseLattice(NamedTuple):
     size: tuple[int, int]
     heading: float
     sectors: int
+    modes: int
 
 
 @compiled
@@ -88,14 +102,43 @@ def is_far_from_all(body: RobotBody, x: float, y: float, wider: float) -> bool:
 
 
 @compiled
-def is_free(body: RobotBody, x: float, y: float, heading: float, buffer: FloatArray) -> bool:
+def is_free(body: RobotBody, pose: Pose, buffer: FloatArray) -> bool:
     """Check whether the robot is clear of obstacles and bounds there."""
-    if is_far_from_all(body, x, y, 0.0):
+    if is_far_from_all(body, pose[0], pose[1], 0.0):
         return True
-    place, poses = (np.float32(x), np.float32(y), np.float32(0)), buffer[2 * TILE :]
-    poses[0], poses[TILE] = direction(body, body.robot, heading)
-    poses[2 * TILE] = poses[3 * TILE] = np.float32(0)
-    return not touches_static(body.footprints, body.arrays, body.robot, place, poses, 0, 0, body.extra, buffer)
+    place, poses = (np.float32(pose[0]), np.float32(pose[1]), np.float32(0)), buffer[2 * TILE :]
+    i, trailer, placed = np.int64(body.robot), 0, placed_first(body, body.robot, pose[2], ZERO, ZERO)
+    while i >= 0:
+        for row in range(POSE):
+            poses[(i * POSE + row) * TILE] = placed[row]
+        placed = placed_next(body, i, placed, hitch_of(pose, trailer))
+        i, trailer = np.int64(body.footprints.following[i]), trailer + 1
+    k, stride = body.robot, POSE * TILE
+    return not touches_static(body.footprints, body.arrays, k, place, poses, stride, 0, body.extra, buffer)
+
+
+@compiled
+def hitch_of(pose: Pose, trailer: int) -> float:
+    """Hitch angle of a trailer; of the last one there may be."""
+    return pose[3] if trailer == 0 else pose[4] if trailer == 1 else pose[5]
+
+
+@compiled
+def placed_first(body: RobotBody, robot: Whole, heading: float, x: np.float32, y: np.float32) -> Placed:
+    """Where a robot's own body is."""
+    c, s = direction(body, robot, heading)
+    return c, s, x, y
+
+
+@compiled
+def placed_next(body: RobotBody, i: Whole, before: Placed, hitch: float) -> Placed:
+    """Where the trailer that follows body ``i`` is; the same if there is none."""
+    j = body.footprints.following[i]
+    if j < 0:
+        return before
+    c, s, length = cosine(np.float32(hitch)), sine(np.float32(hitch)), body.footprints.hitch[j]
+    cos, sin = before[0] * c + before[1] * s, before[1] * c - before[0] * s
+    return cos, sin, before[2] - length * cos, before[3] - length * sin
 
 
 @compiled
@@ -108,9 +151,39 @@ def direction(body: RobotBody, robot: Whole, heading: float) -> tuple[np.float32
 
 @compiled
 def moved(x: float, y: float, heading: float, step: Floats) -> tuple[float, float, float]:
-    """The pose after a step ``(3,)`` seen from a pose; its heading is not wound up."""
+    """Position and heading after a step ``(6,)`` seen from a pose; the heading is not wound up."""
     c, s = np.float64(cosine(np.float32(heading))), np.float64(sine(np.float32(heading)))
     return x + (c * step[0] - s * step[1]), y + (s * step[0] + c * step[1]), turned_by(heading + step[2])
+
+
+@compiled
+def pose_after(x: float, y: float, heading: float, step: Floats) -> Pose:
+    """The pose after a step ``(6,)`` seen from a pose."""
+    px, py, turned = moved(x, y, heading, step)
+    return px, py, turned, step[3], step[4], step[5]
+
+
+@compiled
+def pose_of(row: Floats) -> Pose:
+    """The pose in a row of an array."""
+    return row[0], row[1], row[2], row[3], row[4], row[5]
+
+
+@compiled
+def write_pose(rows: Floats, at: int, x: float, y: float, heading: float, hitches: Floats) -> None:
+    """Write a pose into a row, its hitch angles as in another row."""
+    rows[at, 0], rows[at, 1], rows[at, 2] = x, y, heading
+    for i in range(3, POSE_SIZE):
+        rows[at, i] = hitches[i]
+
+
+@compiled
+def pose_between(before: Floats, after: Floats, back: float) -> Pose:
+    """The pose that so large a share of a step lies before its end."""
+    x, y = after[0] - back * (after[0] - before[0]), after[1] - back * (after[1] - before[1])
+    heading = after[2] - back * turned_by(after[2] - before[2])
+    first, second = after[3] - back * (after[3] - before[3]), after[4] - back * (after[4] - before[4])
+    return x, y, heading, first, second, after[5] - back * (after[5] - before[5])
 
 
 @compiled
@@ -135,8 +208,7 @@ def is_way_free(
         return True
     # From the end on: what is not free is found there soonest.
     for step in range(primitives.first[number + 1] - 1, primitives.first[number] - 1, -1):
-        px, py, turned = moved(x, y, heading, primitives.poses[step])
-        if not is_free(body, px, py, turned, buffer):
+        if not is_free(body, pose_after(x, y, heading, primitives.poses[step]), buffer):
             return False
     return True
 
@@ -163,7 +235,7 @@ def _spread(
 @cached_kernel(**OPTIONS)
 def fill_costs(
     body: RobotBody, primitives: Primitives, lattice: PoseLattice, goals: Floats, start: Floats, pace: float,
-    costs: FloatArray, poses: Floats, heap: Heap,
+    costs: FloatArray, poses: Floats, heap: Heap, mode: int, buffer: FloatArray,
 ) -> float:  # fmt: skip
     """Spread costs backwards from the goals over all poses from which it may be worthwhile to go there.
 
@@ -177,11 +249,13 @@ def fill_costs(
         costs: ``(cells,)`` steps to the goal, filled; infinite to begin with, and beyond what was reached.
         poses: ``(cells, 3)`` to overwrite.
         heap: To overwrite.
+        mode: That the robot starts in.
+        buffer: To overwrite, see :func:`buffer_size`.
 
     Returns:
         The cost up to which all are known.
     """
-    buffer, begin = np.zeros(BUFFER, np.float32), cell_of(lattice, start[0], start[1], start[2], 0)
+    begin = cell_of(lattice, start[0], start[1], start[2], mode)
     heap.filled[0] = 0
     for number in range(goals.shape[0]):
         cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], 0)

@@ -8,9 +8,11 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
+from d4orm_planners.manoeuvres.costs import Costs
+from d4orm_planners.manoeuvres.curves import Curves
 from d4orm_planners.manoeuvres.heaps import Heap, push
-from d4orm_planners.manoeuvres.lattice import BUFFER, PoseLattice, RobotBody, cell_of, turned_by
-from d4orm_planners.manoeuvres.primitives import Primitives
+from d4orm_planners.manoeuvres.lattice import Pose, PoseLattice, RobotBody, cell_of, turned_by
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
 from d4orm_planners.manoeuvres.snapping import Goal, Limits, snap_of, snap_steps
 
 MAX_STEPS = 2**14
@@ -21,7 +23,7 @@ class Nodes(NamedTuple):
     """Nodes of a search, ``N`` at most, and where to find those of a cell.
 
     Attributes:
-        pose: ``(N, 3)``.
+        pose: ``(N, 6)``.
         mode: ``(N,)``, -1 for a node at which the robot stays at its goal.
         time: ``(N,)`` step of arrival.
         until: ``(N,)`` first step at which it must have gone.
@@ -35,8 +37,8 @@ class Nodes(NamedTuple):
         heads: ``(C,)`` first node of each.
         marks: ``(C,)`` search that wrote it.
         heap: Those to be followed.
-        swept: ``(., 4)`` poses and speeds on a move, from where it begins.
-        buffer: See :data:`~d4orm_planners.manoeuvres.lattice.BUFFER`.
+        swept: ``(., 7)`` poses and speeds on a move, from where it begins.
+        buffer: See :func:`~d4orm_planners.manoeuvres.lattice.buffer_size`.
     """
 
     pose: Floats
@@ -57,17 +59,17 @@ class Nodes(NamedTuple):
     buffer: FloatArray
 
     @classmethod
-    def of(cls, size: int) -> Nodes:
-        """Room for so many."""
+    def of(cls, size: int, buffer: int) -> Nodes:
+        """Room for so many, and a buffer of a size."""
         slots = 1 << int(2 * size - 1).bit_length()
 
         def numbers(count: int) -> IntArray:
             return np.zeros(count, np.int64)
 
         return cls(
-            np.empty((size, 3)), numbers(size), numbers(size), numbers(size), numbers(size), numbers(size),
+            np.empty((size, POSE_SIZE)), numbers(size), numbers(size), numbers(size), numbers(size), numbers(size),
             numbers(size), numbers(size), numbers(1), numbers(1), numbers(slots), numbers(slots), numbers(slots),
-            Heap.of(size + 1), np.empty((MAX_STEPS + 1, 4)), np.zeros(BUFFER, np.float32),
+            Heap.of(size + 1), np.empty((MAX_STEPS + 1, POSE_SIZE + 1)), np.zeros(buffer, np.float32),
         )  # fmt: skip
 
 
@@ -77,12 +79,11 @@ class Task(NamedTuple):
     Attributes:
         body: The robot.
         primitives: What it can do.
-        limits: For the last stretch.
+        limits: For the last stretch, ...
+        curves: ... and those of a robot with trailers.
         goal: Where to.
         lattice: Cells and sectors.
-        costs: Steps to the goal from every cell of the goal's own lattice, none in a world without obstacles, ...
-        far: ... and from those that are not known.
-        costs_lattice: PoseLattice of the costs.
+        costs: Steps to the goal; none in a world without obstacles.
         weight: Times that these count more than the steps behind.
         patience: Steps between departures that are tried.
         horizon: Last step.
@@ -92,11 +93,10 @@ class Task(NamedTuple):
     body: RobotBody
     primitives: Primitives
     limits: Limits
+    curves: Curves
     goal: Goal
     lattice: PoseLattice
-    costs: FloatArray
-    far: float
-    costs_lattice: PoseLattice
+    costs: Costs
     weight: float
     patience: int
     horizon: int
@@ -129,20 +129,20 @@ def is_dominated(nodes: Nodes, slot: int, number: int, own: int, time: int) -> b
 @compiled
 def cost_to_go(task: Task, x: float, y: float, heading: float, mode: Whole) -> float:
     """Steps to the goal; where there are no obstacles, those of the last stretch."""
-    if task.costs.shape[0] == 0:
+    if task.costs.steps.shape[0] == 0:
         ahead = snap_steps(snap_of(task.limits, task.goal, x, y, heading, 1.0))
         return float(min(ahead, snap_steps(snap_of(task.limits, task.goal, x, y, heading, -1.0))))
-    cell = cell_of(task.costs_lattice, x, y, heading, mode)
-    cost = np.float64(task.costs[cell]) if cell >= 0 else np.inf
-    return cost if cost < np.inf else task.far
+    cell = cell_of(task.costs.lattice, x, y, heading, mode)
+    cost = np.float64(task.costs.steps[cell]) if cell >= 0 else np.inf
+    return cost if cost < np.inf else task.costs.far
 
 
 @compiled
 def add(
-    task: Task, nodes: Nodes, x: float, y: float, heading: float, mode: int, time: int, until: int, parent: int,
-    move: int, depart: int,
-) -> None:  # fmt: skip
+    task: Task, nodes: Nodes, pose: Pose, mode: int, time: int, until: int, parent: int, move: int, depart: int
+) -> None:
     """Take in a node, unless another one is as good."""
+    x, y, heading = pose[0], pose[1], pose[2]
     slot, remaining = -1, 0.0
     if mode >= 0:
         cell = cell_of(task.lattice, x, y, heading, mode)
@@ -156,7 +156,8 @@ def add(
     if number >= nodes.mode.shape[0]:
         return
     nodes.filled[0] = number + 1
-    nodes.pose[number, 0], nodes.pose[number, 1], nodes.pose[number, 2] = x, y, turned_by(heading)
+    for i in range(POSE_SIZE):
+        nodes.pose[number, i] = pose[i] if i != 2 else turned_by(heading)
     nodes.mode[number], nodes.time[number], nodes.until[number] = mode, time, until
     nodes.parent[number], nodes.move[number], nodes.depart[number], nodes.next[number] = parent, move, depart, -1
     if mode >= 0:

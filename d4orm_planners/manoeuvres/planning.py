@@ -11,7 +11,9 @@ from d4orm_env.core.world import World
 from d4orm_env.footprints import Box
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.manoeuvres.search import find_motion
+from d4orm_planners.manoeuvres.curves import NO_CURVES
+from d4orm_planners.manoeuvres.moves import AHEAD
+from d4orm_planners.manoeuvres.search import curve_from, find_motion
 from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.mapf.lns import search_neighbourhoods
 
@@ -32,6 +34,7 @@ def compile_manoeuvres() -> None:
     motions = TeamMotions.prepared(problem, lambda: False)
     assert motions is not None
     motions.plan_all()
+    curve_from(NO_CURVES, motions.robots[0].goal, 0.0, 0.0, 0.0, AHEAD)
 
 
 def find_manoeuvres(search: SolveRun) -> TeamMotions | None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,15 +12,17 @@ from d4orm_env.core.footprint_gaps import pair_gap, world_gap
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
-from d4orm_planners.manoeuvres.heaps import Heap
-from d4orm_planners.manoeuvres.lattice import PoseLattice, RobotBody, fill_costs
-from d4orm_planners.manoeuvres.primitives import MOVES, SECTOR, SECTORS, Kind, Mode, Primitives, primitives_of
-from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TURNING, Goal, Limits
+from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION, UNICYCLE2
+from d4orm_planners.manoeuvres.costs import Area, Costs, costs_of
+from d4orm_planners.manoeuvres.curves import NO_CURVES, Curves, curves_of
+from d4orm_planners.manoeuvres.kinds import SECTORS, Kind
+from d4orm_planners.manoeuvres.lattice import PoseLattice, RobotBody
+from d4orm_planners.manoeuvres.model_moves import MOVES
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives, primitives_of
+from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TOWING, TURNING, Goal, Limits
 
 CELLS_PER_RADIUS = 3
 """Cells in the outer radius of the largest robot."""
-TEAM_CELLS, LEAST_CELLS, MOST_CELLS = 4_000_000, 150_000, 400_000
-"""Cells of the costs of all robots together, and the least and the most of one: a larger world has larger cells."""
 ROOM = 4
 """Room round starts and goals in a world without bounds, in diameters of the largest robot."""
 CLEARANCE = 0.15
@@ -35,12 +36,41 @@ CERTAIN = 0.98
 """Share of a goal's radius, heading tolerance and speed within which a robot is there beyond doubt."""
 
 
-class Area(NamedTuple):
-    """The room that robots may use, and the largest cell that a lattice of it needs [m]."""
+class Scene(NamedTuple):
+    """What all robots of a team share.
 
-    low: Floats
-    high: Floats
-    cell: float
+    Attributes:
+        problem: The problem.
+        area: The room that robots may use.
+        arrays: The problem's arrays, of one type for all problems, with an index of all obstacles within reach.
+        extra: Distance kept from everything [m].
+    """
+
+    problem: Problem
+    area: Area
+    arrays: ProblemArrays
+    extra: float
+
+    @property
+    def reach(self) -> float:
+        """Distance beyond which two robots do not matter to each other in a step [m]."""
+        return 2 * float(self.problem.team.radius.max()) + self.extra + 2 * self.problem.stride
+
+    def body(self, robot: int) -> RobotBody:
+        """A robot among the obstacles."""
+        footprints, stride = self.problem.team.all_footprint_arrays, self.problem.stride
+        parts = min(int(np.ceil(CUTTING * stride / self.extra)), MAX_PARTS)
+        return RobotBody(footprints, self.arrays, robot, np.float32(self.extra), stride, parts)
+
+
+def scene_of(problem: Problem) -> Scene:
+    """What all robots of a team share."""
+    team, extra = problem.team, distance_kept(problem)
+    index = problem.world.index(float(team.radius.max()) + extra, within=float(team.radius.max()) + extra)
+    arrays = problem.arrays._replace(
+        grid=index, turns_at_goals=None, goal_direction=None, squared_goal_chord=None, footprints=None
+    )
+    return Scene(problem, area_of(problem), arrays, extra)
 
 
 def can_plan(problem: Problem) -> bool:
@@ -50,8 +80,9 @@ def can_plan(problem: Problem) -> bool:
         return False
     if not team.shapes and np.isnan(problem.goal_heading).all():
         return False
-    extras = [problem.start[robot, _extra(model) : model.state_size] for robot, model in enumerate(team.robot_models)]
-    return not any(extra.any() for extra in extras)
+    # Trailers need not be in line.
+    begin = [model.state_size if model.trailers else _extra(model) for model in team.robot_models]
+    return not any(state[first:].any() for state, first in zip(problem.start, begin, strict=True))
 
 
 def _extra(model: Model) -> int:
@@ -72,27 +103,36 @@ def area_of(problem: Problem) -> Area:
     return Area(low, high, largest / CELLS_PER_RADIUS)
 
 
-def plain_arrays(problem: Problem, reach: float) -> ProblemArrays:
-    """The problem's arrays, of one type for all problems, with an index of all obstacles within reach."""
-    index = problem.world.index(reach, within=reach)
-    return problem.arrays._replace(
-        grid=index, turns_at_goals=None, goal_direction=None, squared_goal_chord=None, footprints=None
-    )
-
-
 def distance_kept(problem: Problem) -> float:
     """Distance that robots keep from everything [m]; less where starts or goals leave less room."""
-    team, largest = problem.team, float(problem.team.radius.max())
-    room, usual = np.inf, problem.margin + problem.rounding + CLEARANCE * problem.stride
-    turned = np.where([model.heading_index is None for model in team.robot_models], 0, problem.goal_heading)
-    for places, headings in ((problem.start[:, :2], team.headings(problem.start)), (problem.goal, turned)):
-        poses = np.column_stack([places, headings]).astype(np.float64)
-        for robot in np.flatnonzero(problem.world.clearance(places) - team.radius < usual):
-            room = min(room, world_gap(problem.world, team.footprint[robot], poses[robot]))
-        for one, other in combinations(range(len(poses)), 2):
-            if np.linalg.norm(poses[one, :2] - poses[other, :2]) < 2 * largest + usual:
-                room = min(room, pair_gap(team.footprint[one], poses[one], team.footprint[other], poses[other]))
-    return min(usual, 0.9 * room)
+    team, usual = problem.team, problem.margin + problem.rounding + CLEARANCE * problem.stride
+    goals = np.zeros_like(problem.start)
+    goals[:, :2] = problem.goal
+    for robot, model in enumerate(team.robot_models):
+        if model.heading_index is not None:
+            goals[robot, model.heading_index] = problem.goal_heading[robot]
+    return min(usual, 0.9 * min(_room(problem, problem.start, usual), _room(problem, goals, usual)))
+
+
+def _room(problem: Problem, states: FloatArray, enough: float) -> float:
+    """The least gap between robots, and to the world, in states ``(K, n)``; only those below ``enough`` are looked at.
+
+    A robot that may face anywhere counts with its inner disc, and its trailers do not.
+    """
+    team, world, room = problem.team, problem.world, np.inf
+    poses, radius = team.body_poses(states), team.radius.astype(np.float64)
+    bodies: list[list[int]] = [[] for _ in range(team.num_robots)]
+    for i, body in enumerate(team.bodies):
+        if not np.isnan(poses[i, :2]).any():
+            bodies[body.robot].append(i)
+    shapes = [body.footprint for body in team.bodies]
+    for robot in np.flatnonzero(world.clearance(states[:, :2]) - radius < enough):
+        room = min([room, *(world_gap(world, shapes[i], poses[i]) for i in bodies[robot])])
+    apart = np.linalg.norm(states[:, None, :2].astype(np.float64) - states[None, :, :2], axis=2)
+    for one, other in np.argwhere(np.triu(apart - radius[:, None] - radius < enough, 1)).tolist():
+        gaps = (pair_gap(shapes[i], poses[i], shapes[j], poses[j]) for i in bodies[one] for j in bodies[other])
+        room = min([room, *gaps])
+    return room
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,86 +142,68 @@ class Robot:
     Attributes:
         number: Its number.
         model: Its model.
-        start: ``(3,)`` pose.
+        start: ``(6,)`` pose.
+        mode: That it starts in.
         goal: Where to.
         limits: For the last stretch.
+        curves: For that of a robot with trailers.
         body: Among the obstacles.
         primitives: What it can do.
-        modes: Speeds and angles of each mode.
-        lattice: Cells and sectors round its start's heading, ...
-        costs_lattice: ... and its goal's.
-        costs: ``(cells,)`` steps to the goal.
-        far: Steps from where that is not known, at least.
+        lattice: Cells and sectors round its start's heading.
+        costs: Steps to the goal.
     """
 
     number: int
     model: Model
     start: Floats
+    mode: int
     goal: Goal
     limits: Limits
+    curves: Curves
     body: RobotBody
     primitives: Primitives
-    modes: tuple[Mode, ...]
     lattice: PoseLattice
-    costs_lattice: PoseLattice
-    costs: FloatArray
-    far: float
+    costs: Costs
 
 
-def make_robot(problem: Problem, number: int, area: Area, arrays: ProblemArrays, extra: float) -> Robot:
-    """Prepare the search for a robot of a team."""
-    team, model = problem.team, problem.team.robot_models[number]
-    own = team.limits[number].astype(np.float64)
-    sectors = 1 if model.heading_index is None else SECTORS
-    kind = Kind(model.name, tuple(own[: len(model.limit_names)].tolist()), problem.dt, area.cell)
+def make_robot(scene: Scene, number: int) -> Robot | None:
+    """Prepare the search for a robot of a team; ``None`` if its trailers cannot be brought in line from the start."""
+    problem, area, body = scene.problem, scene.area, scene.body(number)
+    model = problem.team.robot_models[number]
+    state = problem.start[number, : model.state_size].astype(np.float64).tolist()
+    limits = problem.team.limits[number, : len(model.limit_names)].astype(np.float64).tolist()
+    kind = Kind(model.name, tuple(limits), problem.dt, area.cell, tuple(state[_extra(model) :]))
     primitives, _, modes = primitives_of(kind)
-    cells = np.clip(TEAM_CELLS / problem.num_robots, LEAST_CELLS, MOST_CELLS)
-    wide = max(area.cell, round(float(np.sqrt(np.prod(area.high - area.low) * len(modes) * sectors / cells)), 3))
-    back = primitives_of(replace(kind, cell=wide))[1]
-    heading = float(problem.goal_heading[number]) if sectors > 1 else 0.0
-    towards = _lattice(area, wide, 0.0 if np.isnan(heading) else heading, sectors)
-    start = np.zeros(3)
-    start[: _extra(model)] = problem.start[number, : _extra(model)]
-    goal = _goal(problem, number, heading if sectors > 1 else np.nan)
-    parts = int(np.ceil(CUTTING * problem.stride / extra))
-    body = RobotBody(
-        team.all_footprint_arrays, arrays, number, np.float32(extra), problem.stride, min(parts, MAX_PARTS)
-    )
-    costs, far, limits = np.zeros(0, np.float32), np.inf, _limits(model, own, problem.dt)
-    if problem.world.num_obstacles or limits.way == NOWHERE:
-        costs, far = _costs(body, back, towards, goal, start, 1 / (own[SPEED] * problem.dt))
-    return Robot(
-        number, model, start, goal, limits, body, primitives, modes,
-        _lattice(area, area.cell, float(start[2]), sectors), towards, costs, far,
+    if kind.start not in modes:
+        return None
+    start, goal, last = np.zeros(POSE_SIZE), _goal(problem, number), _limits(kind)
+    start[: _extra(model)] = state[: _extra(model)]
+    start[3 : 3 + len(model.trailers)] = state[3 : 3 + len(model.trailers)]
+    sectors = 1 if model.heading_index is None else SECTORS
+    lattice = area.lattice(area.cell, float(start[2]), sectors, len(modes))
+    costs = Costs(lattice, np.zeros(0, np.float32), np.inf)
+    if problem.world.num_obstacles or last.way in (NOWHERE, TOWING):
+        costs = costs_of(kind, area, body, start, goal, problem.num_robots)
+    curves = curves_of(kind.base) if model.trailers else NO_CURVES
+    mode = modes.index(kind.start)
+    return Robot(number, model, start, mode, goal, last, curves, body, primitives, lattice, costs)
+
+
+def _limits(kind: Kind) -> Limits:
+    model, own, lower = kind.model, kind.limits, kind.lower
+    way = SIDEWAYS if model.heading_index is None else TURNING if model.turns_in_place else NOWHERE
+    swing = own[MAX_TURN_ACCELERATION] if model.name == UNICYCLE2.name else np.inf
+    return Limits(
+        TOWING if model.trailers else way, own[SPEED], lower[SPEED],
+        np.inf if model.first_order else own[ACCELERATION], own[TURN_RATE], lower[TURN_RATE], swing,
+        float(np.float32(kind.dt)),
     )  # fmt: skip
 
 
-def _lattice(area: Area, cell: float, heading: float, sectors: int) -> PoseLattice:
-    size = np.ceil((area.high - area.low) / cell).astype(int).tolist()
-    return PoseLattice(area.low, 1 / cell, (size[0], size[1]), heading, sectors)
-
-
-def _limits(model: Model, own: Floats, dt: float) -> Limits:
-    way = SIDEWAYS if model.heading_index is None else TURNING if model.turns_in_place else NOWHERE
-    acceleration = np.inf if model.first_order else own[ACCELERATION]
-    return Limits(way, float(own[SPEED]), float(acceleration), float(own[TURN_RATE]), float(np.float32(dt)))
-
-
-def _goal(problem: Problem, number: int, heading: float) -> Goal:
+def _goal(problem: Problem, number: int) -> Goal:
+    heading = np.nan if problem.team.robot_models[number].heading_index is None else problem.goal_heading[number]
     return Goal(
-        float(problem.goal[number, 0]), float(problem.goal[number, 1]), heading, problem.goal_radius * CERTAIN,
+        float(problem.goal[number, 0]), float(problem.goal[number, 1]), float(heading), problem.goal_radius * CERTAIN,
         float(problem.goal_heading_tolerance[number]) * CERTAIN, float(problem.goal_speed[number]) * CERTAIN,
         problem.docks,
     )  # fmt: skip
-
-
-def _costs(
-    body: RobotBody, back: Primitives, lattice: PoseLattice, goal: Goal, start: Floats, pace: float
-) -> tuple[FloatArray, float]:
-    """Steps to the goal from all cells, and from where they are not known."""
-    cells = len(back.rests) * lattice.sectors * lattice.size[0] * lattice.size[1]
-    headings = [goal.heading] if not np.isnan(goal.heading) else np.arange(lattice.sectors) * SECTOR
-    goals = np.array([[goal.x, goal.y, heading] for heading in headings])
-    costs = np.full(cells, np.inf, np.float32)
-    known = fill_costs(body, back, lattice, goals, start, pace, costs, np.empty((cells, 3)), Heap.of(2 * cells + 512))
-    return costs, known

@@ -13,11 +13,13 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_planners.manoeuvres.curves import Curve, Curves, curve_of
 from d4orm_planners.manoeuvres.heaps import pop
-from d4orm_planners.manoeuvres.lattice import cell_of, moved
-from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, docks_after, is_sweep_free, reaches, sweep
+from d4orm_planners.manoeuvres.lattice import cell_of, moved, pose_of
+from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, docks_after, is_sweep_free, reaches, stretch_steps, sweep
 from d4orm_planners.manoeuvres.nodes import Nodes, Task, add, cost_to_go, is_dominated, slot_of
-from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, Goal, Limits, Snap, snap_of, snap_steps
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE
+from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TOWING, Goal, Limits, Snap, snap_of
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, is_met, safe_since, safe_until, visits_of
 
 NOTHING, PAUSED = -1, -2
@@ -91,16 +93,16 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
         return
     mode = task.primitives.mode[move] if move >= 0 and not docks else -1
     busy, met = _has_traffic(traffic, nodes, count, depart), 0
-    x, y, heading, _ = nodes.swept[count]
+    pose = pose_of(nodes.swept[count])
     while depart < until and depart + count <= task.horizon:
         if not busy:
-            add(task, nodes, x, y, heading, mode, depart + count, NEVER, node, move, depart)
+            add(task, nodes, pose, mode, depart + count, NEVER, node, move, depart)
             return
         met = _meeting(task, nodes, traffic, count, depart, met)
         if met == 0:
             end = safe_until(task.body, traffic, depart + count, nodes.swept[count], nodes.buffer)
             if mode >= 0 or end == NEVER:
-                add(task, nodes, x, y, heading, mode, depart + count, end, node, move, depart)
+                add(task, nodes, pose, mode, depart + count, end, node, move, depart)
             if end == NEVER:
                 return
             depart = max(depart, end - count)
@@ -115,14 +117,13 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
 def _snaps(task: Task, nodes: Nodes, traffic: Traffic, node: int) -> None:
     """Try the last stretch, where it is about as quick as any way."""
     pose, mode = nodes.pose[node], nodes.mode[node]
-    if task.limits.way == NOWHERE or not task.primitives.rests[mode]:
+    if task.limits.way == NOWHERE or not task.primitives.rests[mode] or (task.limits.way == TOWING and mode > 0):
         return
     remaining = cost_to_go(task, pose[0], pose[1], pose[2], mode)
     for move in range(AHEAD, BEHIND - 1 if task.limits.way != SIDEWAYS else BEHIND, -1):
-        snap = snap_of(task.limits, task.goal, pose[0], pose[1], pose[2], 1.0 if move == AHEAD else -1.0)
-        steps = snap_steps(snap)
+        steps = stretch_steps(task, pose[0], pose[1], pose[2], move)
         # A long one is seldom free: nodes that are near to each other need not all try.
-        if steps <= 1.25 * remaining + 20 and (steps <= SHORT or node % EVERY == 0):
+        if 0 < steps <= 1.25 * remaining + 20 and (steps <= SHORT or node % EVERY == 0):
             _follow(task, nodes, traffic, node, move)
 
 
@@ -132,41 +133,43 @@ def _soonest(task: Task, traffic: Traffic, nodes: Nodes) -> int:
     goal, pose = task.goal, nodes.swept[0]
     if np.isnan(goal.heading):
         return 0
+    for i in range(3, POSE_SIZE):
+        pose[i] = 0.0
     pose[0], pose[1], pose[2] = goal.x, goal.y, goal.heading
     return safe_since(task.body, traffic, pose, nodes.buffer)
 
 
 @compiled
-def _begin(task: Task, traffic: Traffic, nodes: Nodes, start: Floats) -> None:
-    """Begin at a pose ``(3,)``, at rest; there is no node if the robot cannot stay there for a step."""
+def _begin(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode: int) -> None:
+    """Begin at a pose ``(6,)``, at rest; there is no node if the robot cannot stay there for a step."""
     nodes.filled[0], nodes.heap.filled[0] = 0, 0
     until = safe_until(task.body, traffic, 0, start, nodes.buffer)
     nodes.soonest[0] = _soonest(task, traffic, nodes)
     if until > 0 and nodes.soonest[0] <= task.horizon:
-        add(task, nodes, start[0], start[1], start[2], 0, 0, until, -1, -1, 0)
+        add(task, nodes, pose_of(start), mode, 0, until, -1, -1, 0)
 
 
 @cached_kernel(**OPTIONS)
-def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, goes_on: bool) -> int:
-    """Look for a motion from a pose ``(3,)`` at rest to the goal, where the robot stays; or go on looking for it.
+def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode: int, goes_on: bool) -> int:
+    """Look for a motion from a pose ``(6,)`` at rest to the goal, where the robot stays; or go on looking for it.
 
     Returns:
         The node at its end; :data:`NOTHING` if there is none or no more room for nodes; or :data:`PAUSED`.
     """
     if not goes_on:
-        _begin(task, traffic, nodes, start)
+        _begin(task, traffic, nodes, start, mode)
     for _ in range(PATIENCE):
         if nodes.heap.filled[0] == 0 or nodes.filled[0] >= nodes.mode.shape[0]:
             return NOTHING
         _, node = pop(nodes.heap)
         if nodes.mode[node] < 0:
             return node
-        x, y, heading = nodes.pose[node]
+        x, y, heading = nodes.pose[node, 0], nodes.pose[node, 1], nodes.pose[node, 2]
         cell = cell_of(task.lattice, x, y, heading, nodes.mode[node])
         if is_dominated(nodes, slot_of(nodes, cell, task.number), task.number, node, nodes.time[node] - 1):
             continue
-        rests = task.primitives.rests[nodes.mode[node]]
-        if rests and nodes.until[node] == NEVER and reaches(task.goal, x, y, heading, 0.0, 1.0):
+        ends = task.primitives.rests[nodes.mode[node]] and (task.limits.way != TOWING or nodes.mode[node] == 0)
+        if ends and nodes.until[node] == NEVER and reaches(task.goal, x, y, heading, 0.0, 1.0):
             return node
         _snaps(task, nodes, traffic, node)
         begin, end = task.primitives.begin[nodes.mode[node]], task.primitives.begin[nodes.mode[node] + 1]
@@ -177,11 +180,11 @@ def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, goes_
 
 @cached_kernel(**OPTIONS)
 def trace(task: Task, nodes: Nodes, node: int, poses: FloatArray) -> None:
-    """Fill in the poses ``(T + 1, 3)`` of the motion that ends in a node, at all ``T`` steps."""
+    """Fill in the poses ``(T + 1, 6)`` of the motion that ends in a node, at all ``T`` steps."""
     last = poses.shape[0] - 1
     while True:
         for step in range(nodes.time[node], last + 1):
-            for i in range(3):
+            for i in range(POSE_SIZE):
                 poses[step, i] = nodes.pose[node, i]
         last = nodes.time[node] - 1
         above = nodes.parent[node]
@@ -190,7 +193,7 @@ def trace(task: Task, nodes: Nodes, node: int, poses: FloatArray) -> None:
         depart = nodes.depart[node]
         sweep(task, nodes, above, nodes.move[node])
         for step in range(depart + 1, last + 1):
-            for i in range(3):
+            for i in range(POSE_SIZE):
                 poses[step, i] = nodes.swept[step - depart, i]
         last = depart
         node = above
@@ -200,3 +203,9 @@ def trace(task: Task, nodes: Nodes, node: int, poses: FloatArray) -> None:
 def snap_from(limits: Limits, goal: Goal, x: float, y: float, heading: float, move: int) -> Snap:
     """The last stretch from a pose, as one of the moves."""
     return snap_of(limits, goal, x, y, heading, -1.0 if move == BEHIND else 1.0)
+
+
+@cached_kernel(**OPTIONS)
+def curve_from(curves: Curves, goal: Goal, x: float, y: float, heading: float, move: int) -> Curve:
+    """The same of a robot with trailers."""
+    return curve_of(curves, goal, x, y, heading, -1.0 if move == BEHIND else 1.0)

@@ -6,32 +6,39 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.engine.compiling import compiled
 from d4orm_env.engine.elementary import arctan2
 from d4orm_planners.manoeuvres.lattice import turned_by
 
-NOWHERE, TURNING, SIDEWAYS = range(3)
-"""Robots that cannot turn on the spot and have no last stretch; those that can; those that need not."""
-NEAR = 1e-5
-"""Distance from the goal that needs no drive [m]."""
+NOWHERE, TURNING, SIDEWAYS, TOWING = range(4)
+"""Robots that cannot turn on the spot and have no last stretch; those that can; those that need not; those that pull
+trailers, whose last stretch is in :mod:`~d4orm_planners.manoeuvres.curves`."""
+NEAR = 1e-3
+"""Distance from the goal that needs no drive, in its radius."""
 
 
 class Limits(NamedTuple):
     """What a robot can do.
 
     Attributes:
-        way: One of :data:`NOWHERE`, :data:`TURNING` and :data:`SIDEWAYS`.
+        way: One of :data:`NOWHERE`, :data:`TURNING`, :data:`SIDEWAYS` and :data:`TOWING`.
         speed: [m/s].
+        reverse: Speed backwards [m/s].
         acceleration: [m/s^2], infinite for first-order robots.
-        turn_rate: [rad/s].
+        left: Turn rate to the left [rad/s].
+        right: The same to the right.
+        turn_acceleration: [rad/s^2], infinite for robots that take any turn rate at once.
         dt: Time step [s].
     """
 
     way: int
     speed: float
+    reverse: float
     acceleration: float
-    turn_rate: float
+    left: float
+    right: float
+    turn_acceleration: float
     dt: float
 
 
@@ -57,9 +64,10 @@ class Goal(NamedTuple):
     docks: bool
 
 
-Snap: TypeAlias = tuple[int, float, int, int, float, float, float, int, float]
-"""Steps and angle of the first turn; steps to speed up and at full speed, signed length, and its direction; steps and
-angle of the last turn."""
+Leg: TypeAlias = tuple[int, int, float]
+"""Steps to speed up, and as many to brake; those at full speed; and the signed length or angle."""
+Snap: TypeAlias = tuple[Leg, Leg, Leg, float, float]
+"""The first turn, the drive, the last turn, and the direction of the drive."""
 
 
 @compiled
@@ -68,12 +76,34 @@ def _steps(amount: float, per_step: float) -> int:
 
 
 @compiled
+def _leg(amount: float, speed: float, acceleration: float, dt: float) -> Leg:
+    """From rest to rest."""
+    length, ramp, cruise = abs(amount), 0, _steps(amount, speed * dt)
+    if length > 0.0 and acceleration < np.inf:
+        ramp = max(1, _steps(speed, acceleration * dt))
+        if length < speed * ramp * dt:
+            ramp = max(1, int(np.ceil(np.sqrt(length / acceleration) / dt - 1e-6)))
+        cruise = max(0, cruise - ramp)
+    return ramp, cruise, amount
+
+
+@compiled
+def _turn(limits: Limits, angle: float) -> Leg:
+    return _leg(angle, limits.left if angle > 0 else limits.right, limits.turn_acceleration, limits.dt)
+
+
+@compiled
+def _leg_steps(leg: Leg) -> int:
+    return 2 * leg[0] + leg[1]
+
+
+@compiled
 def snap_of(limits: Limits, goal: Goal, x: float, y: float, heading: float, way: float) -> Snap:
     """The last stretch from a pose at rest, forwards (``way`` is 1) or backwards (-1)."""
     dx, dy = goal.x - x, goal.y - y
     distance = np.sqrt(dx * dx + dy * dy)
-    turn, end = 0.0, heading
-    if distance > NEAR:
+    turn = end = 0.0
+    if distance > NEAR * goal.radius:
         dx, dy = dx / distance, dy / distance
     else:
         dx, dy, distance = 0.0, 0.0, 0.0
@@ -82,28 +112,20 @@ def snap_of(limits: Limits, goal: Goal, x: float, y: float, heading: float, way:
             wanted = np.float64(arctan2(np.float32(way * dy), np.float32(way * dx)))
             turn = turned_by(wanted - heading)
         end = turned_by(goal.heading - heading - turn) if not np.isnan(goal.heading) else 0.0
-    else:
-        end = 0.0
-    ramp, cruise = 0, _steps(distance, limits.speed * limits.dt)
-    if distance > 0.0 and limits.acceleration < np.inf:
-        ramp = max(1, _steps(limits.speed, limits.acceleration * limits.dt))
-        if distance < limits.speed * ramp * limits.dt:
-            ramp = max(1, int(np.ceil(np.sqrt(distance / limits.acceleration) / limits.dt - 1e-6)))
-        cruise = max(0, cruise - ramp)
-    rate = limits.turn_rate * limits.dt
-    return _steps(turn, rate), turn, ramp, cruise, way * distance, dx, dy, _steps(end, rate), end
+    drive = _leg(way * distance, limits.speed if way > 0 else limits.reverse, limits.acceleration, limits.dt)
+    return _turn(limits, turn), drive, _turn(limits, end), dx, dy
 
 
 @compiled
 def snap_steps(snap: Snap) -> int:
     """Steps that it takes."""
-    return snap[0] + 2 * snap[2] + snap[3] + snap[7]
+    return _leg_steps(snap[0]) + _leg_steps(snap[1]) + _leg_steps(snap[2])
 
 
 @compiled
-def _share(snap: Snap, step: int) -> tuple[float, float]:
-    """Share of the drive that is behind after so many steps of it, and the speed as a share of the highest."""
-    ramp, cruise = snap[2], snap[3]
+def _share(leg: Leg, step: int) -> tuple[float, float]:
+    """Share of a leg that is behind after so many steps of it, and the speed as a share of the highest."""
+    ramp, cruise, _ = leg
     if ramp == 0:
         return step / max(cruise, 1), 1.0
     whole = float(ramp + cruise)
@@ -116,29 +138,42 @@ def _share(snap: Snap, step: int) -> tuple[float, float]:
 
 
 @compiled
+def _gone(leg: Leg, step: int) -> float:
+    """Length or angle after so many steps of a leg; before it begins none, and when it has ended all."""
+    count = _leg_steps(leg)
+    return leg[2] * _share(leg, max(0, min(step, count)))[0] if count > 0 else 0.0
+
+
+@compiled
 def snap_pose(limits: Limits, snap: Snap, x: float, y: float, heading: float, step: int) -> tuple[float, ...]:
-    """Pose and speed after so many steps of it; the heading is not wound up."""
-    turn_steps, turn, ramp, cruise, length, dx, dy, end_steps, end = snap
-    if step <= turn_steps and turn_steps > 0:
-        return x, y, heading + turn * step / turn_steps, 0.0
-    drive = 2 * ramp + cruise
-    at = min(step - turn_steps, drive)
-    share, pace = _share(snap, at)
-    gone, top = share * abs(length), abs(length) / (max(ramp + cruise, 1) * limits.dt)
-    faced, late = heading + turn, step - turn_steps - drive
-    if late > 0:
-        faced, pace = faced + end * late / end_steps, 0.0
-    return x + gone * dx, y + gone * dy, faced, pace * top
+    """Position, heading and speed after so many steps of it; the heading is not wound up."""
+    turn, drive, end, dx, dy = snap
+    at = step - _leg_steps(turn)
+    late, gone, pace = at - _leg_steps(drive), abs(_gone(drive, at)), 0.0
+    if at > 0 >= late:
+        top = abs(drive[2]) / (max(drive[0] + drive[1], 1) * limits.dt)
+        pace = _share(drive, at)[1] * top
+    return x + gone * dx, y + gone * dy, heading + _gone(turn, step) + _gone(end, late), pace
 
 
-def snap_controls(limits: Limits, snap: Snap, first_order: bool) -> FloatArray:
-    """``(n, 2)`` its controls: speed, or acceleration, and turn rate; for robots without a heading along x and y."""
-    turn_steps, turn, ramp, cruise, length, dx, dy, end_steps, end = snap
-    rows = [np.tile([0.0, turn / (max(turn_steps, 1) * limits.dt)], (turn_steps, 1))]
-    top = length / (max(ramp + cruise, 1) * limits.dt)
-    push = top / (max(ramp, 1) * limits.dt)
-    pushes = [top] * cruise if first_order else [push] * ramp + [0.0] * cruise + [-push] * ramp
+def _leg_controls(leg: Leg, dt: float, first_order: bool) -> Floats:
+    """``(n,)`` speeds or accelerations."""
+    ramp, cruise, amount = leg
+    top = amount / (max(ramp + cruise, 1) * dt)
+    if first_order:
+        return np.full(cruise, top)
+    push = top / (max(ramp, 1) * dt)
+    return np.array([push] * ramp + [0.0] * cruise + [-push] * ramp)
+
+
+def snap_controls(limits: Limits, snap: Snap) -> FloatArray:
+    """``(n, 2)`` its controls: speed, or acceleration, and turn rate, or its change; for robots without a heading along
+    x and y.
+    """
+    turn, drive, end, dx, dy = snap
+    turns_at_once = limits.turn_acceleration == np.inf
     direction = (dx, dy) if limits.way == SIDEWAYS else (1.0, 0.0)
-    rows.append(np.array(pushes).reshape(-1, 1) * np.array([direction]))
-    rows.append(np.tile([0.0, end / (max(end_steps, 1) * limits.dt)], (end_steps, 1)))
+    driven = _leg_controls(drive, limits.dt, limits.acceleration == np.inf)
+    rows = [np.outer(_leg_controls(leg, limits.dt, turns_at_once), (0.0, 1.0)) for leg in (turn, end)]
+    rows.insert(1, np.outer(driven, direction))
     return np.concatenate(rows).astype(np.float32)

@@ -10,18 +10,21 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_planners.manoeuvres.curves import curve_controls
+from d4orm_planners.manoeuvres.lattice import buffer_size
 from d4orm_planners.manoeuvres.nodes import Nodes, Task
-from d4orm_planners.manoeuvres.robots import Robot, area_of, distance_kept, make_robot, plain_arrays
-from d4orm_planners.manoeuvres.search import PAUSED, find_motion, snap_from, trace
-from d4orm_planners.manoeuvres.snapping import snap_controls
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE
+from d4orm_planners.manoeuvres.robots import Robot, Scene, make_robot, scene_of
+from d4orm_planners.manoeuvres.search import PAUSED, curve_from, find_motion, snap_from, trace
+from d4orm_planners.manoeuvres.snapping import TOWING, snap_controls
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, traffic_of
 from d4orm_planners.mapf.lns import Odds
 
 MAX_NODES = 100_000
 """Nodes after which a search gives up, ..."""
 FIRST_NODES = 400_000
-"""... and at first a robot's share of so many, once more after every four searches of each: in a large team it is
-quicker to change others' motions."""
+"""... and among others at first a robot's share of so many, once more after every four searches of each: in a large
+team it is quicker to change others' motions."""
 WEIGHT = 1.5
 """Times that the steps ahead count more than those behind."""
 PATIENCE = 0.7
@@ -33,7 +36,7 @@ class Motion:
     """A robot's motion.
 
     Attributes:
-        poses: ``(T + 1, 3)`` float32.
+        poses: ``(T + 1, 6)`` float32.
         controls: ``(T, m)``.
     """
 
@@ -50,7 +53,8 @@ class TeamMotions:
     """The motions of a team, as a low-level planner of :mod:`~d4orm_planners.mapf.lns`.
 
     Args:
-        problem: The problem.
+        scene: What all robots share.
+        robots: What the search knows of each.
         should_stop: Whether time is up.
 
     Attributes:
@@ -61,12 +65,13 @@ class TeamMotions:
 
     groups = 1
 
-    def __init__(self, problem: Problem, robots: list[Robot], reach: float, should_stop: Callable[[], bool]) -> None:
-        self.problem, self.robots, self.should_stop = problem, robots, should_stop
-        self._area, self._reach = area_of(problem), reach
-        self._nodes, self._searches = Nodes.of(MAX_NODES), 0
+    def __init__(self, scene: Scene, robots: list[Robot], should_stop: Callable[[], bool]) -> None:
+        self.problem, self.robots, self.should_stop = scene.problem, robots, should_stop
+        self._area, self._reach, problem = scene.area, scene.reach, scene.problem
+        self._nodes = Nodes.of(MAX_NODES, buffer_size(problem.team.all_footprint_arrays))
+        self._searches = 0
         size, horizon = problem.num_robots, problem.horizon
-        self._poses = np.empty((size, horizon + 1, 3), np.float32)
+        self._poses = np.empty((size, horizon + 1, POSE_SIZE), np.float32)
         self._poses[:] = np.array([robot.start for robot in self.robots])[:, None]
         self.motions: list[Motion | None] = [None] * size
         self.alone = [self._find(robot, (), {}) for robot in range(size)]
@@ -74,19 +79,20 @@ class TeamMotions:
     @classmethod
     def prepared(cls, problem: Problem, should_stop: Callable[[], bool]) -> TeamMotions | None:
         """A team without motions; ``None`` if time is up, or a robot has none even alone."""
-        area, extra, largest = area_of(problem), distance_kept(problem), float(problem.team.radius.max())
-        arrays, robots = plain_arrays(problem, largest + extra), {}
+        scene = scene_of(problem)
+        robots: dict[int, Robot] = {}
 
         def prepare(part: IntArray) -> None:
             for number in range(part[0], part[1]):
-                if not should_stop():
-                    robots[number] = make_robot(problem, number, area, arrays, extra)
+                robot = None if should_stop() else make_robot(scene, number)
+                if robot is not None:
+                    robots[number] = robot
 
         Threads(available_cores()).over(problem.num_robots, prepare)
         if len(robots) < problem.num_robots:
             return None
         everybody = [robots[number] for number in range(problem.num_robots)]
-        team = cls(problem, everybody, 2 * largest + extra + 2 * problem.stride, should_stop)
+        team = cls(scene, everybody, should_stop)
         return None if any(motion is None for motion in team.alone) else team
 
     @property
@@ -182,15 +188,15 @@ class TeamMotions:
         patience = max(1, round(PATIENCE * float(problem.team.radius.max()) / problem.stride))
         self._searches += 1
         task = Task(
-            robot.body, robot.primitives, robot.limits, robot.goal, robot.lattice, robot.costs, robot.far,
-            robot.costs_lattice, WEIGHT, patience, problem.horizon, self._searches,
+            robot.body, robot.primitives, robot.limits, robot.curves, robot.goal, robot.lattice, robot.costs, WEIGHT,
+            patience, problem.horizon, self._searches,
         )  # fmt: skip
         self._nodes.filled[0] = 0
         traffic, goes_on, node = self._traffic(others, held), False, PAUSED
         team = len(self.robots)
-        most = FIRST_NODES // team * (1 + self._searches // (4 * team))
+        most = MAX_NODES if self._searches <= team else FIRST_NODES // team * (1 + self._searches // (4 * team))
         while node == PAUSED and self._nodes.filled[0] < most and not self.should_stop():
-            node = find_motion(task, traffic, self._nodes, robot.start, goes_on)
+            node = find_motion(task, traffic, self._nodes, robot.start, robot.mode, goes_on)
             goes_on = True
         return None if node < 0 else self._motion(robot, task, node)
 
@@ -205,7 +211,7 @@ class TeamMotions:
             since, until = int(nodes.depart[last]), int(nodes.time[last])
             pose = nodes.pose[nodes.parent[last]].tolist()
             controls[since:until] = _controls(robot, int(nodes.move[last]), pose)[: until - since]
-        poses = np.empty((steps + 1, 3), np.float32)
+        poses = np.empty((steps + 1, POSE_SIZE), np.float32)
         trace(task, nodes, node, poses)
         return Motion(poses, controls)
 
@@ -224,6 +230,9 @@ def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:
     if move >= 0:
         first, end = robot.primitives.first[move : move + 2]
         return robot.primitives.controls[first:end]
-    snap = snap_from(robot.limits, robot.goal, pose[0], pose[1], pose[2], move)
-    controls = snap_controls(robot.limits, snap, robot.model.first_order)
+    x, y, heading = pose[0], pose[1], pose[2]
+    if robot.limits.way == TOWING:
+        curve = curve_from(robot.curves, robot.goal, x, y, heading, move)
+        return curve_controls(robot.curves, curve, robot.limits.dt)
+    controls = snap_controls(robot.limits, snap_from(robot.limits, robot.goal, x, y, heading, move))
     return controls[:, ::-1] if robot.model.name == "differential_drive" else controls

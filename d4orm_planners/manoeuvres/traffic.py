@@ -8,10 +8,10 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled
 from d4orm_env.engine.convex_cores import cores_within, place_body
 from d4orm_env.engine.simd import TILE
-from d4orm_planners.manoeuvres.lattice import RobotBody, direction, turned_by
+from d4orm_planners.manoeuvres.lattice import Pose, RobotBody, hitch_of, placed_first, placed_next, pose_between
 
 NEVER = 1 << 40
 """Step that never comes."""
@@ -21,7 +21,7 @@ class Traffic(NamedTuple):
     """The motions of others, and a grid of who comes near to its cells when.
 
     Attributes:
-        poses: ``(K, T + 1, 3)`` float32.
+        poses: ``(K, T + 1, 6)`` float32.
         last: ``(K,)`` number of the last step at which each moves; it stays there, ...
         gone: ``(K,)`` ... but is there no more from this step on.
         end: The last step at which anything changes.
@@ -82,7 +82,7 @@ def count_visits(
 
 
 def traffic_of(poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, high: Floats, reach: float) -> Traffic:
-    """The motions of robots ``(K, T + 1, 3)``; who has none moves last at step -1."""
+    """The motions of robots ``(K, T + 1, 6)``; who has none moves last at step -1."""
     counted = np.maximum(np.ceil((high - low) / reach), 1)
     size = (int(counted[0]), int(counted[1]))
     cells = size[0] * size[1]
@@ -116,22 +116,17 @@ def _meets(
     far = reach + np.float32(2 * body.stride)
     if dx * dx + dy * dy > far * far:
         return False
-    turn, its_turn = turned_by(after[2] - before[2]), turned_by(np.float64(end[2]) - begin[2])
     for part in range(parts):
-        back = part / parts
-        x = np.float32(after[0] - back * (after[0] - before[0]))
-        y = np.float32(after[1] - back * (after[1] - before[1]))
-        dx = np.float32(end[0] - back * (end[0] - begin[0])) - x
-        dy = np.float32(end[1] - back * (end[1] - begin[1])) - y
-        headings = (after[2] - back * turn, end[2] - back * its_turn)
-        if dx * dx + dy * dy <= reach * reach and _touches(body, other, headings, dx, dy, buffer):
+        pose, its_pose = pose_between(before, after, part / parts), pose_between(begin, end, part / parts)
+        dx, dy = np.float32(its_pose[0]) - np.float32(pose[0]), np.float32(its_pose[1]) - np.float32(pose[1])
+        if dx * dx + dy * dy <= reach * reach and _touches(body, other, pose, its_pose, dx, dy, buffer):
             return True
     return False
 
 
 @compiled
 def _touches(
-    body: RobotBody, other: Whole, headings: tuple[float, float], dx: np.float32, dy: np.float32, buffer: FloatArray
+    body: RobotBody, other: Whole, pose: Pose, its_pose: Pose, dx: np.float32, dy: np.float32, buffer: FloatArray
 ) -> bool:
     """Check whether another robot, offset by ``(dx, dy)`` from this one, is too near to it."""
     f, k = body.footprints, body.robot
@@ -139,10 +134,19 @@ def _touches(
     if dx * dx + dy * dy <= inner * inner:
         return True
     own, core = buffer[:TILE], buffer[TILE : 2 * TILE]
-    (c, s), (its_c, its_s) = direction(body, k, headings[0]), direction(body, other, headings[1])
-    place_body(f, k, c, s, np.float32(0), np.float32(0), own)
-    place_body(f, other, its_c, its_s, dx, dy, core)
-    return cores_within(own, core, body.extra)
+    i, number, placed = np.int64(k), 0, placed_first(body, k, pose[2], ZERO, ZERO)
+    while i >= 0:
+        place_body(f, i, placed[0], placed[1], placed[2], placed[3], own)
+        j, its_number, its = np.int64(other), 0, placed_first(body, other, its_pose[2], dx, dy)
+        while j >= 0:
+            place_body(f, j, its[0], its[1], its[2], its[3], core)
+            if cores_within(own, core, body.extra):
+                return True
+            its = placed_next(body, j, its, hitch_of(its_pose, its_number))
+            j, its_number = np.int64(f.following[j]), its_number + 1
+        placed = placed_next(body, i, placed, hitch_of(pose, number))
+        i, number = np.int64(f.following[i]), number + 1
+    return False
 
 
 @compiled

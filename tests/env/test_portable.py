@@ -46,6 +46,12 @@ def test_sine_and_cosine_next_to_multiples_of_half_pi() -> None:
     assert ulps(portable.cos(x), np.array([math.cos(value) for value in x])) <= 2
 
 
+@pytest.mark.parametrize("x", [SIGNED, spread(8, -8, 7)[:2000], np.arange(-100, 100) * (np.pi / 2)])
+def test_one_number_has_the_same_sine_and_cosine_as_in_an_array(x: np.ndarray) -> None:
+    alone = np.array([portable.sin_cos_of(value) for value in x.tolist()]).T
+    assert alone.tobytes() == np.array(portable.sin_cos(x)).tobytes()
+
+
 def test_the_number_closest_to_a_multiple_of_half_pi() -> None:
     # J.-M. Muller, Elementary Functions: the worst case of all float64 for the reduction of arguments.
     assert portable.cos(6381956970095103 * 2.0**797) == -4.68716592425462761112e-19

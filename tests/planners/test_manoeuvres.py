@@ -10,10 +10,14 @@ import pytest
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.footprints import Box
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.footprints import Box, Train
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
-from d4orm_planners.manoeuvres.primitives import MOVES, Kind, primitives_of
+from d4orm_planners.manoeuvres.curves import curves_of
+from d4orm_planners.manoeuvres.kinds import Kind
+from d4orm_planners.manoeuvres.model_moves import MOVES
+from d4orm_planners.manoeuvres.primitives import primitives_of
 from d4orm_planners.manoeuvres.robots import can_plan
 
 CORRIDOR = [[0.0, 1.0, 6.0, 1.5], [0.0, -0.5, 2.5, 0.3], [3.8, -0.5, 6.0, 0.3]]
@@ -64,15 +68,51 @@ def test_a_car_backs_into_its_place() -> None:
     assert plan.trajectory.states[:, 0, 3].min() < 0
 
 
+def kind_of(model: str) -> Kind:
+    """A robot with a model's usual limits, at rest."""
+    own = [limit.default for limit in MODELS[model].own_limits]
+    extra = MODELS[model].state_size - (2 if MODELS[model].heading_index is None else 3)
+    return Kind(model, (1.0, 1.0, 1.5, *own), 0.1, 0.1, (0.0,) * extra)
+
+
 @pytest.mark.parametrize("model", MOVES)
 def test_primitives_lead_back_where_they_began(model: str) -> None:
     """Those backwards in time undo those ahead: every position is passed in both, and the steps are as many."""
-    ahead, back, modes = primitives_of(Kind(model, (1.0, 1.0, 1.5, 0.6, 1.0, 0.3), 0.1, 0.1))
+    ahead, back, modes = primitives_of(kind_of(model))
     assert len(ahead.begin) == len(back.begin) == len(modes) + 1
     assert ahead.rests[0]
     ends = np.linalg.norm(ahead.poses[ahead.first[1:] - 1, :2], axis=1)
     for end in np.linalg.norm(back.poses[back.first[1:] - 1, :2], axis=1):
         assert np.abs(ends - end).min() < 1e-9
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_swings_end_at_the_hitch_angles_of_a_circle(count: int) -> None:
+    """There, held to its steering angle, the model goes on in the circle with trailers as they are."""
+    kind = kind_of(f"car_with_{count}_trailer" + "s" * (count > 1))
+    curves = curves_of(kind)
+    for circle in range(len(curves.curvature)):
+        middle, end = curves.begin[2 * circle + 1 : 2 * circle + 3]
+        last = (0.0, 0.0, 0.0, *curves.poses[middle - 1, 3 : 3 + count])
+        control = np.array([[curves.stride[circle] / kind.dt, curves.steering[circle]]], np.float32)
+        np.testing.assert_allclose(kind.states(last, control)[-1][3:], last[3:], atol=1e-5)
+        np.testing.assert_allclose(curves.poses[end - 1, 3:], 0.0, atol=1e-5)
+
+
+def trailers(start: Any, goal: Any, **arguments: Any) -> Problem:
+    """Cars with a trailer that reverse slowly; starts ``(x, y, heading, hitch)``, goals ``(x, y, heading)``."""
+    goals, footprint = np.array(goal, float), Train(Box(0.5, 0.25), [Box(0.3, 0.25)])
+    own = {"max_reverse_speed": 0.1, "wheelbase": 0.25, "max_steering": 1.0}
+    team = Team(("car_with_1_trailer",) * len(goals), max_speed=0.5, own_limits=own, footprint=footprint)
+    usual = {"margin": 0.0, "goal_radius": 0.01, "goal_heading_tolerance": 0.01, "arrival": "stay", "horizon": 400}
+    world = World(lower=(0.0, 0.0), upper=(5.0, 5.0))
+    return Problem(team, start, goals[:, :2], world, goal_heading=goals[:, 2], **usual | arguments)
+
+
+def test_cars_with_trailers_swap() -> None:
+    start = [[1.0, 2.5, 0.0, 0.2], [4.0, 2.5, np.pi, 0.0]]
+    plan = solved(trailers(start, [[4.0, 2.5, 0.0], [1.0, 2.5, np.pi]]))
+    np.testing.assert_allclose(plan.trajectory.states[-1, :, 3], 0.0, atol=0.01)
 
 
 def test_discs_without_headings_are_planned_otherwise() -> None:

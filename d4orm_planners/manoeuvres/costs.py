@@ -1,0 +1,72 @@
+"""Time to a robot's goal from all poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.dynamics.robot_model import SPEED
+from d4orm_planners.manoeuvres.heaps import Heap
+from d4orm_planners.manoeuvres.kinds import SECTOR, SECTORS, Kind
+from d4orm_planners.manoeuvres.lattice import PoseLattice, RobotBody, buffer_size, fill_costs
+from d4orm_planners.manoeuvres.primitives import Primitives, primitives_of
+from d4orm_planners.manoeuvres.snapping import Goal
+
+TEAM_CELLS, LEAST_CELLS, MOST_CELLS = 4_000_000, 150_000, 400_000
+"""Cells of the costs of all robots together, and the least and the most of one: a larger world has larger cells."""
+
+
+class Area(NamedTuple):
+    """The room that robots may use, and the largest cell that a lattice of it needs [m]."""
+
+    low: Floats
+    high: Floats
+    cell: float
+
+    def lattice(self, cell: float, heading: float, sectors: int, modes: int) -> PoseLattice:
+        """Cells of this size over all of it."""
+        size = np.ceil((self.high - self.low) / cell).astype(int).tolist()
+        return PoseLattice(self.low, 1 / cell, (size[0], size[1]), heading, sectors, modes)
+
+
+class Costs(NamedTuple):
+    """Steps to a goal.
+
+    Attributes:
+        lattice: Cells.
+        steps: ``(cells,)``.
+        far: Steps from where that is not known, at least.
+    """
+
+    lattice: PoseLattice
+    steps: FloatArray
+    far: float
+
+
+def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal, team_size: int) -> Costs:
+    """Steps to a goal for a robot that starts at a pose ``(6,)``, in a team of so many."""
+    layers = SECTORS if kind.model.heading_index is not None else 1
+    modes, cells = primitives_of(kind)[2], np.clip(TEAM_CELLS / team_size, LEAST_CELLS, MOST_CELLS)
+    size = np.prod(area.high - area.low) * len(modes) * layers
+    cell = max(area.cell, round(float(np.sqrt(size / cells)), 3))
+    lattice = area.lattice(cell, 0.0 if np.isnan(goal.heading) else goal.heading, layers, len(modes))
+    back, pace = primitives_of(replace(kind, cell=cell))[1], 1 / (kind.limits[SPEED] * kind.dt)
+    steps, far = _spread(body, back, lattice, goal, start, modes.index(kind.start), pace)
+    return Costs(lattice, steps, far)
+
+
+def _spread(
+    body: RobotBody, back: Primitives, lattice: PoseLattice, goal: Goal, start: Floats, mode: int, pace: float
+) -> tuple[FloatArray, float]:
+    cells = lattice.modes * lattice.sectors * lattice.size[0] * lattice.size[1]
+    headings = [goal.heading] if not np.isnan(goal.heading) else np.arange(lattice.sectors) * SECTOR
+    goals = np.array([[goal.x, goal.y, heading] for heading in headings])
+    steps = np.full(cells, np.inf, np.float32)
+    far = fill_costs(
+        body, back, lattice, goals, start, pace, steps, np.empty((cells, 3)), Heap.of(2 * cells + 512), mode,
+        np.zeros(buffer_size(body.footprints), np.float32),
+    )  # fmt: skip
+    return steps, far

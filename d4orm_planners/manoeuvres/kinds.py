@@ -1,0 +1,92 @@
+"""What motion primitives depend on, and what they are before they are put in tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import ceil, pi, sqrt
+
+import numpy as np
+
+from d4orm_env.core import portable
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.dynamics.robot_model import ACCELERATION, PYTHON_OPS, SPEED, Model, TimeStep
+
+SECTORS = 32
+"""Headings that are told apart."""
+SECTOR = 2 * pi / SECTORS
+
+OPS = PYTHON_OPS._replace(
+    cos=lambda x: portable.sin_cos_of(x)[1],
+    sin=lambda x: portable.sin_cos_of(x)[0],
+)
+
+Mode = tuple[float, ...]
+"""What of a state is neither position nor heading: speeds, steering and hitch angles."""
+Move = tuple[Mode, Mode, FloatArray]
+"""Mode before, mode after, and ``(n, m)`` controls."""
+State = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What primitives depend on.
+
+    Attributes:
+        name: The model's name.
+        limits: Of the robot.
+        dt: Time step [s].
+        cell: Distance that should be told apart [m].
+        start: Mode that the robot starts in.
+    """
+
+    name: str
+    limits: tuple[float, ...]
+    dt: float
+    cell: float
+    start: Mode
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        return MODELS[self.name]
+
+    @property
+    def base(self) -> Kind:
+        """The same, whatever the cells and the start are."""
+        return replace(self, cell=0.0, start=())
+
+    @property
+    def lower(self) -> list[float]:
+        """Magnitudes that bound negative values."""
+        return self.model.lower_bounds(list(self.limits))
+
+    def pace(self, way: int) -> float:
+        """Speed limit forwards (``way`` is 1) or backwards (-1)."""
+        return self.limits[SPEED] if way > 0 else self.lower[SPEED]
+
+    def steps(self, amount: float, rate: float) -> int:
+        """Steps that an amount takes at this rate, at least one."""
+        return max(1, ceil(amount / (rate * self.dt) - 1e-6))
+
+    def speeding_up(self, speed: float) -> int:
+        """Steps from rest to a speed."""
+        return self.steps(speed, self.limits[ACCELERATION])
+
+    def hop(self, length: float, acceleration: float) -> tuple[int, float]:
+        """Steps to speed up, and as many to brake, so that a robot moves so far; and the speed in between."""
+        count = max(1, ceil(sqrt(length / acceleration) / self.dt - 1e-6))
+        return count, length / (count * self.dt)
+
+    def states(self, state: State, controls: FloatArray) -> list[State]:
+        """The ``n + 1`` states under ``(n, m)`` controls, by the model's own integration."""
+        h = TimeStep(self.dt, self.dt / 2, self.dt / 3, self.dt / 6)
+        states = [state]
+        for control in controls.astype(np.float64).tolist():
+            states.append(self.model.functions.integrate(states[-1], tuple(control), self.limits, h, OPS))
+        return states
+
+
+def held(count: int, *control: float) -> FloatArray:
+    """``(n, m)`` a control, for so many steps."""
+    return np.tile(np.array(control, np.float32), (count, 1))
