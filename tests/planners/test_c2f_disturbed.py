@@ -466,7 +466,7 @@ def test_the_paper_preset_is_algorithm_4() -> None:
     assert executed.metrics["success"], executed.metrics
     config = policy.config
     assert (config.num_samples, config.coarse_samples, config.credit, config.penalty) == (1024, 1024, "team", 1.0)
-    planner = policy._guide._planner.config
+    planner = policy._guide._planning.planner.config
     assert (planner.decoupling, planner.start, planner.credit, planner.weight_cutoff) == ("groups", "team", "team", 0.0)
     assert not any(loop.replanned for loop in policy.loops)
     # Line 7: one waypoint for the whole team.

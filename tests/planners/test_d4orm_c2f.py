@@ -24,7 +24,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
-from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
+from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
@@ -236,15 +236,15 @@ def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.Monk
 
 def test_no_loop_waits_for_a_new_coarse_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     policy, env = controller(deadline=0.2, replan_distance=2.0), navigation_v0.parallel_env(problem=circle(4))
-    plan, asked, released = CoarsePlanTracker.plan, threading.Event(), threading.Event()
+    plan, asked, released = CoarsePlanning.plan, threading.Event(), threading.Event()
 
-    def late(self: CoarsePlanTracker, joint: JointState, *rest: Any) -> Any:
+    def late(self: CoarsePlanning, problem: Problem, joint: JointState, *rest: Any) -> Any:
         if joint.steps:
             asked.set()
             assert released.wait(60)
-        return plan(self, joint, *rest)
+        return plan(self, problem, joint, *rest)
 
-    monkeypatch.setattr(CoarsePlanTracker, "plan", late)
+    monkeypatch.setattr(CoarsePlanning, "plan", late)
     observations, _ = env.reset(seed=0)
     policy.reset(env, seed=0)
     first = policy.guidance
@@ -359,16 +359,17 @@ def replanned(
 ) -> list[tuple[JointState, Any, int, Any, int]]:
     """Where it was replanned, from which controls and with how many iterations, and the guidance until then."""
     calls = []
-    plan = CoarsePlanTracker.plan
+    plan = CoarsePlanning.plan
 
     def coarse_plan(
-        self: CoarsePlanTracker, joint: JointState, docked: Any, initial: Any, iterations: int, *more: Any
-    ) -> Any:
+        self: CoarsePlanning, problem: Problem, joint: JointState, docked: Any, initial: Any, iterations: int,
+        *more: Any,
+    ) -> Any:  # fmt: skip
         if initial is not None:
-            calls.append((joint, initial.copy(), iterations, self.guidance, self.index))
-        return plan(self, joint, docked, initial, iterations, *more)
+            calls.append((joint, initial.copy(), iterations, policy._guide.guidance, policy._guide.index))
+        return plan(self, problem, joint, docked, initial, iterations, *more)
 
-    monkeypatch.setattr(CoarsePlanTracker, "plan", coarse_plan)
+    monkeypatch.setattr(CoarsePlanning, "plan", coarse_plan)
     world = navigation_v0.parallel_env(**env)
     observations, _ = world.reset(seed=0)
     policy.reset(world, seed=0)
@@ -502,7 +503,8 @@ def test_a_plan_that_comes_before_the_episode_ends_is_preferred(seed: int) -> No
     states = joint.states.copy()
     states[0, 2:] = -1.1, 0.0  # A push may make a robot faster than a problem lets it start.
     late = joint._replace(states=states, steps=env.max_cycles - left * policy.config.coarse_factor)
-    plan = policy._guide.plan(late, nobody, None, 20, thorough=True)
+    guide = policy._guide
+    plan = guide._planning.plan(guide.problem, late, nobody, None, 20, thorough=True)
     assert get_sampling_engine("cpu").rollout(plan.problem, plan.controls).arrived[left].all()
 
 
