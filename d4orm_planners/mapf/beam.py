@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
-from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.engine.compiling import compiled, inlined
 
 
 class Beam(NamedTuple):
@@ -45,16 +44,47 @@ class PathTree(NamedTuple):
     used: IntArray
 
 
-@register_jitable(nogil=True, **OPTIONS)
-def make_beam(size: int, n: int, d: int) -> Beam:
+class Space(NamedTuple):
+    """Workspace of a search.
+
+    Attributes:
+        beam: The paths kept after the last block.
+        numbers: ``(width,)`` their numbers among all ever kept.
+        new: Those that go on from there.
+        order: ``(N,)`` a heap of these.
+        ever: All ever kept.
+        did: ``(B,)`` the moves of the path found, the last first.
+        path: ``(block, d)`` places in a block.
+    """
+
+    beam: Beam
+    numbers: IntArray
+    new: Beam
+    order: IntArray
+    ever: PathTree
+    did: IntArray
+    path: FloatArray
+
+
+def _make_beam(size: int, n: int, d: int) -> Beam:
     return Beam(
         np.empty((size, n), np.float32), np.empty((size, d), np.float32), np.empty(size), np.empty(size),
         np.empty(size, np.int64), np.empty(size, np.int64),
     )  # fmt: skip
 
 
+def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int) -> Space:
+    """Space for a beam of so many paths, moves and blocks of steps."""
+    before, moves = np.empty((2, width * num_blocks), np.int64)
+    return Space(
+        _make_beam(width, n, d), np.empty(width, np.int64), _make_beam(width * num_moves, n, d),
+        np.empty(width * num_moves, np.int64), PathTree(before, moves, np.empty(1, np.int64)),
+        np.empty(num_blocks, np.int64), np.empty((block, d), np.float32),
+    )  # fmt: skip
+
+
 @compiled
-def _is_like_another(new: Beam, node: Whole, kept: Beam, size: int, dedup2: float) -> bool:
+def _is_like_another(new: Beam, node: Whole, kept: Beam, size: Whole, dedup2: float) -> bool:
     """Check whether a path is about where one of those kept is, about as fast."""
     for other in range(size):
         gap2, change2 = 0.0, 0.0
@@ -78,28 +108,51 @@ def _keep(new: Beam, node: Whole, kept: Beam, number: Whole) -> None:
     kept.before[number], kept.moves[number] = new.before[node], new.moves[node]
 
 
-@register_jitable(nogil=True, **OPTIONS)
-def keep_best(new: Beam, count: int, kept: Beam, numbers: IntArray, best: float, dedup2: float, ever: PathTree) -> int:
+@compiled
+def _sink(bounds: Floats, heap: IntArray, place: Whole, size: Whole) -> None:
+    """Let what is at a place of a heap sink below all that comes before it: lower bounds, then lower numbers."""
+    node = heap[place]
+    while 2 * place + 1 < size:
+        child = 2 * place + 1
+        if child + 1 < size:
+            left, right = heap[child], heap[child + 1]
+            if bounds[right] < bounds[left] or (bounds[right] == bounds[left] and right < left):
+                child += 1
+        other = heap[child]
+        if bounds[node] < bounds[other] or (bounds[node] == bounds[other] and node < other):
+            break
+        heap[place], place = other, child
+    heap[place] = node
+
+
+@inlined
+def keep_best(space: Space, count: Whole, best: float, dedup2: float) -> Whole:
     """Keep the most promising of ``count`` paths, of those that are alike the better one.
 
     Args:
-        new: The paths.
-        count: How many there are.
-        kept: The beam, output.
-        numbers: ``(width,)`` their numbers among all paths ever kept, output.
+        space: The paths, and the beam, output.
+        count: How many paths there are.
         best: Cost that a path must come below [s].
         dedup2: Square of the distance within which two are alike.
-        ever: All paths ever kept, changed.
 
     Returns:
         How many are kept.
     """
-    size = 0
-    for node in np.argsort(new.bounds[:count], kind="mergesort"):
+    new, ever, numbers, heap = space.new, space.ever, space.numbers, space.order
+    root = size = np.int64(0)  # literals would compile what they are passed to once more
+    for node in range(count):
+        heap[node] = node
+    for place in range(count // 2 - 1, -1, -1):
+        _sink(new.bounds, heap, place, count)
+    while count > 0:
+        node = heap[0]
         if size == numbers.shape[0] or new.bounds[node] >= best:
             break
-        if not _is_like_another(new, node, kept, size, dedup2):
-            _keep(new, node, kept, size)
+        count -= 1
+        heap[0] = heap[count]
+        _sink(new.bounds, heap, root, count)
+        if not _is_like_another(new, node, space.beam, size, dedup2):
+            _keep(new, node, space.beam, size)
             number = ever.used[0]
             ever.before[number], ever.moves[number], numbers[size] = new.before[node], new.moves[node], number
             ever.used[0], size = number + 1, size + 1

@@ -18,15 +18,16 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.stepping import Docking, docking_of, models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_checks import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
-from d4orm_planners.mapf.beam import PathTree, keep_best, make_beam, trace_back
+from d4orm_planners.mapf.beam import Space, keep_best, trace_back
 from d4orm_planners.mapf.motion_primitives import Moves, aiming
 from d4orm_planners.tracking.tracker import tracker, velocity_step
 
@@ -177,7 +178,7 @@ def _move_follower(model: Model) -> Callable[..., int]:
 
 
 Search: TypeAlias = Kernel[
-    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, FloatArray, FloatArray, BoolArray], None
+    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, Space, FloatArray, FloatArray, BoolArray], None
 ]
 """A kernel of :func:`search_kernel`."""
 
@@ -193,19 +194,17 @@ def search_kernel(name: str) -> Search:
     drive_block, follow = _block_driver(model), _move_follower(model)
     n, d, num_limits = model.state_size, model.dimension, len(model.limit_names)
 
-    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **WITHOUT_ARRAYS)
     def search(
         arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, part: IntArray,
-        u: FloatArray, x: FloatArray, found: BoolArray,
+        space: Space, u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
-        num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
+        arrays, table, moves = borrow(arrays), borrow(table), borrow(moves)
+        queries, space = borrow(queries), borrow(space)
+        num_blocks, num_moves = table.first.shape[0], moves.pace.shape[0]
+        zero: Whole = np.int64(0)  # a literal would compile what it is passed to once more
         last_busy = min(num_blocks - 1, table.moving[0] + 1)
-        beam, new = make_beam(width, n, d), make_beam(width * num_moves, n, d)
-        ever = PathTree(
-            np.empty(width * num_blocks, np.int64), np.empty(width * num_blocks, np.int64), np.empty(1, np.int64)
-        )
-        numbers, did = np.empty(width, np.int64), np.empty(num_blocks, np.int64)
-        path = np.empty((table.block, d), np.float32)
+        beam, new, ever, numbers, did, path = space.beam, space.new, space.ever, space.numbers, space.did, space.path
         for r in range(part[0], part[1]):
             robot, begin = queries.robots[r], queries.blocks[r]
             goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
@@ -213,10 +212,10 @@ def search_kernel(name: str) -> Search:
             at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
             for i in range(n):
                 beam.states[0, i] = queries.states[r, i]
-            beam.faults[0], numbers[0], size, ever.used[0] = 0.0, -1, 1, 0
-            best, best_number, best_move = queries.limits[r], -1, -1
+            beam.faults[0], numbers[0], size, ever.used[0] = 0.0, -1, zero + 1, 0
+            best, best_number, best_move = queries.limits[r], zero - 1, zero - 1
             for block in range(begin, num_blocks):
-                steps, count = steps_of(table, block), 0
+                steps, count = steps_of(table, block), zero
                 for node in range(size):
                     for number in range(num_moves):
                         state, velocity, at_goal, cost, faults = drive_block(
@@ -241,7 +240,7 @@ def search_kernel(name: str) -> Search:
                         new.faults[count], new.before[count], new.moves[count] = faults, numbers[node], number
                         count += 1
                 dedup2 = rules.dedup_distance * rules.dedup_distance
-                size = keep_best(new, count, beam, numbers, best, dedup2, ever)
+                size = keep_best(space, count, best, dedup2)
                 if size == 0:
                     break
             found[r] = best_move >= 0
