@@ -235,7 +235,8 @@ def cached_kernel(variant: str = "", key: str = "", **options: Any) -> Callable[
 
     def decorate(function: Callable[P, R_co]) -> Kernel[P, R_co]:
         function.__qualname__ += variant and f"_{variant}"
-        dispatcher = numba.njit(nogil=True, **options)(function)
+        # No C code calls a kernel.
+        dispatcher = numba.njit(nogil=True, **options | {"no_cfunc_wrapper": True})(function)
         if dispatcher is function:
             raise ImportError("NUMBA_DISABLE_JIT is set, but the kernels run only when compiled; unset it")
         with suppress(RuntimeError):

@@ -31,8 +31,10 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 fuse, sums are not regrouped, nothing is estimated; so a kernel gives the same bits on every processor, however wide its
 registers. What it costs is measured in docs/performance.md."""
 
-UNCOUNTED = OPTIONS | {
-    "_nrt": False,
+WITHOUT_ARRAYS: dict[str, Any] = OPTIONS | {"_nrt": False}
+"""Options for kernels that make no arrays: without numba's reference counts."""
+
+UNCOUNTED = WITHOUT_ARRAYS | {
     "no_cpython_wrapper": True,
     "no_cfunc_wrapper": True,
     "pipeline_class": PartCompiler,

@@ -134,7 +134,7 @@ def _near_indexed(
         sample = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
         x, y, z = places[sample], places[TILE + sample], places[third + sample]
-        if _touches(index, boxes, triangles, cells[sample], reach, x, y, z):
+        if _touches(index, boxes, triangles, np.int64(cells[sample]), reach, x, y, z):
             sure |= _BIT << np.uint64(sample)
     return sure
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -86,6 +87,7 @@ def _in_scalar_style(function: ModelFunction) -> ModelFunction:
     return integrate
 
 
+@cache
 def make_stepper(model: Model) -> tuple[Mover, Docker]:
     """The two halves of the compiled step of one robot of this model in one world, for a control within its limits.
 

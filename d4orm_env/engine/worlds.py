@@ -7,7 +7,7 @@ is a batch of one.
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,32 +15,39 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import COMMON, names_of_codes
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, aligned_zeros
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS
 from d4orm_env.engine.episodes import advance_worlds_kernel
 from d4orm_env.engine.observing import ObservationSpec, observe_worlds_kernel
 from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key, models_of_kernel
-from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, pose_rows, robot_mover
+from d4orm_env.engine.tiles import measure_goal_distance, robot_mover
 from d4orm_env.engine.types import ObservationInputs, WorldBatch
-from d4orm_env.engine.world_tiles import WorldArrays, allocate_boxes, check_contacts, load, load_world, store_world
+from d4orm_env.engine.world_tiles import WorldArrays, check_contacts, load, load_world, store_world
+
+RollOut: TypeAlias = Kernel[[ProblemArrays, WorldArrays, FloatArray, NDArray[np.uint64], FloatArray], None]
+"""A kernel of :func:`roll_out_kernel`."""
 
 
 @cache
-def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArrays], None]:
+def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
     """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
 
     ``moments`` is a :class:`WorldArrays` of ``H+1`` rows, of which the first is the start and has no control. The
     motion comes first; then 64 moments at a time are checked, as if they were worlds, as far as there are rewards.
+    ``w`` is zero, ``(K STRIDE + P TILE,)`` with ``P`` rows of poses, and ``near`` ``(K, 3)``: see
+    :mod:`~d4orm_env.engine.tiles`; ``boxes`` are of :func:`~d4orm_env.engine.world_tiles.allocate_boxes`.
     """
     move_robot = robot_mover(names)
 
-    @cached_kernel(variant="_".join(names), key=models_key(names), **OPTIONS)
-    def roll_out(arrays: ProblemArrays, moments: WorldArrays) -> None:
+    @cached_kernel(variant="_".join(names), key=models_key(names), **WITHOUT_ARRAYS)
+    def roll_out(
+        arrays: ProblemArrays, moments: WorldArrays, w: FloatArray, near: NDArray[np.uint64], boxes: FloatArray
+    ) -> None:
         use_wide_registers()
+        arrays, moments = borrow(arrays), borrow(moments)
         num_robots, dimension = arrays.goal.shape
-        w = aligned_zeros(num_robots * STRIDE + pose_rows(arrays.footprints) * TILE)
-        near, boxes = np.empty((num_robots, 3), np.uint64), allocate_boxes(arrays)
         lane = np.int64(0)  # a literal zero would compile what it is passed to once more
         state, docked = moments.state, moments.docked
         for t in range(1, state.shape[0]):
@@ -70,7 +77,7 @@ def roll_out_kernel(names: tuple[str, ...]) -> Kernel[[ProblemArrays, WorldArray
 class WorldKernels(NamedTuple):
     """The kernels that step and observe teams of some models."""
 
-    roll_out: Kernel[[ProblemArrays, WorldArrays], None]
+    roll_out: RollOut
     observe_worlds: Kernel[[ProblemArrays, ObservationInputs, ObservationSpec, IntArray, FloatArray], None]
     advance_worlds: Kernel[
         [ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-from d4orm_env import render
-from d4orm_env.scenarios import load_problem, make_problem
+from d4orm_env import render, scenarios
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import physics_module
 from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
@@ -142,12 +141,12 @@ class ProblemOptions:
             refuse_options(self.context, (*common, "scenario_settings"), reason)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", ".*nothing solves this problem")  # the commands tell it at their end
-                return load_problem(self.scenario)
+                return scenarios.load_problem(self.scenario)
         own = parse_settings(self.scenario_settings, "--scenario-set")
         for name in (*common, "seed"):
             if name in own:
                 raise ValueError(f"--scenario-set {name} is said by --{name.replace('_', '-')}; use that")
-        return make_problem(
+        return scenarios.make_problem(
             self.scenario, self.num_robots, self.seed, model=self.model, num_obstacles=self.num_obstacles, **own
         )
 

@@ -39,12 +39,15 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.engine.cpu_sampling import Sampling
+from d4orm_planners.engine.path_checks import check_alone
+from d4orm_planners.engine.path_index import PathIndex
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
 from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.tracking.steering import prepare_drives, standing
 from d4orm_planners.tracking.straight_drives import straight_kernel
 
 
@@ -89,38 +92,56 @@ def compile_for_planning(
     announce()
     # Either takes about half of the time. Should the other fail, its kernels are compiled when they are needed.
     drive, paths = f"drive_once({models!r}, {driver!r})", "; find_paths()" if walls else ""
-    other = _in_another_process(drive + paths if driver else f"roll_out_once({models!r})")
+    other = _in_another_process(drive + paths if driver else f"average_once({models!r}); roll_out_once({models!r})")
+    if driver:
+        # First what the other process needs too, later.
+        roll_out_once(models)
     if driver and walls:
         spread_waves()
     sample_once((models,))
-    roll_out_once(models)
     other.wait()
 
 
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     # What ends it, as Ctrl-C, ends this process too, which says so.
-    names = "drive_once, find_paths, roll_out_once, sample_once, spread_waves"
+    names = "average_once, drive_once, find_paths, roll_out_once, sample_once, spread_waves"
     return subprocess.Popen(
         [sys.executable, "-c", f"from {__name__} import {names}; {call}"], stderr=subprocess.DEVNULL
     )
 
 
 def roll_out_once(models: tuple[str, ...]) -> None:
-    """Roll out a plan of the smallest problem of a team of these models on the CPU.
+    """Roll out a plan of the smallest problem of a team of these models on the CPU."""
+    problem = _smallest_problem(models)
+    get_sampling_engine("cpu").rollout(problem, _no_controls(problem))
 
-    Samples are weighed and averaged here too, and first: a process that scores them needs that last.
-    """
+
+def average_once(models: tuple[str, ...]) -> None:
+    """Weigh and average samples, which a process that scores them needs last."""
     problem = _smallest_problem(models)
     rewards = np.zeros((1, 2), np.float32)
     run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
     run.moments(_RULES.weights(rewards, np), with_second=False)
-    get_sampling_engine("cpu").rollout(problem, _no_controls(problem))
 
 
 def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
     """Look for drives as a planner begins with, in the smallest problem of a team of these models."""
-    planner = make_planner(driver, engine="cpu")
-    planner.init(SolveRun(planner, _smallest_problem(models), seed=0))
+    planner, problem = make_planner(driver, engine="cpu"), _smallest_problem(models)
+    prepare_drives(problem)
+    _index_paths(problem)
+    # Last, because this rolls out, which another process compiles meanwhile.
+    planner.init(SolveRun(planner, problem, seed=0))
+
+
+def _index_paths(problem: Problem) -> None:
+    """Look for meetings and faults of robots that stay where they are."""
+    states, robots = standing(problem)[0], np.arange(problem.num_robots)
+    index = PathIndex(states[..., : problem.dimension], problem.team.radius, problem.margin)
+    index.pairs()
+    index.move(robots, index.positions)
+    paths = states.swapaxes(0, 1)[:, None]
+    index.count_meetings(robots, paths)
+    check_alone(problem.arrays, robots, paths)
 
 
 def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:

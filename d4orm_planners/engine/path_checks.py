@@ -7,8 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import FloatArray, IntArray, Ints
 from d4orm_env.core.problem_arrays import ProblemArrays
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, inlined
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, inlined
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.threads import Threads, available_cores
 
@@ -35,11 +36,12 @@ def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) ->
     return steps
 
 
-@cached_kernel(**OPTIONS)
+@cached_kernel(**WITHOUT_ARRAYS)
 def _check_alone(
     arrays: ProblemArrays, robots: IntArray, paths: FloatArray, robot_range: IntArray, steps: Ints
 ) -> None:
     """See :func:`check_alone`."""
+    arrays = borrow(arrays)
     dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), paths.shape[2]
     for r in range(robot_range[0], robot_range[1]):
         reach, goal = arrays.radius[robots[r]] + arrays.margin, arrays.goal[robots[r]]

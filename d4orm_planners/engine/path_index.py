@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Ints, Whole
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, inlined
+from d4orm_env.engine.compiling import OPTIONS, WITHOUT_ARRAYS, inlined
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.engine.path_table import (
     BLOCK,
@@ -84,20 +85,27 @@ class PathIndex:
         """
         index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(states, np.float32)
         last = np.full(len(index), paths.shape[2]) if until is None else np.asarray(until, np.int64)
-        met, when = np.empty((2, *paths.shape[:2]), np.int32)
-        self._threads.over(len(index), lambda part: _count_meetings(self.table, index, paths, last, part, met, when))
-        return met, when
+        counts, when = np.empty((2, *paths.shape[:2]), np.int32)
+
+        def count(part: IntArray) -> None:
+            met = np.empty((paths.shape[1], self.table.places.shape[1]), np.bool_)
+            _count_meetings(self.table, index, paths, last, part, met, counts, when)
+
+        self._threads.over(len(index), count)
+        return counts, when
 
 
-@cached_kernel(**OPTIONS)
+@cached_kernel(**WITHOUT_ARRAYS)
 def _link_all(table: PathTable) -> None:
+    table = borrow(table)
     for block in range(table.first.shape[0]):
         for robot in range(table.places.shape[1]):
             link(table, block, robot)
 
 
-@cached_kernel(**OPTIONS)
+@cached_kernel(**WITHOUT_ARRAYS)
 def _move(table: PathTable, robots: IntArray, paths: FloatArray) -> None:
+    table = borrow(table)
     for i in range(robots.shape[0]):
         for t in range(paths.shape[0]):
             for axis in range(paths.shape[2]):
@@ -113,6 +121,7 @@ def _mark_near(
     met: BoolArray,
 ) -> tuple[int, int]:  # fmt: skip
     """Enter in ``met`` ``(K,)`` who is near in a block; return how many are new there and the first step of these."""
+    begin = np.int64(0)  # a literal would compile what it is passed to once more
     count, soonest = 0, table.places.shape[0]
     low_i, high_i, low_j, high_j, low_k, high_k = cells_around(table, middle, spread)
     for i in range(low_i, high_i + 1):
@@ -121,7 +130,7 @@ def _mark_near(
                 other = table.first[block, bucket_of(table, i, j, k)]
                 while other != NOBODY:
                     if not met[other]:
-                        t = first_near(table, robot, path, 0, middle, spread, block, other)
+                        t = first_near(table, robot, path, begin, middle, spread, block, other)
                         if t > 0:
                             met[other], count, soonest = True, count + 1, min(soonest, t)
                     other = table.following[block, other]
@@ -131,6 +140,7 @@ def _mark_near(
 @cached_kernel(**OPTIONS)
 def _pairs(table: PathTable, robot_range: IntArray) -> IntArray:
     """Pairs in which a robot of a range has the lower number and they are ever near, each as one number."""
+    table = borrow(table)
     num_blocks, num_robots = table.following.shape
     found, count, met = np.empty(64, np.int64), 0, np.empty(num_robots, np.bool_)
     for robot in range(robot_range[0], robot_range[1]):
@@ -146,19 +156,20 @@ def _pairs(table: PathTable, robot_range: IntArray) -> IntArray:
     return found[:count]
 
 
-@cached_kernel(**OPTIONS)
+@cached_kernel(**WITHOUT_ARRAYS)
 def _count_meetings(
     table: PathTable,
     robots: IntArray,
     paths: FloatArray,
     until: IntArray,
     robot_range: IntArray,
+    met: BoolArray,
     counts: Ints,
     when: Ints,
 ) -> None:
-    """See :meth:`PathIndex.count_meetings`."""
+    """See :meth:`PathIndex.count_meetings`; ``met`` ``(V, K)`` is overwritten."""
+    table = borrow(table)
     num_paths, num_blocks = paths.shape[1], table.first.shape[0]
-    met = np.empty((num_paths, table.places.shape[1]), np.bool_)
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
         met[:], met[:, robot] = False, True

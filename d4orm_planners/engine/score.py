@@ -23,8 +23,9 @@ from d4orm_env.dynamics import reward, transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine import obstacles
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, aligned_zeros, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import ONE, WITHOUT_ARRAYS, ZERO, aligned_zeros, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.footprint_contacts import place_bodies, refine_static
 from d4orm_env.engine.noise import DRAWS
@@ -317,7 +318,7 @@ def score_kernel(models: tuple[str, ...]) -> Score:
 def _score_kernel(models: tuple[str, ...]) -> Score:
     run_robot = dispatch({name: _runner(name) for name in models})
 
-    @cached_kernel(variant="_".join(models), key=models_key(models), **OPTIONS)
+    @cached_kernel(variant="_".join(models), key=models_key(models), **WITHOUT_ARRAYS)
     def score_tiles(
         arrays: ProblemArrays,
         scoring: Scoring,
@@ -328,6 +329,7 @@ def _score_kernel(models: tuple[str, ...]) -> Score:
         rewards: FloatArray,
     ) -> None:
         use_wide_registers()
+        arrays, scoring, drawing, space = borrow(arrays), borrow(scoring), borrow(drawing), borrow(space)
         num_robots, num_samples = rewards.shape
         fill_keys(drawing.seed, drawing.step, num_robots, kept.shape[2], kept.shape[3], space.keys)
         for index in range(tile_range[0], tile_range[1]):

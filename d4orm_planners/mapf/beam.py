@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import register_jitable
 
-from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
-from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
+from d4orm_env.engine.compiling import compiled
 
 
 class Beam(NamedTuple):
@@ -49,16 +48,48 @@ class PathTree(NamedTuple):
     used: IntArray
 
 
-@register_jitable(nogil=True, **OPTIONS)
-def make_beam(size: int, n: int, d: int, steps: int) -> Beam:
+class Space(NamedTuple):
+    """Workspace of a search.
+
+    Attributes:
+        beam: The paths kept after the last block.
+        numbers: ``(width,)`` their numbers among all ever kept.
+        new: Those that go on from there, and room for one more.
+        heap: ``(N,)`` numbers of these that may still be kept, the most promising first.
+        counted: ``(N,)`` bool, those of which it is known whom they meet in the last block.
+        ever: All ever kept.
+        did: ``(B,)`` the moves of the path found, the last first.
+    """
+
+    beam: Beam
+    numbers: IntArray
+    new: Beam
+    heap: IntArray
+    counted: BoolArray
+    ever: PathTree
+    did: IntArray
+
+
+def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
     return Beam(
         np.empty((size, n), np.float32), np.empty((size, d), np.float32), np.empty(size), np.empty(size),
         np.empty(size), np.empty(size, np.int64), np.empty(size, np.int64), np.empty((size, steps, d), np.float32),
     )  # fmt: skip
 
 
+def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int) -> Space:
+    """Space for a beam of so many paths, moves and blocks of steps."""
+    before, moves = np.empty((2, width * num_blocks), np.int64)
+    most = width * num_moves
+    return Space(
+        _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, block),
+        np.empty(most, np.int64), np.empty(most, np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
+        np.empty(num_blocks, np.int64),
+    )  # fmt: skip
+
+
 @compiled
-def is_like_another(new: Beam, node: Whole, kept: Beam, size: int, dedup2: float) -> bool:
+def is_like_another(new: Beam, node: Whole, kept: Beam, size: Whole, dedup2: float) -> bool:
     """Check whether a path is about where one of those kept is, about as fast."""
     for other in range(size):
         gap2, change2 = 0.0, 0.0
@@ -73,7 +104,7 @@ def is_like_another(new: Beam, node: Whole, kept: Beam, size: int, dedup2: float
 
 
 @compiled
-def keep(new: Beam, node: Whole, kept: Beam, size: int, numbers: IntArray, ever: PathTree) -> None:
+def keep(new: Beam, node: Whole, kept: Beam, size: Whole, numbers: IntArray, ever: PathTree) -> None:
     """Keep a path as the next one of the beam, with its number among all ever kept, which ``numbers`` is told."""
     for i in range(new.states.shape[1]):
         kept.states[size, i] = new.states[node, i]
@@ -82,6 +113,23 @@ def keep(new: Beam, node: Whole, kept: Beam, size: int, numbers: IntArray, ever:
     kept.faults[size], number = new.faults[node], ever.used[0]
     ever.before[number], ever.moves[number], numbers[size] = new.before[node], new.moves[node], number
     ever.used[0] = number + 1
+
+
+@compiled
+def sink(bounds: Floats, heap: IntArray, place: Whole, size: Whole) -> None:
+    """Let what is at a place of a heap sink below all that comes before it: lower bounds, then lower numbers."""
+    node = heap[place]
+    while 2 * place + 1 < size:
+        child = 2 * place + 1
+        if child + 1 < size:
+            left, right = heap[child], heap[child + 1]
+            if bounds[right] < bounds[left] or (bounds[right] == bounds[left] and right < left):
+                child += 1
+        other = heap[child]
+        if bounds[node] < bounds[other] or (bounds[node] == bounds[other] and node < other):
+            break
+        heap[place], place = other, child
+    heap[place] = node
 
 
 @compiled

@@ -6,13 +6,11 @@ turns off by some angle. After every block the most promising of the paths so fa
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
@@ -20,15 +18,16 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
 from d4orm_env.engine.stepping import Docking, docking_of, models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_checks import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
-from d4orm_planners.mapf.beam import Beam, PathTree, is_like_another, keep, make_beam, trace_back
+from d4orm_planners.mapf.beam import Space, is_like_another, keep, sink, trace_back
 from d4orm_planners.mapf.motion_primitives import Moves, aiming
 from d4orm_planners.tracking.tracker import tracker, velocity_step
 
@@ -113,36 +112,35 @@ def _count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, blo
     return count + _count_beside(table, robot, queries.others, r, path, first, last)
 
 
-@register_jitable(nogil=True, **OPTIONS)
+@inlined
 def _keep_best(
-    new: Beam, count: int, kept: Beam, numbers: IntArray, best: float, rules: BeamRules, ever: PathTree,
-    table: PathTable, queries: Queries, r: int, block: Whole,
-) -> int:  # fmt: skip
+    space: Space, count: Whole, best: float, rules: BeamRules, table: PathTable, queries: Queries, r: int, block: Whole
+) -> Whole:
     """Keep the most promising of ``count`` paths, of those that are alike the better one; return how many.
 
     Most are worse than those kept whomever they meet. So that is counted of one only when its turn comes, which then
     comes again.
     """
-    order, after, size = np.argsort(new.bounds[:count], kind="mergesort"), 0, 0
-    counted = [(0.0, np.int64(0)) for _ in range(0)]
+    new, heap, counted, numbers = space.new, space.heap, space.counted, space.numbers
     dedup2 = rules.dedup_distance * rules.dedup_distance
-    while size < numbers.shape[0] and (after < count or len(counted) > 0):
-        is_next = after < count
-        if is_next and len(counted) > 0:
-            is_next = (new.bounds[order[after]], order[after]) < counted[0]
-        node = order[after] if is_next else heapq.heappop(counted)[1]
-        after += is_next
-        if new.bounds[node] >= best:
-            break
-        if is_like_another(new, node, kept, size, dedup2):
-            continue
-        if is_next:
-            new.faults[node] += _count_met(table, queries, r, new.paths[node], block)
-            new.bounds[node] = rules.contact * new.faults[node] + new.costs[node]
-            heapq.heappush(counted, (new.bounds[node], node))
+    root = size = np.int64(0)  # literals would compile what they are passed to once more
+    for node in range(count):
+        heap[node], counted[node] = node, False
+    for place in range(count // 2 - 1, -1, -1):
+        sink(new.bounds, heap, place, count)
+    while size < numbers.shape[0] and count > 0 and new.bounds[heap[0]] < best:
+        node = heap[0]
+        alike = is_like_another(new, node, space.beam, size, dedup2)
+        if alike or counted[node]:
+            count -= 1
+            heap[0] = heap[count]
+            if not alike:
+                keep(new, node, space.beam, size, numbers, space.ever)
+                size += 1
         else:
-            keep(new, node, kept, size, numbers, ever)
-            size += 1
+            new.faults[node] += _count_met(table, queries, r, new.paths[node], block)
+            new.bounds[node], counted[node] = rules.contact * new.faults[node] + new.costs[node], True
+        sink(new.bounds, heap, root, count)
     return size
 
 
@@ -220,7 +218,7 @@ def _move_follower(model: Model) -> Callable[..., int]:
 
 
 Search: TypeAlias = Kernel[
-    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, FloatArray, FloatArray, BoolArray], None
+    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, Space, FloatArray, FloatArray, BoolArray], None
 ]
 """A kernel of :func:`search_kernel`."""
 
@@ -236,19 +234,17 @@ def search_kernel(name: str) -> Search:
     drive_block, follow = _block_driver(model), _move_follower(model)
     n, d, num_limits = model.state_size, model.dimension, len(model.limit_names)
 
-    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **WITHOUT_ARRAYS)
     def search(
         arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, part: IntArray,
-        u: FloatArray, x: FloatArray, found: BoolArray,
+        space: Space, u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
-        num_blocks, num_moves, width = table.first.shape[0], moves.pace.shape[0], rules.width
+        arrays, table, moves = borrow(arrays), borrow(table), borrow(moves)
+        queries, space = borrow(queries), borrow(space)
+        num_blocks, num_moves = table.first.shape[0], moves.pace.shape[0]
+        zero: Whole = np.int64(0)  # a literal would compile what it is passed to once more
         last_busy = min(num_blocks - 1, table.moving[0] + 1)
-        # One more, to be overwritten.
-        beam, new = make_beam(width, n, d, 0), make_beam(width * num_moves + 1, n, d, table.block)
-        ever = PathTree(
-            np.empty(width * num_blocks, np.int64), np.empty(width * num_blocks, np.int64), np.empty(1, np.int64)
-        )
-        numbers, did = np.empty(width, np.int64), np.empty(num_blocks, np.int64)
+        beam, new, ever, numbers, did = space.beam, space.new, space.ever, space.numbers, space.did
         for r in range(part[0], part[1]):
             robot, begin = queries.robots[r], queries.blocks[r]
             goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
@@ -256,10 +252,10 @@ def search_kernel(name: str) -> Search:
             at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
             for i in range(n):
                 beam.states[0, i] = queries.states[r, i]
-            beam.faults[0], numbers[0], size, ever.used[0] = 0.0, -1, 1, 0
-            best, best_number, best_move = queries.limits[r], -1, -1
+            beam.faults[0], numbers[0], size, ever.used[0] = 0.0, -1, zero + 1, 0
+            best, best_number, best_move = queries.limits[r], zero - 1, zero - 1
             for block in range(begin, num_blocks):
-                steps, count = steps_of(table, block), 0
+                steps, count = steps_of(table, block), zero
                 for node in range(size):
                     for number in range(num_moves):
                         path = new.paths[count]
@@ -283,7 +279,7 @@ def search_kernel(name: str) -> Search:
                         new.costs[count], new.bounds[count] = cost, rules.contact * faults + cost
                         new.faults[count], new.before[count], new.moves[count] = faults, numbers[node], number
                         count += 1
-                size = _keep_best(new, count, beam, numbers, best, rules, ever, table, queries, r, block)
+                size = _keep_best(space, count, best, rules, table, queries, r, block)
                 if size == 0:
                     break
             found[r] = best_move >= 0

@@ -12,6 +12,7 @@ from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
+from d4orm_planners.mapf.beam import make_space
 from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents, Queries, search_kernel
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives, Moves
 from d4orm_planners.tracking.steering import Rollouts, by_model
@@ -70,10 +71,11 @@ def _search(
     waiting = iter(range(len(u)))
 
     def look(_: IntArray) -> None:
+        space = make_space(rules.width, len(moves.pace), len(table.first), BLOCK, x.shape[2], team.problem.dimension)
         for number in waiting:
             if team.search.should_stop():
                 break
-            search(arrays, table, moves, rules, queries, np.array((number, number + 1)), u, x, found)
+            search(arrays, table, moves, rules, queries, np.array((number, number + 1)), space, u, x, found)
 
     Threads(available_cores()).over(len(u), look)
     return u, x, found

@@ -10,8 +10,9 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
+from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.stepping import docking_of, make_stepper, models_key
 from d4orm_env.engine.tile_layout import SQUARED_GAP, Row
@@ -49,11 +50,13 @@ def straight_kernel(name: str) -> Drives:
 
     drive = tracker(model, by_points)
 
-    @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
+    @cached_kernel(variant=name, key=models_key((name,)), **WITHOUT_ARRAYS)
     def drive_straight(
         arrays: ProblemArrays, robots: IntArray, switch: IntArray, vias: FloatArray, near2: np.float32,
         u: FloatArray, x: FloatArray, arrived: BoolArray,
     ) -> None:  # fmt: skip
+        arrays = borrow(arrays)
+        passed = np.int64(0)  # a literal would compile what it is passed to once more
         for r in robots:
             docking = docking_of(arrays, r)
             limits, goal = to_fixed_tuple(arrays.limits[r], num_limits), to_fixed_tuple(arrays.goal[r], d)
@@ -63,7 +66,7 @@ def straight_kernel(name: str) -> Drives:
                 if first > 0:
                     control = to_fixed_tuple(u[r, v, first - 1], m)
                     state, _, at_goal = dock(False, state, control, limits, goal, docking)
-                arrival = drive(arrays, r, (vias[r, v], near2), 0, first, state, at_goal, u[r, v], x[r, v])
+                arrival = drive(arrays, r, (vias[r, v], near2), passed, first, state, at_goal, u[r, v], x[r, v])
                 arrived[r, v] = arrival < x.shape[2]
 
     return drive_straight

@@ -8,6 +8,7 @@ A reference is data and a guide, which says what velocity is wanted next: from p
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,6 +32,7 @@ Tracker: TypeAlias = Callable[[ProblemArrays, Whole, Any, Any, int, Row, bool, F
 VelocityStep: TypeAlias = Callable[[Row, Row, Row, Row, Docking, TimeStep], tuple[Row, Row, bool]]
 
 
+@cache
 def velocity_step(model: Model) -> VelocityStep:
     """The compiled step of a robot of this model towards a velocity; at its goal it turns to its goal heading.
 
