@@ -15,7 +15,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.jax.jax_footprints import PlacedBodies, place_robots
 
 
-class Others(NamedTuple):
+class OtherBodies(NamedTuple):
     """Bodies of all robots, seen from one of them.
 
     Attributes:
@@ -56,7 +56,7 @@ def cast_rays(
 
     def of_robot(robot: Array, x: Array, y: Array, cosine: Array, sine: Array) -> Array:
         own = owner == robot
-        others = Others(bodies[0] - x, bodies[1] - y, jnp.where(own, -1, radius), cores)
+        others = OtherBodies(bodies[0] - x, bodies[1] - y, jnp.where(own, -1, radius), cores)
         aim = cosine * fan[:, 0] - sine * fan[:, 1], sine * fan[:, 0] + cosine * fan[:, 1]
         reach = jax.vmap(lambda ray_x, ray_y: _nearest(arrays, others, x, y, ray_x, ray_y))(*aim)
         return jnp.minimum(reach, layout.ray_range)
@@ -65,7 +65,7 @@ def cast_rays(
     return [reach[:, i] for i in range(layout.num_rays)]
 
 
-def _nearest(arrays: ProblemArrays, others: Others, x: Array, y: Array, ray_x: Array, ray_y: Array) -> Array:
+def _nearest(arrays: ProblemArrays, others: OtherBodies, x: Array, y: Array, ray_x: Array, ray_y: Array) -> Array:
     """Distance from ``(x, y)`` along a ray to whatever comes first; the other robots' positions are relative."""
     found = [_to_others(arrays.footprints, others, ray_x, ray_y), *_to_obstacles(arrays, x, y, ray_x, ray_y)]
     if arrays.bounds is not None:
@@ -87,7 +87,7 @@ def are_blocked(arrays: ProblemArrays, place: list[Array], gap: list[Array]) -> 
     return blocked
 
 
-def _to_others(f: FootprintArrays | None, others: Others, ray_x: Array, ray_y: Array) -> Array:
+def _to_others(f: FootprintArrays | None, others: OtherBodies, ray_x: Array, ray_y: Array) -> Array:
     """``(F,)`` distances to bodies: to discs about the corners of a core that is widened, and to the core."""
     x, y, radius, cores = others
     if f is None or cores is None:

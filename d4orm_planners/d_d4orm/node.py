@@ -64,7 +64,7 @@ def node_seed(seed: int, node: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class NodeTask:
+class PlanningTask:
     """Common task of the nodes of one solve.
 
     Attributes:
@@ -114,7 +114,7 @@ class Node:
     def __init__(
         self,
         number: int,
-        task: NodeTask,
+        task: PlanningTask,
         planner: Planner,
         transport: Transport,
         evaluator: Evaluator,

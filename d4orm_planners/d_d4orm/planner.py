@@ -16,7 +16,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d_d4orm.async_pool import AsyncNodePool, NetworkNodePool
 from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox
-from d4orm_planners.d_d4orm.node import Node, NodeTask, node_seed
+from d4orm_planners.d_d4orm.node import Node, PlanningTask, node_seed
 from d4orm_planners.d_d4orm.node_pool import NodePool, SyncNodePool
 from d4orm_planners.d_d4orm.ray_planner import RayConnection, import_ray, ray_planners
 from d4orm_planners.d_d4orm.settings import DD4ormConfig
@@ -63,7 +63,7 @@ class DD4orm(Planner):
         with ExitStack() as opened:
             number = self.config.nodes or search.problem.num_robots
             selection = self.config.selection, self.config.k
-            task = NodeTask(number, search.seed, search.current.planned, *selection, self._links(search.problem))
+            task = PlanningTask(number, search.seed, search.current.planned, *selection, self._links(search.problem))
             zenoh = self.config.zenoh
             crew = self._local_crew(search, task, opened) if zenoh is None else self._network_crew(search, task, zenoh)
             return RunningNodes(crew, opened.pop_all())
@@ -91,7 +91,7 @@ class DD4orm(Planner):
                 search.best = best
             search.metrics |= state.crew.metrics()
 
-    def _network_crew(self, search: SolveRun, task: NodeTask, zenoh: ZenohSettings) -> NodePool:
+    def _network_crew(self, search: SolveRun, task: PlanningTask, zenoh: ZenohSettings) -> NodePool:
         """The one node of a network that this process is."""
         config = self.config
         config.check_node(task.num_nodes)
@@ -103,7 +103,7 @@ class DD4orm(Planner):
         node = Node(config.node, task, planner, transport, evaluator, sequence=time.time_ns())
         return NetworkNodePool(node, transport, config.timeout, evaluator, zenoh.grace_period)
 
-    def _local_crew(self, search: SolveRun, task: NodeTask, opened: ExitStack) -> NodePool:
+    def _local_crew(self, search: SolveRun, task: PlanningTask, opened: ExitStack) -> NodePool:
         """All nodes, in threads of this process; what is to be closed after them is ``opened``."""
         config, problem, number = self.config, search.problem, task.num_nodes
         planners: list[Planner] = list(config.node_planners(number))

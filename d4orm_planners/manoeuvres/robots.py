@@ -36,7 +36,7 @@ CERTAIN = 0.98
 """Share of a goal's radius, heading tolerance and speed within which a robot is there beyond doubt."""
 
 
-class Scene(NamedTuple):
+class ManoeuvreScene(NamedTuple):
     """What all robots of a team share.
 
     Attributes:
@@ -63,14 +63,14 @@ class Scene(NamedTuple):
         return RobotBody(footprints, self.arrays, robot, np.float32(self.extra), stride, parts)
 
 
-def scene_of(problem: Problem) -> Scene:
+def scene_of(problem: Problem) -> ManoeuvreScene:
     """What all robots of a team share."""
     team, extra = problem.team, distance_kept(problem)
     index = problem.world.index(float(team.radius.max()) + extra, within=float(team.radius.max()) + extra)
     arrays = problem.arrays._replace(
         grid=index, turns_at_goals=None, goal_direction=None, squared_goal_chord=None, footprints=None
     )
-    return Scene(problem, area_of(problem), arrays, extra)
+    return ManoeuvreScene(problem, area_of(problem), arrays, extra)
 
 
 def can_plan(problem: Problem) -> bool:
@@ -166,7 +166,7 @@ class Robot:
     costs: Costs
 
 
-def make_robot(scene: Scene, number: int) -> Robot | None:
+def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     """Prepare the search for a robot of a team; ``None`` if its trailers cannot be brought in line from the start."""
     problem, area, body = scene.problem, scene.area, scene.body(number)
     model = problem.team.robot_models[number]

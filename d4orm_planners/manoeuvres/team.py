@@ -14,7 +14,7 @@ from d4orm_planners.manoeuvres.curves import curve_controls
 from d4orm_planners.manoeuvres.lattice import buffer_size
 from d4orm_planners.manoeuvres.nodes import Nodes, Task
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
-from d4orm_planners.manoeuvres.robots import Robot, Scene, make_robot, scene_of
+from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, curve_from, find_motion, snap_from, trace
 from d4orm_planners.manoeuvres.snapping import TOWING, snap_controls
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, traffic_of
@@ -65,7 +65,7 @@ class TeamMotions:
 
     groups = 1
 
-    def __init__(self, scene: Scene, robots: list[Robot], should_stop: Callable[[], bool]) -> None:
+    def __init__(self, scene: ManoeuvreScene, robots: list[Robot], should_stop: Callable[[], bool]) -> None:
         self.problem, self.robots, self.should_stop = scene.problem, robots, should_stop
         self._area, self._reach, problem = scene.area, scene.reach, scene.problem
         self._nodes = Nodes.of(MAX_NODES, buffer_size(problem.team.all_footprint_arrays))

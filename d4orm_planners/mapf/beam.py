@@ -48,7 +48,7 @@ class PathTree(NamedTuple):
     used: IntArray
 
 
-class Space(NamedTuple):
+class BeamSpace(NamedTuple):
     """Workspace of a search.
 
     Attributes:
@@ -77,11 +77,11 @@ def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
     )  # fmt: skip
 
 
-def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int) -> Space:
+def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int) -> BeamSpace:
     """Space for a beam of so many paths, moves and blocks of steps."""
     before, moves = np.empty((2, width * num_blocks), np.int64)
     most = width * num_moves
-    return Space(
+    return BeamSpace(
         _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, block),
         np.empty(most, np.int64), np.empty(most, np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
         np.empty(num_blocks, np.int64),

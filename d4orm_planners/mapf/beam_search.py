@@ -27,7 +27,7 @@ from d4orm_env.engine.stepping import Docking, docking_of, models_key
 from d4orm_env.engine.tile_layout import Row
 from d4orm_planners.engine.path_checks import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
-from d4orm_planners.mapf.beam import Space, is_like_another, keep, sink, trace_back
+from d4orm_planners.mapf.beam import BeamSpace, is_like_another, keep, sink, trace_back
 from d4orm_planners.mapf.motion_primitives import Moves, aiming
 from d4orm_planners.tracking.tracker import tracker, velocity_step
 
@@ -114,7 +114,14 @@ def _count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, blo
 
 @inlined
 def _keep_best(
-    space: Space, count: Whole, best: float, rules: BeamRules, table: PathTable, queries: Queries, r: int, block: Whole
+    space: BeamSpace,
+    count: Whole,
+    best: float,
+    rules: BeamRules,
+    table: PathTable,
+    queries: Queries,
+    r: int,
+    block: Whole,
 ) -> Whole:
     """Keep the most promising of ``count`` paths, of those that are alike the better one; return how many.
 
@@ -218,7 +225,7 @@ def _move_follower(model: Model) -> Callable[..., int]:
 
 
 Search: TypeAlias = Kernel[
-    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, Space, FloatArray, FloatArray, BoolArray], None
+    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, BeamSpace, FloatArray, FloatArray, BoolArray], None
 ]
 """A kernel of :func:`search_kernel`."""
 
@@ -237,7 +244,7 @@ def search_kernel(name: str) -> Search:
     @cached_kernel(variant=name, key=models_key((name,)), **WITHOUT_ARRAYS)
     def search(
         arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, part: IntArray,
-        space: Space, u: FloatArray, x: FloatArray, found: BoolArray,
+        space: BeamSpace, u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
         arrays, table, moves = borrow(arrays), borrow(table), borrow(moves)
         queries, space = borrow(queries), borrow(space)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
+ROOT, PACKAGES = Path(__file__).parents[2], ("d4orm_env", "d4orm_planners")
 HEAVY = ("torch", "ray", "casadi", "matplotlib", "jax", "stable_baselines3", "supersuit", "zenoh", "pyrvo",
          "pandas", "pyarrow", "scipy.stats", "typer", "rich", "safetensors", "PIL")  # fmt: skip
 CONTRACT = (
@@ -25,6 +29,12 @@ CONTRACT = (
     "rollout",
     "verify",
 )
+
+
+def test_no_two_classes_of_the_packages_have_one_name() -> None:
+    sources = [path.read_text(encoding="utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
+    names = Counter(name for text in sources for name in re.findall(r"^ *class (\w+)", text, re.MULTILINE))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def run_python(code: str) -> str:

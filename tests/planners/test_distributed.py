@@ -34,7 +34,7 @@ from d4orm_planners.d_d4orm import messages, node
 from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox, Stopped
 from d4orm_planners.d_d4orm.messages import KINDS, MAGIC, Message, MessageError, decode, encode
 from d4orm_planners.d_d4orm.node import KINDS as KINDS_OF_EVENTS
-from d4orm_planners.d_d4orm.node import Event, Node, NodeTask, node_seed
+from d4orm_planners.d_d4orm.node import Event, Node, PlanningTask, node_seed
 from d4orm_planners.d_d4orm.selection import choose, diverse, k_means, merge, shares, top_k
 from d4orm_planners.d_d4orm.transport import WAITING, LocalNetwork
 from d4orm_planners.engine.select import get_sampling_engine
@@ -356,7 +356,7 @@ def test_what_a_process_has_made_is_judged_once() -> None:
 
 def alone(planner: Planner, evaluator: Evaluator | None = None) -> Node:
     """A network's only node."""
-    task = NodeTask(1, 0, None, "max", 1)
+    task = PlanningTask(1, 0, None, "max", 1)
     return Node(0, task, planner, LocalNetwork().join(), evaluator or Evaluator(get_sampling_engine("cpu"), PROBLEM))
 
 
@@ -646,7 +646,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
     planner = D4orm(D4ormConfig(engine="cpu", num_samples=64, num_steps=5))
     events: list[Event] = []
     controls = np.zeros((problem.horizon, 2, 2), np.float32)
-    task, evaluator = NodeTask(2, 0, controls, "max", 1), Evaluator(get_sampling_engine("cpu"), problem)
+    task, evaluator = PlanningTask(2, 0, controls, "max", 1), Evaluator(get_sampling_engine("cpu"), problem)
     nodes = [
         Node(i, task, planner, network.join(), evaluator, observer=observer)
         for i, observer in enumerate((events.append, None))
@@ -668,7 +668,7 @@ def test_an_observer_is_told_what_a_node_does() -> None:
 
 def test_settling_says_whether_all_others_have_a_solution_as_good() -> None:
     problem, network = hop_problem(2), LocalNetwork()
-    task = NodeTask(2, 0, distributed().solve(problem).controls, "max", 1)
+    task = PlanningTask(2, 0, distributed().solve(problem).controls, "max", 1)
     evaluator = Evaluator(get_sampling_engine("cpu"), problem)
     first, second = (Node(i, task, cheap_planner("d4orm"), network.join(), evaluator) for i in range(2))
     assert not first.settle(0), "nobody has told it anything"
