@@ -33,7 +33,7 @@ CONTRACT = (
 
 def test_no_two_classes_of_the_packages_have_one_name() -> None:
     sources = [path.read_text(encoding="utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
-    names = Counter(name for text in sources for name in re.findall(r"^ *class (\w+)", text, re.MULTILINE))
+    names = Counter(name for text in sources for name in re.findall(r"^ *class ([A-Z_]\w*)", text, re.MULTILINE))
     assert [name for name, count in names.items() if count > 1] == []
 
 
