@@ -40,6 +40,14 @@ def find_bodies(footprints: Sequence[Footprint], models: Sequence[Model], hitche
     return (*robots, *trailers)
 
 
+def numbers_by_robot(bodies: Sequence[Body], num_robots: int) -> list[list[int]]:
+    """Each robot's bodies by their numbers, the robot itself first."""
+    numbers: list[list[int]] = [[] for _ in range(num_robots)]
+    for i, body in enumerate(bodies):
+        numbers[body.robot].append(i)
+    return numbers
+
+
 def body_poses(bodies: Sequence[Body], states: FloatArray, d: int) -> Floats:
     """``(..., F, d + 1)`` reference points and headings of the bodies in states ``(..., K, n)``."""
     last = dict[int, int]()

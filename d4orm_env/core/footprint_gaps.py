@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
+from d4orm_env.core.bodies import numbers_by_robot
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.footprints import Core, Footprint
@@ -38,7 +39,7 @@ def touching(team: Team, states: FloatArray, among: NDArray[np.intp], rounding: 
     Gaps of no more than ``rounding`` count as none [m].
     """
     d, poses, bodies = team.dimension, team.body_poses(states), team.bodies
-    numbers = [[i for i, body in enumerate(bodies) if body.robot == robot] for robot in range(team.num_robots)]
+    numbers = numbers_by_robot(bodies, team.num_robots)
     partners: dict[int, list[int]] = {}
     for one, other in combinations(among.tolist(), 2):
         apart = np.linalg.norm(poses[one, :d] - poses[other, :d]) - team.radius[one] - team.radius[other]

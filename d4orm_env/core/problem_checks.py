@@ -17,6 +17,7 @@ from d4orm_env.core.arrays import (
     shown,
     whole_number,
 )
+from d4orm_env.core.bodies import numbers_by_robot
 from d4orm_env.core.footprint_gaps import near_pairs, pair_gap, world_gap
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
@@ -81,7 +82,7 @@ def check_physics(problem: Problem) -> list[str]:
     faults = [
         check_places(team, problem.world, what, positions, problem.margin, poses)
         for what, positions, poses in (
-            ("start", places, team.body_poses(problem.start)), ("goal", problem.goal, goals)
+            ("start", places, team.body_poses(problem.start) if team.shapes else None), ("goal", problem.goal, goals)
         )
     ]  # fmt: skip
     return [fault for fault in faults if fault]
@@ -239,7 +240,7 @@ def check_places(
     shaped = bool(team.shapes)
     if poses is None:
         poses = np.column_stack([places.astype(np.float64), np.full(len(places), np.nan)])
-    bodies = [[i for i in range(len(poses)) if team.bodies[i].robot == robot] for robot in range(len(places))]
+    bodies = numbers_by_robot(team.bodies[: len(poses)], team.num_robots) if shaped else []
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
         gaps[robot] = min(world_gap(world, team.bodies[i].footprint, poses[i]) for i in bodies[robot])
     for robot in np.flatnonzero(gaps <= 0):
