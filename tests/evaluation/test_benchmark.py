@@ -105,7 +105,7 @@ def test_every_engine_rule_and_size_is_measured(results: dict[str, list[Any]]) -
         ("cpu", "default", 2), ("cpu", "paper", 2), ("jax", "paper", 2), ("plain", "paper", 2),
         ("cpu", "default", 3), ("cpu", "paper", 3),
     }  # fmt: skip
-    assert set(results) == {"denoising", "threads", "environments", "obstacles", "index", "robots", "memory", "plans"}
+    assert set(results) == set(SECTIONS) - {"startup"}
 
 
 @pytest.mark.parametrize(("cores", "counts"), [(1, []), (2, [2]), (3, [2, 3]), (8, [2, 4, 8]), (12, [2, 4, 8, 12])])

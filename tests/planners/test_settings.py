@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_planners import list_policies, make_planner, make_policy
 from d4orm_planners.base.planner_registry import PLANNERS, POLICIES, policy_settings, setting_names
-from d4orm_planners.base.settings import CheckedSettings, UnknownKeywordError
+from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.rl.learned import SHIPPED
 
 KINDS: dict[str, type[CheckedSettings]] = {

@@ -19,7 +19,7 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import Engine
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.d_d4orm.inbox import Evaluator
-from d4orm_planners.d_d4orm.node import Event, Node, Task
+from d4orm_planners.d_d4orm.node import Event, Node, PlanningTask
 from d4orm_planners.d_d4orm.transport import Transport
 
 COLUMNS = (
@@ -158,7 +158,7 @@ class Round:
         agenda, planning = self.agenda, self._mission.planning()
         nodes, own = len(agenda.members), agenda.members.index(robot)
         seed = derived_seed(self._mission.seed, Stream.TAKEOVER, agenda.takeover)
-        task = Task(nodes, seed, agenda.guess, planning.selection, planning.k)
+        task = PlanningTask(nodes, seed, agenda.guess, planning.selection, planning.k)
         planner, evaluator = planning.node_planners(nodes)[own], Evaluator(self._engine, agenda.problem)
         sequence = SEQUENCE * agenda.number
         return Node(own, task, planner, self._team, evaluator, sequence=sequence, observer=self._observe)
