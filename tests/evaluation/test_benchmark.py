@@ -288,7 +288,7 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     told += d4orm("plan", "--num-robots", "3", "--out", "plan.npz", "--quiet")
     for command in (
         ("plan.npz", "--control-noise-std", "0.01"),
-        ("--policy", "d4orm-c2f", "--disturb", "control_noise=0.5"),
+        ("--policy", "d4orm-c2f", "--disturb", "control_noise=0.05"),
         ("--policy", "d4orm-c2f", "--scenario", "rooms", "--num-robots", "6"),
     ):
         told += d4orm("run", *command, "--quiet")

@@ -29,6 +29,7 @@ BESIDE: dict[str, dict[str, Any]] = {
     "penalty_rise": JOINT,
     "penalty_limit": JOINT,
     "clip_after": JOINT,
+    "communication_range": {"nodes": None},
 }
 """What these numbers need beside them."""
 
