@@ -264,7 +264,7 @@ def _reduced(x: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
 
 
 def _remainder(x: Part, multiple: Part) -> tuple[Part, Part]:
-    """What is left of ``x`` over a multiple of pi/2, high and low part."""
+    """Rest of ``x`` over a multiple of pi/2, high and low part."""
     rest, first = _difference(x - multiple * _HALF_PI[0], multiple * _HALF_PI[1])
     rest, second = _difference(rest, multiple * _HALF_PI[2])
     error = (first + second) - multiple * _HALF_PI[3]

@@ -33,7 +33,7 @@ class _Borrowed(types.Type):
 
     @property
     def key(self) -> types.NamedTuple:
-        """What makes two of these types the same."""
+        """The struct, by which two of these types are the same."""
         return self.struct
 
     def field(self, name: str) -> types.Type | None:

@@ -11,12 +11,11 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.compiling import aligned_zeros
-from d4orm_env.engine.footprint_contacts import POSE
 from d4orm_env.engine.observing import ObservationSpec
 from d4orm_env.engine.ray_casting import Surroundings, cast_rays
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.tiles import STRIDE
+from d4orm_env.engine.tiles import STRIDE, pose_rows
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
 from d4orm_env.engine.world_tiles import WorldArrays, allocate_boxes
 from d4orm_env.engine.worlds import WorldKernels, kernels_of_codes
@@ -135,8 +134,8 @@ def _rolled_out(
     goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
     nothing = np.empty((0, 0, 2 * goal.shape[-1] + 1), np.float32)
     moments = WorldArrays(goal, inverse, state, control, arrived, nothing, collided, violated, rewards)
-    num_poses = 0 if arrays.footprints is None else POSE * len(arrays.footprints.heading)
-    w, near = aligned_zeros(len(states) * STRIDE + num_poses * TILE), np.empty((len(states), 3), np.uint64)
+    w = aligned_zeros(len(states) * STRIDE + pose_rows(arrays.footprints) * TILE)
+    near = np.empty((len(states), 3), np.uint64)
     _kernels(arrays).roll_out(arrays, moments, w, near, allocate_boxes(arrays))
     return moments
 

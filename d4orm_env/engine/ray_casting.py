@@ -23,7 +23,7 @@ from d4orm_env.engine.ray_shapes import invert, meet_bounds, meet_box, meet_core
 from d4orm_env.engine.simd import CHUNK, TILE, use_wide_registers
 
 _FEW = 4
-"""Where at least one in so many rays may meet a thing, all are asked, for which loops are unrolled."""
+"""Share of the rays, one in so many, from which on all are asked about a thing, for which loops are unrolled."""
 _HALF, _PER_TURN = np.float32(0.5), np.float32(0.5 / np.pi)
 _ABOVE_ARCSINE = np.float32(0.571)
 """``x + 0.571 x^3`` is at least the arcsine of ``x``, from 0 to 1."""
@@ -32,8 +32,8 @@ _A0, _A1, _A2, _A3, _A4 = (np.float32(a) for a in (0.9998660, -0.3302995, 0.1801
 _BELOW_CHORD = np.float32(0.2928)
 """``1 - 0.2928 x`` is at least one over the root of ``1 + x``, from 0 to 1."""
 _SPARE_ANGLE, _SPARE_SHARE, _SPARE_PLACE = np.float32(2e-3), np.float32(1.0001), np.float32(1e-6)
-"""What the disc round a thing is wider by, for what is rounded off: seen from afar [rad], and shares of its radius and
-of its coordinates."""
+"""Excess of the disc round a thing, for what is rounded off: seen from afar [rad], and shares of its radius and of its
+coordinates."""
 
 
 class Surroundings(NamedTuple):

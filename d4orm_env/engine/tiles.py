@@ -14,6 +14,7 @@ from functools import cache
 from typing import TypeAlias
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
@@ -22,7 +23,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
-from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.footprint_contacts import POSE, place_bodies, refine_pair
 from d4orm_env.engine.simd import TILE, at_most, use_wide_registers, within_2, within_3
@@ -117,7 +118,7 @@ def near_pair(reach: np.float32, a: int, b: int, dimension: int, w: FloatArray) 
     return within_3(w, a, b, reach * reach)
 
 
-@inlined
+@register_jitable(nogil=True, **OPTIONS)
 def pose_rows(f: FootprintArrays | None) -> int:
     """Return how many rows the poses of a team's bodies take; they are the last of the workspace."""
     return 0 if f is None else POSE * f.heading.shape[0]

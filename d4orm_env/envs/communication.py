@@ -1,4 +1,4 @@
-"""Who knows of whom: robots within a communication range, and within sight if asked."""
+"""Links between robots within a communication range, and within sight if asked."""
 
 from __future__ import annotations
 

@@ -171,10 +171,8 @@ class CoarsePlanTracker:
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
         initial = self._beginning(joint, keep & (not lost))
-        work, anew = (
-            partial(self._planning.plan, self.problem, joint, docked, initial, iterations, thorough),
-            ~keep | lost,
-        )
+        work = partial(self._planning.plan, self.problem, joint, docked, initial, iterations, thorough)
+        anew = ~keep | lost
         if self._config.deadline is None:
             self._follow(joint, work(), anew)
             return True

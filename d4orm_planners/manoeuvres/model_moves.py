@@ -78,6 +78,20 @@ def _swing(kind: Kind, side: int, turn: float, least: int) -> tuple[int, float]:
     return count, side * turn / (count * kind.dt) ** 2
 
 
+def _paced(kind: Kind, way: int, speed: float, turn: float) -> Iterator[Move]:
+    """Speeding up, slowing down and going on, and from rest to rest, at a turn rate or steering angle that is held."""
+    count, rest, going = kind.speeding_up(speed), (0.0, turn), (way * speed, turn)
+    push = way * speed / (count * kind.dt)
+    yield rest, going, held(count, push, 0.0)
+    yield going, rest, held(count, -push, 0.0)
+    for length in LENGTHS:
+        yield going, going, held(kind.steps(length * kind.cell, speed), 0.0, 0.0)
+        count, peak = kind.hop(length * kind.cell, kind.limits[ACCELERATION])
+        if peak <= speed:
+            push = way * peak / (count * kind.dt)
+            yield rest, rest, np.concatenate([held(count, push, 0.0), held(count, -push, 0.0)])
+
+
 def _unicycle2(kind: Kind) -> Iterator[Move]:
     rest = (0.0, 0.0)
     for sectors, side in product(TURNS_ON_THE_SPOT, (1, -1)):
@@ -85,16 +99,8 @@ def _unicycle2(kind: Kind) -> Iterator[Move]:
         yield rest, rest, np.concatenate([held(count, 0.0, swing), held(count, 0.0, -swing)])
     for way in (1, -1):
         speed = kind.pace(way)
-        going, count = (way * speed, 0.0), kind.speeding_up(speed)
-        push = way * speed / (count * kind.dt)
-        yield rest, going, held(count, push, 0.0)
-        yield going, rest, held(count, -push, 0.0)
-        for length in LENGTHS:
-            yield going, going, held(kind.steps(length * kind.cell, speed), 0.0, 0.0)
-            count, peak = kind.hop(length * kind.cell, kind.limits[ACCELERATION])
-            if peak <= speed:
-                push = way * peak / (count * kind.dt)
-                yield rest, rest, np.concatenate([held(count, push, 0.0), held(count, -push, 0.0)])
+        yield from _paced(kind, way, speed, 0.0)
+        going = (way * speed, 0.0)
         for sectors, side in product(TURNS, (1, -1)):
             least = kind.steps(LENGTHS[0] * kind.cell / 2, speed)
             count, swing = _swing(kind, side, sectors * SECTOR, least)
@@ -110,16 +116,7 @@ def _car(kind: Kind) -> Iterator[Move]:
         for pace in (0.0, speed, -speed):
             yield (pace, wheels[old]), (pace, wheels[new]), held(swing, 0.0, rate)
     for way, wheel in product((1, -1), wheels):
-        count, rest, going = kind.speeding_up(speed), (0.0, wheel), (way * speed, wheel)
-        push = way * speed / (count * kind.dt)
-        yield rest, going, held(count, push, 0.0)
-        yield going, rest, held(count, -push, 0.0)
-        for length in LENGTHS:
-            yield going, going, held(kind.steps(length * kind.cell, speed), 0.0, 0.0)
-            count, peak = kind.hop(length * kind.cell, kind.limits[ACCELERATION])
-            if peak <= speed:
-                push = way * peak / (count * kind.dt)
-                yield rest, rest, np.concatenate([held(count, push, 0.0), held(count, -push, 0.0)])
+        yield from _paced(kind, way, speed, wheel)
 
 
 def _compass() -> Iterator[tuple[float, float]]:

@@ -254,10 +254,13 @@ PLAN = (
 
 def python(folder: Path, *arguments: str, **environment: str) -> str:
     """What an interpreter prints."""
-    return subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, check=True, cwd=folder,
+    result = subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, check=False, cwd=folder,
         env={**os.environ, **environment},
-    ).stdout  # fmt: skip
+    )  # fmt: skip
+    assert result.returncode in ((0, 1) if "run" in arguments else (0,)), result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stdout
 
 
 @pytest.mark.slow
@@ -288,10 +291,10 @@ def test_after_a_warm_up_nothing_is_left_to_compile(tmp_path: Path) -> None:
     told += d4orm("plan", "--num-robots", "3", "--out", "plan.npz", "--quiet")
     for command in (
         ("plan.npz", "--control-noise-std", "0.01"),
-        ("--policy", "d4orm-c2f", "--disturb", "control_noise=0.05"),
+        ("--policy", "d4orm-c2f", "--disturb", "control_noise=0.5"),
         ("--policy", "d4orm-c2f", "--scenario", "rooms", "--num-robots", "6"),
     ):
-        told += d4orm("run", *command, "--quiet")
+        told += d4orm("run", *command, "--quiet")  # succeeds or not, where noise is that strong
     # Other tests have put theirs into the same cache.
     assert kernels(told)
     assert sorted(kernels(told) - kernels(again)) == []
