@@ -124,8 +124,7 @@ class Planar(Footprint):
 
     def outline(self) -> Floats:
         corners, rounding = self.core
-        ends: Floats = corners[(DIRECTIONS @ corners.T).argmax(axis=1)] + rounding * DIRECTIONS
-        return ends
+        return corners[(DIRECTIONS @ corners.T).argmax(axis=1)] + rounding * DIRECTIONS
 
     @property
     @abstractmethod

@@ -14,8 +14,7 @@ from d4orm_env.dynamics.robot_model import ACCELERATION
 def arrival_steps(arrived: BoolArray) -> NDArray[np.intp]:
     """``(K,)`` first row of ``arrived`` ``(H+1, K)`` from which on a robot is at its goal; the last where it is not."""
     last_away = len(arrived) - (~arrived[::-1]).argmax(axis=0)
-    since: NDArray[np.intp] = np.where(arrived.all(axis=0), 0, np.minimum(last_away, len(arrived) - 1))
-    return since
+    return np.where(arrived.all(axis=0), 0, np.minimum(last_away, len(arrived) - 1))
 
 
 def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
@@ -25,8 +24,7 @@ def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
         arrived: ``(H+1, K)`` bool.
         dt: Time step [s].
     """
-    times: NDArray[np.float64] = np.where(arrived[-1], arrival_steps(arrived) * dt, np.inf)
-    return times
+    return np.where(arrived[-1], arrival_steps(arrived) * dt, np.inf)
 
 
 def mean_squared_jerk(controls: FloatArray, arrived: BoolArray, dt: float) -> float:

@@ -83,8 +83,7 @@ def squared_chords(headings: FloatArray, tolerance: FloatArray) -> FloatArray:
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:
     """``(K,)`` one over the start distance; a robot that starts at its goal counts from the goal radius."""
-    inverse: FloatArray = (1.0 / np.maximum(np.linalg.norm(goal - positions, axis=-1), goal_radius)).astype(np.float32)
-    return inverse
+    return (1.0 / np.maximum(np.linalg.norm(goal - positions, axis=-1), goal_radius)).astype(np.float32)
 
 
 def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:

@@ -84,5 +84,4 @@ class DisturbanceEvents:
     def stall_starts(self) -> BoolArray:
         """``(T + 1, K)`` bool: where a robot stops obeying."""
         before = np.concatenate([np.zeros_like(self.stalled[:1]), self.stalled[:-1]])
-        starts: BoolArray = self.stalled & ~before
-        return starts
+        return self.stalled & ~before

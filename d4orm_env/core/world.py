@@ -126,8 +126,7 @@ class World(Frozen):
     @property
     def balls(self) -> FloatArray:
         """``(., dimension + 1)`` the obstacles that are round in every dimension: circles, or spheres in space."""
-        balls: FloatArray = self.circles if self.dimension == 2 else self.spheres
-        return balls
+        return self.circles if self.dimension == 2 else self.spheres
 
     @property
     def bounds(self) -> FloatArray:
@@ -242,8 +241,7 @@ class World(Frozen):
 
     def _to_bounds(self, points: Floats) -> Floats:
         bounds = self.bounds.astype(np.float64)
-        distance: Floats = np.minimum(points - bounds[0], bounds[1] - points).min(axis=-1)
-        return distance
+        return np.minimum(points - bounds[0], bounds[1] - points).min(axis=-1)
 
 
 def _rounded_up(distance: float) -> float:

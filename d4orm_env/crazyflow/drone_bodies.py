@@ -186,8 +186,7 @@ class DroneBodies:
         left = (len(path) - 1 - np.arange(len(path))) / SETPOINT_RATE
         bodies = intruders[:, :3] - left[:, None, None] * intruders[:, 3:6]
         apart = np.linalg.norm(path[:, :, None] - bodies[:, None], axis=3) - self._radius[:, None]
-        touched: BoolArray = (apart <= self.intruder_radius).any(axis=(0, 2))
-        return touched
+        return (apart <= self.intruder_radius).any(axis=(0, 2))
 
     def _gusts(self, count: int) -> Floats:
         force, each = np.zeros((count, self.problem.num_robots, 3)), round(GUST * SETPOINT_RATE)

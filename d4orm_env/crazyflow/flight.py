@@ -164,5 +164,4 @@ def least_gaps(path: Floats, radius: Floats) -> Floats:
     nearest = np.clip(-(begin * change).sum(axis=-1) / np.maximum(squared, 1e-12), 0, 1)
     gaps = np.linalg.norm(begin + nearest[..., None] * change, axis=-1).min(axis=0) - (radius[:, None] + radius)
     np.fill_diagonal(gaps, np.inf)
-    least: Floats = gaps.min(axis=1)
-    return least
+    return gaps.min(axis=1)

@@ -133,8 +133,7 @@ class Quantisation(Disturbance[Memory]):
 
     def command(self, controls: FloatArray, memory: Memory, scene: Scene, draws: Draws) -> FloatArray:
         step = np.float32(self.step)
-        rounded: FloatArray = np.rint(controls / step) * step
-        return rounded
+        return np.rint(controls / step) * step
 
 
 class Queue(NamedTuple):

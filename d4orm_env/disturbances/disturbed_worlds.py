@@ -58,8 +58,7 @@ class _ActiveDisturbance:
         """A copy of what is remembered of some worlds."""
         parts = [values[worlds] for values in self.memory]
         make = getattr(type(self.memory), "_make", tuple)
-        memory: Memory = make(parts)
-        return memory
+        return make(parts)
 
     def has(self, method: str) -> bool:
         """Check whether it overrides a method."""

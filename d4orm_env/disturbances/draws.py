@@ -83,8 +83,7 @@ class Draws:
         """``(B, *shape)`` unit vectors along the last axis, uniform on the circle or the sphere."""
         vectors = self.normal(*shape)
         length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
-        directions: FloatArray = vectors / np.maximum(length, np.float32(1e-12))
-        return directions
+        return vectors / np.maximum(length, np.float32(1e-12))
 
     def _filled(self, kind: int, shape: tuple[int, ...]) -> FloatArray:
         if self._ahead is None:

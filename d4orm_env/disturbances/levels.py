@@ -68,5 +68,4 @@ def check_components(value: float | tuple[float, ...], name: str, control_size: 
 def scaled(value: float | tuple[float, ...], numbers: FloatArray) -> FloatArray:
     """``numbers`` ``(..., m)`` times levels."""
     level = np.array(value, np.float32) if isinstance(value, tuple) else np.float32(value)
-    product: FloatArray = level * numbers
-    return product
+    return level * numbers

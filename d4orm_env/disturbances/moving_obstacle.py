@@ -118,8 +118,7 @@ def _distances(points: FloatArray, through: FloatArray, heading: FloatArray) -> 
     """``(...)`` distances of points from lines [m]; all arguments ``(..., d)``."""
     offset = points - through
     along = (offset * heading).sum(axis=-1)
-    distances: FloatArray = np.sqrt(np.maximum((offset * offset).sum(axis=-1) - along * along, 0))
-    return distances
+    return np.sqrt(np.maximum((offset * offset).sum(axis=-1) - along * along, 0))
 
 
 _COLUMNS = ("id", "time", "x", "y")

@@ -97,8 +97,7 @@ class Stops(NamedTuple):
     def now(self, scene: Scene) -> NDArray[np.bool_]:
         """``(B, K)`` bool: those that do not obey now."""
         steps = scene.steps[:, None]
-        stalled: NDArray[np.bool_] = (self.begin <= steps) & (steps < self.end) & ~scene.standing
-        return stalled
+        return (self.begin <= steps) & (steps < self.end) & ~scene.standing
 
 
 @dataclass(frozen=True)

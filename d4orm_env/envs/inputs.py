@@ -51,8 +51,7 @@ def checked_states(
 
 def usable(actions: FloatArray) -> BoolArray:
     """Return where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
-    within: BoolArray = np.abs(actions) <= MAX_ACTION
-    return within
+    return np.abs(actions) <= MAX_ACTION
 
 
 def check_options(options: object, known: tuple[str, ...] = (), ignored: tuple[str, ...] = ()) -> None:

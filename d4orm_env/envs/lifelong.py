@@ -40,10 +40,9 @@ def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, control
         for robot, model in enumerate(team.robot_models):
             velocity = model.functions.velocity(states[robot], controls[robot], arrays.limits[robot], NUMPY_OPS)
             squared_speed[robot] = sum(component * component for component in velocity)
-    reached: BoolArray = arrives(
+    return arrives(
         (offsets * offsets).sum(axis=1), squared_speed, arrays.squared_goal_radius, arrays.squared_goal_speed
     )
-    return reached
 
 
 def assign_goals(problem: Problem, robots: NDArray[np.intp], world: WorldBatch, random: np.random.Generator) -> None:

@@ -166,8 +166,7 @@ def _smallest(distance: Floats, cell: NDArray[np.int64], bounds: NDArray[np.int6
     if nearest > FEW:
         ordered = distance[np.lexsort((distance, cell))]
         last = np.append(bounds[1:], len(cell)) - 1
-        ranked: Floats = ordered[np.minimum(bounds + nearest - 1, last)]
-        return ranked
+        return ordered[np.minimum(bounds + nearest - 1, last)]
     left = distance.copy()
     for _ in range(nearest - 1):
         # Without the first one of every cell that is as near as its nearest.

@@ -100,8 +100,7 @@ class _Ears:
         (ax, ay), (bx, by), (cx, cy) = (
             self._places[which] for which in (self._before[corner], corner, self._after[corner])
         )
-        turn: float = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
-        return turn
+        return (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
 
     def _find_ear(self) -> int:
         while self._next:
@@ -159,5 +158,4 @@ class _Ears:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    product: Floats = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -99,8 +99,7 @@ class Shapes:
         nearest_face = np.arange(d) == outside.argmax(axis=1)[:, None]
         beyond = outside.max(axis=1, keepdims=True) > 0
         away = np.where(beyond, np.maximum(outside, 0.0), nearest_face)
-        slope: Floats = np.where(above > below, away, -away) / np.linalg.norm(away, axis=1)[:, None]
-        return slope
+        return np.where(above > below, away, -away) / np.linalg.norm(away, axis=1)[:, None]
 
 
 def _box_distance(points: Floats, columns: Floats, items: IntArray) -> Floats:
@@ -130,5 +129,4 @@ def _triangle_distance(points: Floats, corners: Floats) -> Floats:
         x, y = offset[:, 0] - share * along[:, 0], offset[:, 1] - share * along[:, 1]
         nearest = np.minimum(nearest, x * x + y * y)
         inside &= along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0] >= 0
-    distance: Floats = np.where(inside, -1.0, 1.0) * np.sqrt(nearest)
-    return distance
+    return np.where(inside, -1.0, 1.0) * np.sqrt(nearest)

@@ -138,8 +138,7 @@ class FunctionalEnv:
         """One of the instances; the number may be traced."""
         chosen = {place: stack[number] for place, stack in self._varying.items()}
         leaves = [chosen.get(place, leaf) for place, leaf in enumerate(self._common)]
-        problem: Problem = jax.tree.unflatten(self._structure, leaves)
-        return problem
+        return jax.tree.unflatten(self._structure, leaves)
 
     def reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
         """Begin an episode; the key chooses the instance.

@@ -61,8 +61,7 @@ def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float3
 
     if arrays.footprints is not None or state.shape[-1] < LANES:
         return count(state, reach2)
-    counted: Array = on_gpu(partial(count_near, dimension), count, jax.lax.stop_gradient(state), reach2)
-    return counted
+    return on_gpu(partial(count_near, dimension), count, jax.lax.stop_gradient(state), reach2)
 
 
 def _robots_within(

@@ -139,8 +139,7 @@ def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: World
 def roll_out(models: tuple[str, ...], arrays: ProblemArrays, begin: Worlds, controls: Array) -> Worlds:
     """Worlds after each of the controls ``(H, K, m, S)``, as arrays with the time first."""
     kernel, elsewhere = partial(_roll_out_by_kernel, models, arrays), partial(_roll_out_in_steps, models, arrays)
-    worlds: Worlds = on_gpu(kernel, elsewhere, begin, controls)
-    return worlds
+    return on_gpu(kernel, elsewhere, begin, controls)
 
 
 def _roll_out_in_steps(models: tuple[str, ...], arrays: ProblemArrays, begin: Worlds, controls: Array) -> Worlds:

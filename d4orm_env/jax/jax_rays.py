@@ -83,8 +83,7 @@ def are_blocked(arrays: ProblemArrays, place: list[Array], gap: list[Array]) -> 
     def to_obstacle(x: Array, y: Array, ray_x: Array, ray_y: Array) -> Array:
         return jnp.concatenate([jnp.full(1, jnp.inf), *_to_obstacles(arrays, x, y, ray_x, ray_y)]).min()
 
-    blocked: Array = jax.vmap(to_obstacle)(place[0], place[1], gap[0] / length, gap[1] / length) < distance
-    return blocked
+    return jax.vmap(to_obstacle)(place[0], place[1], gap[0] / length, gap[1] / length) < distance
 
 
 def _to_others(f: FootprintArrays | None, others: OtherBodies, ray_x: Array, ray_y: Array) -> Array:

@@ -171,8 +171,7 @@ def _towards(places: Floats, targets: Floats) -> Floats:
     """Unit vectors ``(..., d)`` from places to targets; zero where these are the same."""
     offset = targets - places
     norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
-    direction: Floats = offset / np.where(norm > 0, norm, 1.0)
-    return direction
+    return offset / np.where(norm > 0, norm, 1.0)
 
 
 def ahead_in_each(paths: Sequence[ShortestPaths], places: FloatArray) -> tuple[Floats, Floats]:

@@ -163,8 +163,7 @@ class Axes2D:
     def outlines(self, centres: Array, radius: Array | float, shape: Array = _CIRCLE) -> Array:
         """``(N, vertices, .)`` copies of a shape of unit size, facing the reader."""
         offsets = shape[:, :1] * self.right + shape[:, 1:] * self.up
-        corners: Array = self.flatten(centres)[:, None] + np.broadcast_to(radius, len(centres))[:, None, None] * offsets
-        return corners
+        return self.flatten(centres)[:, None] + np.broadcast_to(radius, len(centres))[:, None, None] * offsets
 
     def polygons(self, vertices: Sequence[Array] | Array, **style: Any) -> Any:
         """Draw filled polygons and return the collection."""
@@ -277,15 +276,11 @@ class TeamLayer:
         if team.dimension == 3:
             balls = panel.outlines(np.zeros_like(places), 1.0)
             sizes = panel.flatten(team.all_footprint_arrays.semi_axes)
-            corners: Array = panel.flatten(places)[:, None] + balls * sizes[:, None]
-            return corners
+            return panel.flatten(places)[:, None] + balls * sizes[:, None]
         poses = team.body_poses(states)
         x, y = np.moveaxis(np.stack([body.footprint.outline() for body in team.bodies]), 2, 0)
         cosine, sine = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-        planar: Array = panel.flatten(poses[:, :2])[:, None] + np.stack(
-            [cosine * x - sine * y, sine * x + cosine * y], axis=-1
-        )
-        return planar
+        return panel.flatten(poses[:, :2])[:, None] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
 
     def heading_lines(self, states: Array) -> Array:
         """``(., 2, 2)`` lines from the centre to the front of every robot that has a heading."""

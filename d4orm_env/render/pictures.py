@@ -43,8 +43,7 @@ PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 def _contact_starts(collided: Array) -> Array:
     """Return where in ``(T, K)`` flags a contact begins."""
-    starts: Array = collided & ~np.concatenate([np.zeros_like(collided[:1]), collided[:-1]])
-    return starts
+    return collided & ~np.concatenate([np.zeros_like(collided[:1]), collided[:-1]])
 
 
 def contact_points(trajectory: Trajectory) -> list[Array]:

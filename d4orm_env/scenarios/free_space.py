@@ -44,8 +44,7 @@ class FreeSpace:
 
     def points(self, indices: NDArray[np.int64]) -> Points:
         """``(..., d)`` places of the lattice points of these indices, as float32 holds them [m]."""
-        places: Points = (self.low + self.step * indices).astype(np.float32).astype(np.float64)
-        return places
+        return (self.low + self.step * indices).astype(np.float32).astype(np.float64)
 
     def contains(self, place: Points) -> bool:
         """Check whether the lattice point nearest to a position belongs to the region."""

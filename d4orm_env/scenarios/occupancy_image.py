@@ -117,8 +117,7 @@ def _pixels(content: bytes) -> tuple[Floats, Floats]:
 
 
 def _brightness(colours: np.ndarray) -> Floats:
-    shade: Floats = colours.sum(axis=-1, dtype=np.uint16) / 3 / 255
-    return shade
+    return colours.sum(axis=-1, dtype=np.uint16) / 3 / 255
 
 
 def _mode(value: object) -> Mode:

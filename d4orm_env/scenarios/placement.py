@@ -41,8 +41,7 @@ class PlacementArea(NamedTuple):
         if not self.is_round:
             return np.full(len(points), True)
         extent = np.maximum(self.half_extent, np.finfo(np.float64).tiny)
-        inside: NDArray[np.bool_] = (((points - self.centre) / extent) ** 2).sum(axis=1) <= 1
-        return inside
+        return (((points - self.centre) / extent) ** 2).sum(axis=1) <= 1
 
 
 def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
@@ -143,8 +142,7 @@ def _first(
         points = points.astype(np.float32).astype(np.float64)
         free = area.contains(points) & is_free(points)
         if free.any():
-            first: Points = points[np.argmax(free)]
-            return first
+            return points[np.argmax(free)]
     return None
 
 
@@ -152,5 +150,4 @@ def _gaps(candidates: Points, points: Points, reach: Points | float) -> Points:
     """``(C,)`` how far each candidate is from all points, less their reach; infinite where there are none [m]."""
     if not len(points):
         return np.full(len(candidates), np.inf)
-    gaps: Points = (np.linalg.norm(candidates[:, None] - points, axis=-1) - reach).min(axis=1)
-    return gaps
+    return (np.linalg.norm(candidates[:, None] - points, axis=-1) - reach).min(axis=1)

@@ -55,8 +55,7 @@ class Stretch:
     def times(self, steps: Indices, sub_steps: Indices, fraction: Floats) -> Floats:
         """Return the time at which that fraction of that sub-step of that step has passed [s]."""
         sub_step = self.dt / (self.path.shape[1] - 1)
-        times: Floats = self.start + steps * self.dt + (sub_steps + fraction) * sub_step
-        return times
+        return self.start + steps * self.dt + (sub_steps + fraction) * sub_step
 
 
 class Watch(ABC):
@@ -193,14 +192,12 @@ class Pairs(Watch):
 
     def near_gap(self, stretch: Stretch, a: Indices, b: Indices) -> Floats:
         """``(N,)`` gap of bodies ``a`` and ``b`` when the stretch begins [m]."""
-        gap: Floats = norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
-        return gap
+        return norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
         place = stretch.path[:, 0]
         distance = norm(place[steps, self.rows[pairs]] - place[steps, self.columns[pairs]])
-        gap: Floats = distance - self._size[pairs]
-        return gap
+        return distance - self._size[pairs]
 
     def bodies(self, pairs: Indices) -> Sequence[Indices]:
         return self.rows[pairs], self.columns[pairs]
@@ -224,8 +221,7 @@ class Static(Watch):
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
         distance = self.distance(stretch.path[steps, 0, self.rows[pairs]], self.columns[pairs])
-        gap: Floats = distance - self._radius[pairs]
-        return gap
+        return distance - self._radius[pairs]
 
     def bodies(self, pairs: Indices) -> Sequence[Indices]:
         return (self.rows[pairs],)

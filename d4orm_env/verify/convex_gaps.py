@@ -14,8 +14,7 @@ def core_gap(a: Floats, b: Floats) -> Floats:
     """``(N,)`` signed gaps of convex cores ``(N, n, 2)`` and ``(N, m, 2)``, counterclockwise; corners may repeat."""
     apart = np.maximum(_separation(a, b), _separation(b, a))
     distance = np.minimum(_corner_distance(a, b), _corner_distance(b, a))
-    gap: Floats = np.where((apart <= 0) & (apart > -np.inf), apart, distance)
-    return gap
+    return np.where((apart <= 0) & (apart > -np.inf), apart, distance)
 
 
 def _separation(a: Floats, b: Floats) -> Floats:
@@ -57,8 +56,7 @@ def ball_gap(offset: Floats, a: Floats, b: Floats) -> Floats:
     def value(s: Floats) -> Floats:
         s = s[..., None]
         parts = s * (1 - s) * square / ((1 - s) * a2 + s * b2)
-        total: Floats = parts[..., 0] + parts[..., 1] + parts[..., 2]
-        return total
+        return parts[..., 0] + parts[..., 1] + parts[..., 2]
 
     width = WEIGHTS[1] - WEIGHTS[0]
     tried = np.stack([value(np.full(len(offset), weight)) for weight in WEIGHTS])
@@ -70,5 +68,4 @@ def ball_gap(offset: Floats, a: Floats, b: Floats) -> Floats:
         rising = value(left) < value(right)
         low, high = np.where(rising, left, low), np.where(rising, high, right)
     factor = np.sqrt(np.maximum(value((low + high) / 2), 1e-12))
-    gap: Floats = np.maximum(norm(offset) * (1 - 1 / factor), -np.minimum(a.min(axis=1), b.min(axis=1)))
-    return gap
+    return np.maximum(norm(offset) * (1 - 1 / factor), -np.minimum(a.min(axis=1), b.min(axis=1)))

@@ -159,8 +159,7 @@ class TurningPairs(Turning, Pairs):
         if place.shape[1] == 3:
             return ball_gap(its_place - place, shapes.semi_axes[a], shapes.semi_axes[b])
         cores = shapes.placed(a, np.zeros_like(place), turn), shapes.placed(b, its_place - place, its_turn)
-        gap: Floats = core_gap(*cores) - shapes.rounding[a] - shapes.rounding[b]
-        return gap
+        return core_gap(*cores) - shapes.rounding[a] - shapes.rounding[b]
 
 
 class TurningStatic(Turning, Static):
@@ -205,15 +204,13 @@ class Obstacles(TurningStatic):
     def _to_circle(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
         core = self.shapes.placed(body, np.zeros_like(place), turn)
         centre = (self._round[thing, :2] - place)[:, None]
-        gap: Floats = core_gap(core, centre) - self.shapes.rounding[body] - self._round[thing, 2]
-        return gap
+        return core_gap(core, centre) - self.shapes.rounding[body] - self._round[thing, 2]
 
     def _to_rectangle(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
         left, low, right, high = (self._boxes[thing] - np.tile(place, 2)).T
         corners = np.stack([left, low, right, low, right, high, left, high], axis=-1).reshape(-1, 4, 2)
         core = self.shapes.placed(body, np.zeros_like(place), turn)
-        gap: Floats = core_gap(core, corners) - self.shapes.rounding[body]
-        return gap
+        return core_gap(core, corners) - self.shapes.rounding[body]
 
     def _to_polygon(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
         gaps = np.empty(len(thing))
@@ -243,8 +240,7 @@ class Obstacles(TurningStatic):
         offset = np.clip(place, self._boxes[thing, :3], self._boxes[thing, 3:]) - place
         axes = self.shapes.semi_axes[body]
         factor = np.maximum(norm(offset / axes), 1e-6)
-        gap: Floats = np.maximum(norm(offset) * (1 - 1 / factor), -axes.min(axis=1))
-        return gap
+        return np.maximum(norm(offset) * (1 - 1 / factor), -axes.min(axis=1))
 
 
 class Sides(TurningStatic):
@@ -263,12 +259,10 @@ class Sides(TurningStatic):
         sign = np.where(side == 0, 1.0, -1.0)
         at = sign * place[np.arange(len(axis)), axis] - self._place[column]
         if self._dimension == 3:
-            gap: Floats = at - self.shapes.semi_axes[body, axis]
-            return gap
+            return at - self.shapes.semi_axes[body, axis]
         corners = self.shapes.placed(body, np.zeros_like(place), turn)
         along = np.take_along_axis(corners, axis[:, None, None], axis=2)[..., 0]
-        planar: Floats = at + (sign[:, None] * along).min(axis=1) - self.shapes.rounding[body]
-        return planar
+        return at + (sign[:, None] * along).min(axis=1) - self.shapes.rounding[body]
 
 
 def _ball(radius: Floats) -> Floats:

@@ -19,14 +19,12 @@ def dot(a: Floats, b: Floats) -> Floats:
     total: Floats = a[..., 0] * b[..., 0]
     for axis in range(1, a.shape[-1]):
         total = total + a[..., axis] * b[..., axis]
-    product: Floats = total
-    return product
+    return total
 
 
 def norm(a: Floats) -> Floats:
     """Length over the last axis."""
-    length: Floats = np.sqrt(dot(a, a))
-    return length
+    return np.sqrt(dot(a, a))
 
 
 def closest_approach(start: Floats, end: Floats) -> tuple[Floats, Floats]:
@@ -47,8 +45,7 @@ def box_distance(points: Floats, boxes: Floats) -> Floats:
         beyond = np.maximum(outside, 0.0)
         square = square + beyond * beyond
         deepest = np.maximum(deepest, outside)
-    distance: Floats = np.sqrt(square) + np.minimum(deepest, 0.0)
-    return distance
+    return np.sqrt(square) + np.minimum(deepest, 0.0)
 
 
 def box_approach(start: Floats, end: Floats, boxes: Floats) -> tuple[Floats, Floats]:
@@ -84,8 +81,7 @@ def polygon_distance(points: Floats, corners: Floats) -> Floats:
         spans = (begin[1] > y) != (end[1] > y)
         if begin[1] != end[1]:
             inside ^= spans & (x < begin[0] + (y - begin[1]) * (end[0] - begin[0]) / (end[1] - begin[1]))
-    distance: Floats = np.where(inside, -nearest, nearest)
-    return distance
+    return np.where(inside, -nearest, nearest)
 
 
 def polygon_approach(start: Floats, end: Floats, corners: Floats) -> tuple[Floats, Floats]:

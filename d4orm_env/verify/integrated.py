@@ -143,8 +143,7 @@ class Integrated:
         k2 = self._slope(x + h / 2 * k1, u)
         k3 = self._slope(x + h / 2 * k2, u)
         k4 = self._slope(x + h * k3, u)
-        moved: Floats = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return moved
+        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
     def _slope(self, x: Floats, u: Floats) -> Floats:
         return self._call(self._model.functions.derivative, x, u)
@@ -152,8 +151,7 @@ class Integrated:
     def _call(self, function: Callable[..., Iterable[ArrayLike]], *arguments: Floats) -> Floats:
         """A function of the model over arrays whose first axis is the component; it may return single numbers too."""
         result = function(*map(tuple, arguments), self._limits, _ops())
-        rows: Floats = np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])
-        return rows
+        return np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])
 
     def displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S+1, R, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""
@@ -163,8 +161,7 @@ class Integrated:
 
     def headings(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S+1, R, 1 + trailers)`` headings at the ends of sub-steps [rad]; zero for a model without one."""
-        headings: Floats = np.stack([self._headings(x) for x in self._within(steps, sub_steps)], axis=1)
-        return headings
+        return np.stack([self._headings(x) for x in self._within(steps, sub_steps)], axis=1)
 
     def _headings(self, states: Floats) -> Floats:
         """``(..., 1 + trailers)`` headings in states ``(n, ...)`` of the robot and of its trailers."""
@@ -172,8 +169,7 @@ class Integrated:
         headings = [np.zeros_like(states[0]) if column is None else states[column]]
         for hitch, _ in self._model.trailers:
             headings.append(headings[-1] - states[hitch])
-        turned: Floats = np.stack(headings, axis=-1)
-        return turned
+        return np.stack(headings, axis=-1)
 
     def _within(self, steps: slice, sub_steps: int) -> Iterator[Floats]:
         """``(n, T, R)`` states at the ends of sub-steps, the beginning of each step first."""

@@ -172,5 +172,4 @@ class TeamMotion:
             cosine, sine = cosine * turn_cosine - sine * turn_sine, sine * turn_cosine + cosine * turn_sine
         rate = np.stack(rates, axis=1)
         six_means = rate[:, :-1:2] + 4 * rate[:, 1::2] + rate[:, 2::2]
-        displacement: Floats = np.cumsum(six_means, axis=1) * (half / 3)
-        return displacement
+        return np.cumsum(six_means, axis=1) * (half / 3)

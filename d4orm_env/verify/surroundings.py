@@ -37,8 +37,7 @@ class Round(Static):
 
     def _offset(self, places: Floats, columns: Indices) -> Floats:
         # A cylinder is a circle seen from above.
-        offset: Floats = places[..., : self._centres.shape[1]] - self._centres[columns]
-        return offset
+        return places[..., : self._centres.shape[1]] - self._centres[columns]
 
 
 class Boxes(Static):
@@ -82,8 +81,7 @@ class Bounds(Static):
     def distance(self, places: Floats, columns: Indices) -> Floats:
         axis = np.broadcast_to(self._axis[columns], places.shape[:-1])
         value = np.take_along_axis(places, axis[..., None], axis=-1)[..., 0]
-        distance: Floats = self._sign[columns] * value - self._place[columns]
-        return distance
+        return self._sign[columns] * value - self._place[columns]
 
     def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         before, after = self.distance(start, columns), self.distance(end, columns)
