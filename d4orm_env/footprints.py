@@ -32,15 +32,10 @@ def _lengths(vectors: Floats) -> Floats:
 
 
 class Core(NamedTuple):
-    """A footprint's convex core and how far it is widened.
+    """A footprint's convex core and how far it is widened."""
 
-    Attributes:
-        corners: ``(n, 2)`` float64, counterclockwise; one for a point, two for a segment.
-        rounding: Distance by which the core is widened [m].
-    """
-
-    corners: Floats
-    rounding: float
+    corners: Floats  #: ``(n, 2)`` float64, counterclockwise; one for a point, two for a segment
+    rounding: float  #: Distance by which the core is widened [m]
 
     @property
     def axes(self) -> tuple[Floats, Floats]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,9 +20,19 @@ Whole = int | np.int64
 """A number of something in compiled code, which tells no int from an int64."""
 
 
+A = TypeVar("A", bound=np.ndarray | tuple[Any, ...])
+
 SMALLEST, LARGEST = 1e-7, 1e6
 """Limits, radii, coordinates and times lie between these in SI units: float32 then holds all that is computed of them,
 over a whole horizon."""
+
+
+def read_only(arrays: A) -> A:
+    """An array, or the arrays in a tuple, which nobody may write to from now on."""
+    for array in arrays if isinstance(arrays, tuple) else (arrays,):
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+    return arrays
 
 
 def as_float32(value: ArrayLike) -> FloatArray:
@@ -53,16 +63,10 @@ def _detached(value: Any) -> Any:
 def frozen_array(
     value: ArrayLike, name: str, shape: tuple[int | None, ...], *, largest: float = float("inf")
 ) -> FloatArray:
-    """``value`` as a read-only, finite float32 array.
-
-    Args:
-        value: Anything NumPy can read as numbers.
-        name: Its name in an error.
-        shape: Expected shape; ``None`` matches any length.
-        largest: Largest magnitude.
+    """``value`` as a read-only, finite float32 array of a shape, in which ``None`` matches any length.
 
     Raises:
-        ValueError: If it cannot be read, has another shape, or holds a value that is not finite or too large.
+        ValueError: If it cannot be read, has another shape, or holds a value that is not finite or beyond ``largest``.
     """
     try:
         # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
@@ -80,8 +84,7 @@ def frozen_array(
     if (np.abs(array) > largest).any():
         where = tuple(int(i) for i in np.argwhere(np.abs(array) > largest)[0])
         raise ValueError(f"{name}{list(where)} is {array[where]:g}; magnitudes must be at most {largest:g}")
-    array.setflags(write=False)
-    return array
+    return read_only(array)
 
 
 def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray:
@@ -110,10 +113,8 @@ class Frozen:
 
     def _set(self, **values: object) -> None:
         for name, value in values.items():
-            parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else (value,)
-            for array in parts:
-                if isinstance(array, np.ndarray):
-                    array.setflags(write=False)
+            parts = tuple(value.values()) if isinstance(value, Mapping) else value
+            read_only(parts if isinstance(parts, tuple) else (parts,))
             object.__setattr__(self, name, value)
 
     def replace(self, **changes: object) -> Self:
@@ -148,14 +149,7 @@ def shown(value: object) -> str:
 def positive_number(
     value: object, name: str, *, zero_allowed: bool = False, least: float = 0.0, most: float = LARGEST_NUMBER
 ) -> float:
-    """``value`` as a finite positive float.
-
-    Args:
-        value: Anything that is a number.
-        name: Its name in an error.
-        zero_allowed: Whether it may be zero.
-        least: Least value other than zero.
-        most: Largest value; by default, float32 still holds its square.
+    """``value`` as a finite positive float, or zero if that is allowed; by default float32 still holds its square.
 
     Raises:
         ValueError: If it is not a number, not finite, negative, zero where zero is not allowed, below ``least`` or
@@ -181,20 +175,12 @@ def positive_number(
 
 
 def duration(value: object, name: str, *, zero_allowed: bool = False) -> float:
-    """``value`` as a positive number of seconds that every clock can wait: at most :data:`LARGEST`, eleven days.
-
-    Raises:
-        ValueError: As :func:`positive_number`.
-    """
+    """``value`` as a positive number of seconds that every clock can wait: at most :data:`LARGEST`, eleven days."""
     return positive_number(value, name, zero_allowed=zero_allowed, most=LARGEST)
 
 
 def whole_number(value: object, name: str, minimum: int, maximum: int | None = None) -> int:
-    """``value`` as an int of at least ``minimum``, and at most ``maximum`` where there is one.
-
-    Raises:
-        ValueError: If it is not a whole number, too small or too large.
-    """
+    """``value`` as an int of at least ``minimum``, and at most ``maximum`` where there is one."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise ValueError(f"{name} must be a whole number, not {shown(value)}")
     if value < minimum:

@@ -1,4 +1,4 @@
-"""The rigid bodies that a team consists of: robots and their trailers."""
+"""The rigid bodies that a team consists of, robots and their trailers, and their footprints as engines read them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,18 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, Ints, read_only
 from d4orm_env.dynamics.robot_model import Model
-from d4orm_env.footprints import Footprint, Train
+from d4orm_env.footprints import MAX_CORNERS, Disc, Ellipsoid, Footprint, Planar, Polygon, Train
 
 
 class Body(NamedTuple):
-    """A rigid body of a robot: its own one, or a trailer.
+    """A rigid body of a robot: its own one, or a trailer."""
 
-    Attributes:
-        robot: Number of the robot.
-        footprint: What it covers.
-        heading: Number of the state component that turns it, or ``None`` for none.
-        hitch: Distance of a trailer's reference point behind that of the body before it [m]; zero for the robot itself.
-    """
-
-    robot: int
-    footprint: Footprint
-    heading: int | None
+    robot: int  #: Number of the robot
+    footprint: Footprint  #: What it covers
+    heading: int | None  #: Number of the state component that turns it, or ``None`` for none
+    #: Distance of a trailer's reference point behind that of the body before it [m]; zero for the robot itself
     hitch: float
 
 
@@ -68,3 +62,67 @@ def body_poses(bodies: Sequence[Body], states: FloatArray, d: int) -> Floats:
         poses[..., i, d] = turn
         last[body.robot] = i
     return poses
+
+
+class FootprintArrays(NamedTuple):
+    """Footprints of a team's ``F`` bodies as the engines read them, float32 unless said.
+
+    The first ``K`` are the robots' own, those of trailers follow.
+    """
+
+    corners: FloatArray  #: ``(F, 8, 2)`` of the cores, the last one repeated
+    num_corners: Ints  #: ``(F,)`` int32
+    axes: FloatArray  #: ``(F, 8, 2)`` see :attr:`Core.axes`, zeros on padding
+    extents: FloatArray  #: ``(F, 8)`` how far the core reaches along each
+    num_axes: Ints  #: ``(F,)`` int32
+    rounding: FloatArray  #: ``(F,)``
+    inner: FloatArray  #: ``(F,)`` inner radii, a little less for rounding
+    heading: Ints  #: ``(F,)`` int32 number of the state component that turns the footprint, -1 for none
+    semi_axes: FloatArray  #: ``(F, 3)`` of ellipsoids and balls; zero in the plane
+    #: ``(F, 3)`` of cores that are rectangles, segments or points: half of the length and of the width, and how far
+    #: ahead of the reference point the centre lies; -1 of others
+    rectangles: FloatArray
+    hitch: FloatArray  #: ``(F,)`` distance behind the body before it
+    before: Ints  #: ``(F,)`` int32 number of the body that it is hitched to, its own for a robot's
+    following: Ints  #: ``(F,)`` int32 number of the trailer that is hitched to it, -1 for none
+    robot: Ints  #: ``(F,)`` int32
+
+
+def as_arrays(bodies: Sequence[Body]) -> FootprintArrays:
+    """The arrays of these: one of each robot, in order, and then the trailers, those of a robot from its front on."""
+    size = len(bodies)
+    arrays = FootprintArrays(
+        np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros(size, np.int32),
+        np.zeros((size, MAX_CORNERS, 2), np.float32), np.zeros((size, MAX_CORNERS), np.float32),
+        np.zeros(size, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32),
+        np.full(size, -1, np.int32), np.zeros((size, 3), np.float32), np.full((size, 3), -1, np.float32),
+        np.zeros(size, np.float32), np.arange(size, dtype=np.int32), np.full(size, -1, np.int32),
+        np.zeros(size, np.int32),
+    )  # fmt: skip
+    last: dict[int, int] = {}
+    for i, (robot, footprint, heading, hitch) in enumerate(bodies):
+        arrays.robot[i], arrays.hitch[i], arrays.before[i] = robot, hitch, last.get(robot, i)
+        if robot in last:
+            arrays.following[last[robot]] = i
+        last[robot] = i
+        arrays.heading[i] = -1 if heading is None else heading
+        _fill_shape(arrays, i, footprint)
+    return read_only(arrays)
+
+
+def _fill_shape(arrays: FootprintArrays, i: int, footprint: Footprint) -> None:
+    arrays.inner[i] = footprint.inner_radius * (1 - 2.0**-20)
+    if isinstance(footprint, Disc | Ellipsoid):
+        arrays.semi_axes[i] = footprint.semi_axes
+    if not isinstance(footprint, Disc | Planar):
+        return
+    corners, rounding = footprint.core
+    axes, extents = footprint.core.axes
+    arrays.corners[i, : len(corners)] = corners
+    arrays.corners[i, len(corners) :] = corners[-1]
+    arrays.num_corners[i], arrays.num_axes[i] = len(corners), len(axes)
+    arrays.axes[i, : len(axes)], arrays.extents[i, : len(axes)] = axes, extents
+    arrays.rounding[i] = rounding
+    if not isinstance(footprint, Polygon):
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        arrays.rectangles[i] = (*((high - low) / 2), (low[0] + high[0]) / 2)

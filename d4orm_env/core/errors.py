@@ -23,14 +23,7 @@ def describe(error: BaseException) -> str:
 
 
 def unknown(what: str, value: object, known: Iterable[str], *others: str) -> ValueError:
-    """The error for a name that is none of those known, with the one that was meant perhaps.
-
-    Args:
-        what: Kind of thing; may be empty.
-        value: What was given.
-        known: Names that there are.
-        others: What else may be given.
-    """
+    """The error for a name that is none of those known, with the one that was meant perhaps, and ``others`` to give."""
     names = list(known)
     remedy = ", or ".join((f"choose one of {', '.join(names)}", *others))
     return ValueError(f"{what} {shown(value)} is unknown; {remedy}{did_you_mean(value, names)}".lstrip())

@@ -20,13 +20,9 @@ WEIGHTS = np.linspace(0, 1, 257)[1:-1]
 
 
 def pair_gap(one: Footprint, pose: Floats, other: Footprint, its_pose: Floats) -> float:
-    """Signed gap of two footprints [m]; in space that along the line of their centres.
+    """Signed gap of two footprints at poses ``(d + 1,)`` [m]; in space that along the line of their centres.
 
-    Args:
-        one: A footprint.
-        pose: ``(d + 1,)`` its place and heading. Where the heading is NaN, the disc counts that it covers anyhow.
-        other: Another.
-        its_pose: Its place and heading.
+    Where a heading is NaN, the disc counts that the footprint covers anyhow.
     """
     if len(pose) == 4:
         return _ball_gap(its_pose[:3] - pose[:3], _semi_axes(one), _semi_axes(other))

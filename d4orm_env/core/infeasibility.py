@@ -44,11 +44,8 @@ def prove_infeasible(problem: Problem) -> dict[int, str]:
     Proved are starts within the margin that cannot be left in one step, goals within it or so near to each other that
     robots at rest there are within it, and walls between start and goal. Gaps that are only a little too narrow are
     taken for wide enough, and so are those of a world many times larger than its robots. Of a footprint only the disc
-    within it counts. For models of users only
-    goals and walls count, because nothing says how far their robots get in a step.
-
-    Args:
-        problem: The problem.
+    within it counts. For models of users only goals and walls count, because nothing says how far their robots get in a
+    step.
     """
     d, reach = problem.dimension, problem.team.inner_radius + problem.margin
     starts, goals = problem.start[:, :d].astype(np.float64), problem.goal.astype(np.float64)

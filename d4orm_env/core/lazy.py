@@ -29,11 +29,7 @@ class LazyModule:
 
 
 def load(module: LazyModule) -> ModuleType:
-    """Import a module now.
-
-    Raises:
-        ImportError: If the library of an extra is missing.
-    """
+    """Import a module now."""
     try:
         return import_module(module._name)
     except ImportError as error:

@@ -19,42 +19,25 @@ class Sensed(NamedTuple):
     """Observable state of the robots, and scratch for the observation of one of them.
 
     Behind the ``K`` robots come ``N`` bodies that move among them and are none.
-
-    Attributes:
-        position: ``(K + N, d)``.
-        velocity: ``(K + N, d)``.
-        radius: ``(K + N,)``.
-        heading: ``(K, 2)`` cosine and sine, zeros for models without a heading.
-        arrived: ``(K,)`` 0 or 1.
-        hidden: ``(K + N,)`` bool, those that the robot in question does not observe.
-        ray: ``(5, 1)`` scratch for a line of sight.
-        nearest_robots: ``(num_neighbors, 2)`` scratch: squared distance, robot.
-        nearest_obstacles: ``(num_obstacles, 2)`` scratch: distance of the surface, obstacle.
     """
 
-    position: FloatArray
-    velocity: FloatArray
-    radius: FloatArray
-    heading: FloatArray
-    arrived: FloatArray
-    hidden: BoolArray
-    ray: FloatArray
-    nearest_robots: FloatArray
-    nearest_obstacles: FloatArray
+    position: FloatArray  #: ``(K + N, d)``
+    velocity: FloatArray  #: ``(K + N, d)``
+    radius: FloatArray  #: ``(K + N,)``
+    heading: FloatArray  #: ``(K, 2)`` cosine and sine, zeros for models without a heading
+    arrived: FloatArray  #: ``(K,)`` 0 or 1
+    hidden: BoolArray  #: ``(K + N,)`` bool, those that the robot in question does not observe
+    ray: FloatArray  #: ``(5, 1)`` scratch for a line of sight
+    nearest_robots: FloatArray  #: ``(num_neighbors, 2)`` scratch: squared distance, robot
+    nearest_obstacles: FloatArray  #: ``(num_obstacles, 2)`` scratch: distance of the surface, obstacle
 
 
 def observe_robot(
     k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed, time_left: float | np.float32, out: FloatArray
 ) -> None:
-    """Fill one robot's observation.
+    """Fill robot ``k``'s observation ``(D,)``, as :class:`~d4orm_env.core.observation_layout.ObservationSlices` says.
 
-    Args:
-        k: Robot.
-        arrays: The problem.
-        goal: ``(K, d)``.
-        sensed: Observable state of the robots.
-        time_left: Share of the time left, 1 to 0.
-        out: ``(D,)``, filled as :class:`~d4orm_env.core.observation_layout.ObservationSlices` says.
+    ``time_left`` is the share of the time left, 1 to 0.
     """
     d = goal.shape[1]
     neighbors = 2 * d + 8

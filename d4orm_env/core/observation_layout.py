@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
+from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, read_only, whole_number
 from d4orm_env.core.problem import Problem
 
 __all__ = ["BoundsSlack", "ObservationLayout"]
@@ -47,11 +47,11 @@ class BoundsSlack(NamedTuple):
 class OwnParts(NamedTuple):
     """Slices of the robot's own part; ``d`` position dimensions, lengths in m and speeds in m/s."""
 
-    velocity: slice  # d
-    heading: slice  # cosine and sine, both zero for a model without a heading
+    velocity: slice  #: d
+    heading: slice  #: cosine and sine, both zero for a model without a heading
     speed: slice
-    goal: slice  # d, vector to the goal
-    time_left: slice  # share of the time that is left, 1 to 0
+    goal: slice  #: d, vector to the goal
+    time_left: slice  #: share of the time that is left, 1 to 0
     arrived: slice
     radius: slice
     max_speed: slice
@@ -62,8 +62,8 @@ class NeighborParts(NamedTuple):
     """Slices of a neighbour's part; all zeros for an absent one."""
 
     present: slice
-    position: slice  # d, relative to its own
-    velocity: slice  # d, relative to its own
+    position: slice  #: d, relative to its own
+    velocity: slice  #: d, relative to its own
     radius: slice
 
 
@@ -71,14 +71,14 @@ class ObstacleParts(NamedTuple):
     """Slices of the part of an obstacle or a wall of the bounds, likewise."""
 
     present: slice
-    position: slice  # d, vector to the nearest point of the surface
-    gap: slice  # between the two surfaces
+    position: slice  #: d, vector to the nearest point of the surface
+    gap: slice  #: between the two surfaces
 
 
 class PathParts(NamedTuple):
     """Slices of the part on its shortest path, from the first component of that on."""
 
-    direction: slice  # d, unit vector along it; zero at the goal
+    direction: slice  #: d, unit vector along it; zero at the goal
     length: slice
 
 
@@ -87,22 +87,15 @@ Parts: TypeAlias = OwnParts | NeighborParts | ObstacleParts | PathParts
 
 @dataclass(frozen=True)
 class ObservationSlices:
-    """Slices of an observation: the robot's own part, each neighbour's, each obstacle's, the rays, and the path.
+    """Slices of an observation: the robot's own part, each neighbour's, each obstacle's, the rays, and the path."""
 
-    Attributes:
-        dimension: ``d``.
-        num_neighbors: Neighbours listed, nearest first.
-        num_obstacles: Obstacles listed, nearest first; walls of the bounds are among them.
-        num_rays: Rays of its range sensor, counter-clockwise, the first along its heading, or along the x axis for a
-            model without one: how far each reaches [m].
-        observed_path: Whether the path is there.
-    """
-
-    dimension: int
-    num_neighbors: int
-    num_obstacles: int
+    dimension: int  #: ``d``
+    num_neighbors: int  #: Neighbours listed, nearest first
+    num_obstacles: int  #: Obstacles listed, nearest first; walls of the bounds are among them
+    #: Rays of its range sensor, counter-clockwise, the first along its heading, or along the x axis for a model without
+    #: one: how far each reaches [m]
     num_rays: int = field(default=0, kw_only=True)
-    observed_path: bool = field(default=False, kw_only=True)
+    observed_path: bool = field(default=False, kw_only=True)  #: Whether the path is there
 
     def __post_init__(self) -> None:
         for name in ("num_neighbors", "num_obstacles", "num_rays"):
@@ -134,9 +127,7 @@ class ObservationSlices:
         """``(num_rays, 2)`` unit vectors of the rays in the robot's frame, read-only."""
         angles = 2 * np.pi * np.arange(self.num_rays) / max(self.num_rays, 1)
         sine, cosine = portable.sin_cos(angles)
-        directions = np.stack([cosine, sine], axis=1).astype(np.float32)
-        directions.setflags(write=False)
-        return directions
+        return read_only(np.stack([cosine, sine], axis=1).astype(np.float32))
 
     @cached_property
     def size(self) -> int:
@@ -235,9 +226,7 @@ class ObservationLayout(ObservationSlices):
     @cached_property
     def bounds(self) -> FloatArray:
         """``(2, D)`` lower and upper bounds in one array, read-only."""
-        bounds: FloatArray = np.stack([self.low, self.high])
-        bounds.setflags(write=False)
-        return bounds
+        return read_only(np.stack([self.low, self.high]))
 
 
 def _check_sight(problem: Problem, num_rays: int, line_of_sight: bool) -> None:
@@ -270,9 +259,7 @@ def _bounds(problem: Problem, slices: ObservationSlices, slack: BoundsSlack, ray
     rays = np.tile(np.array([[0], [ray_range]], np.float32), slices.num_rays)
     path = _ends(slices.path, direction=1, length=WINDING * reach)
     parts = [own, *[neighbor] * slices.num_neighbors, *[obstacle] * slices.num_obstacles, rays]
-    bounds = np.concatenate([*parts, *[path] * slices.observed_path], axis=1)
-    bounds.setflags(write=False)
-    return bounds
+    return read_only(np.concatenate([*parts, *[path] * slices.observed_path], axis=1))
 
 
 def _ends(parts: Parts, **largest: float) -> FloatArray:

@@ -1,13 +1,10 @@
 """Sine, cosine, arc tangent, exponential and logarithm with the same bits on every processor.
 
 NumPy and the C library choose among versions of these functions by the processor's instruction set, and their last
-bits differ. Where a result must be a function of its input alone, such as a verdict on a plan, these are used instead.
-They are made of NumPy's elementwise ``+ - * /``, rounding and comparison only, which IEEE 754 defines to the bit; each
-operation is a call of its own, so that no compiler can fuse two of them.
-
-All take arrays of any shape, or numbers, and compute in float64. Where every argument is a float32 array or number, the
-result is rounded to float32. They are accurate to about 1 ulp over the whole range, and keep IEEE's signs and special
-values; what is not finite or outside a function's domain gives infinity or NaN without a warning.
+bits differ. These are made of NumPy's elementwise ``+ - * /``, rounding and comparison only, which IEEE 754 defines to
+the bit; each operation is a call of its own, so that no compiler can fuse two. All compute in float64, and round to
+float32 where every argument is. They are accurate to about 1 ulp over the whole range, and keep IEEE's signs and
+special values; what is not finite or outside a function's domain gives infinity or NaN without a warning.
 
 The polynomials and the reduction of arguments are those of fdlibm (Sun Microsystems, 1993).
 """
@@ -27,7 +24,6 @@ from d4orm_env.dynamics.robot_model import Ops
 Real: TypeAlias = Any
 """An array or a number, float32 or float64, whichever the arguments are."""
 Part = TypeVar("Part", Floats, float)
-"""Arrays of float64, or one number of Python."""
 Function = Callable[..., Real]
 
 _TWO_OVER_PI = 6.36619772367581382433e-01
@@ -38,8 +34,7 @@ _HALF_PI = (
     8.47842766036889956997e-32,
 )
 """pi/2 in parts; the first three have 33 bits, so that their products with a quadrant below 2**20 are exact."""
-_REDUCED_EXACTLY = 2.0**20
-"""Magnitude from which on arguments are reduced in whole numbers, one by one."""
+_REDUCED_EXACTLY = 2.0**20  # magnitude from which on arguments are reduced in whole numbers, one by one
 _PI_BITS = 1200  # the largest float64 has 1024 bits before the point, and 176 are left behind it
 
 _SINE = (
@@ -92,22 +87,17 @@ _ONE_OVER_LN2 = 1.44269504088896338700e00
 _SQRT_HALF = 7.07106781186547524401e-01
 _PI, _PI_LOW = 3.14159265358979311600e00, 1.22464679914735317722e-16
 
-# The arc tangent of q >= 0 is that of a known point, high and low part, plus that of (a q + b) / (c q + d), which is
-# small. The points are 0, 1/2, 1, 3/2 and infinity.
 _ARC_LIMITS = (7 / 16, 11 / 16, 19 / 16, 39 / 16)
-_ARC_HIGH = np.array(
-    [0.0, 4.63647609000806093515e-01, 7.85398163397448278999e-01, 9.82793723247329054082e-01, 1.57079632679489655800e00]
-)
-_ARC_LOW = np.array(
+_ARCS = np.array(
     [
-        0.0,
-        2.26987774529616870924e-17,
-        3.06161699786838301793e-17,
-        1.39033110312309984516e-17,
-        6.12323399573676603587e-17,
+        (0.0, 0.0, 1, 0, 0, 1),
+        (4.63647609000806093515e-01, 2.26987774529616870924e-17, 2, -1, 1, 2),
+        (7.85398163397448278999e-01, 3.06161699786838301793e-17, 1, -1, 1, 1),
+        (9.82793723247329054082e-01, 1.39033110312309984516e-17, 1, -1.5, 1.5, 1),
+        (1.57079632679489655800e00, 6.12323399573676603587e-17, 0, -1, 1, 0),
     ]
-)
-_ARC_SHIFT = np.array([[1, 0, 0, 1], [2, -1, 1, 2], [1, -1, 1, 1], [1, -1.5, 1.5, 1], [0, -1, 1, 0]]).T
+).T
+"""Arc tangents of 0, 1/2, 1, 3/2 and infinity, high and low part, and a to d; the rest is of (a q + b) / (c q + d)."""
 
 
 def _in_float64(function: Function) -> Function:
@@ -119,9 +109,9 @@ def _in_float64(function: Function) -> Function:
         single = all(array.dtype == np.float32 for array in arrays)
         with np.errstate(all="ignore"):
             result = function(*(array.astype(np.float64, copy=False) for array in arrays))
-            if isinstance(result, tuple):
-                return tuple(np.float32(part) for part in result) if single else result
-            return np.float32(result) if single else result
+            if not single:
+                return result
+            return tuple(map(np.float32, result)) if isinstance(result, tuple) else np.float32(result)
 
     return wrapper
 
@@ -241,10 +231,10 @@ def _arc_tangent(q: Floats) -> Floats:
     """Arc tangent of ``q >= 0``."""
     q = np.minimum(q, 1e300)  # keeps zero times infinity out of the shift
     index = sum((q >= limit).astype(np.intp) for limit in _ARC_LIMITS)
-    a, b, c, d = (column[index] for column in _ARC_SHIFT)
+    high, low, a, b, c, d = (column[index] for column in _ARCS)
     x = (a * q + b) / (c * q + d)
     square = x * x
-    return _ARC_HIGH[index] - ((x * (square * _polynomial(square, _ARC_TANGENT)) - _ARC_LOW[index]) - x)
+    return high - ((x * (square * _polynomial(square, _ARC_TANGENT)) - low) - x)
 
 
 def _reduced(x: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:

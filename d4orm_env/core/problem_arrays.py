@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.arrays import FloatArray, read_only
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 from d4orm_env.dynamics.transition import docking_speed
 from d4orm_env.geometry.world_index import WorldIndex
@@ -20,51 +20,32 @@ if TYPE_CHECKING:
 
 
 class ProblemArrays(NamedTuple):
-    """A problem as the engines read it: plain arrays, float32 unless said, one struct for numba and JAX alike.
+    """A problem as the engines read it: plain arrays, float32 unless said, one struct for numba and JAX alike."""
 
-    Attributes:
-        model_codes: ``(K,)`` int32.
-        limits: ``(K, L)`` see :attr:`~d4orm_env.core.team.Team.limits`.
-        radius: ``(K,)``.
-        start: ``(K, n)``.
-        goal: ``(K, d)``.
-        inverse_initial_distance: ``(K,)`` one over the distance from start to goal (at least the goal radius).
-        boxes: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`.
-        triangles: ``(., 6)`` more of them.
-        grid: Their index.
-        bounds: ``(2, d)``, infinite where open.
-        time_step: ``(4,)`` dt, dt/2, dt/3, dt/6.
-        margin: ``()``.
-        squared_goal_radius: ``()``.
-        squared_goal_speed: ``(K,)`` with the allowance for rounding; infinite without a limit.
-        docks: ``()`` bool: a robot that has arrived stays there for good.
-        collision_penalty: ``()``.
-        turns_at_goals: ``()`` bool, true; ``None`` if no robot has a goal heading, and so are the next two.
-        goal_direction: ``(K, 2)`` goal headings as unit vectors, zero for none.
-        squared_goal_chord: ``(K,)`` square of the chord by which they may be missed, infinite for none.
-        footprints: Of a team that is not all discs; the radii are then those of discs round them. Else ``None``:
-            numba leaves out of a kernel what asks whether an argument is ``None`` and would go on if it were not.
-    """
-
-    model_codes: NDArray[np.int32]
-    limits: FloatArray
-    radius: FloatArray
-    start: FloatArray
-    goal: FloatArray
+    model_codes: NDArray[np.int32]  #: ``(K,)`` int32
+    limits: FloatArray  #: ``(K, L)`` see :attr:`~d4orm_env.core.team.Team.limits`
+    radius: FloatArray  #: ``(K,)``
+    start: FloatArray  #: ``(K, n)``
+    goal: FloatArray  #: ``(K, d)``
+    #: ``(K,)`` one over the distance from start to goal (at least the goal radius)
     inverse_initial_distance: FloatArray
-    boxes: FloatArray
-    triangles: FloatArray
-    grid: WorldIndex
-    bounds: FloatArray
-    time_step: FloatArray
-    margin: np.float32
-    squared_goal_radius: np.float32
-    squared_goal_speed: FloatArray
-    docks: np.bool_
-    collision_penalty: np.float32
+    boxes: FloatArray  #: ``(., 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`
+    triangles: FloatArray  #: ``(., 6)`` more of them
+    grid: WorldIndex  #: Their index
+    bounds: FloatArray  #: ``(2, d)``, infinite where open
+    time_step: FloatArray  #: ``(4,)`` dt, dt/2, dt/3, dt/6
+    margin: np.float32  #: ``()``
+    squared_goal_radius: np.float32  #: ``()``
+    squared_goal_speed: FloatArray  #: ``(K,)`` with the allowance for rounding; infinite without a limit
+    docks: np.bool_  #: ``()`` bool: a robot that has arrived stays there for good
+    collision_penalty: np.float32  #: ``()``
+    #: ``()`` bool, true; ``None`` if no robot has a goal heading, and so are the next two
     turns_at_goals: np.bool_ | None
-    goal_direction: FloatArray | None
+    goal_direction: FloatArray | None  #: ``(K, 2)`` goal headings as unit vectors, zero for none
+    #: ``(K,)`` square of the chord by which they may be missed, infinite for none
     squared_goal_chord: FloatArray | None
+    #: Of a team that is not all discs; the radii are then those of discs round them. Else ``None``: numba leaves out of
+    #: a kernel what asks whether an argument is ``None`` and would go on if it were not.
     footprints: FootprintArrays | None
 
 
@@ -111,10 +92,7 @@ def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:
         squared_goal_chord=squared_chords(problem.goal_heading, problem.goal_heading_tolerance) if turns else None,
         footprints=problem.team.footprint_arrays,
     )
-    for array in arrays:
-        if isinstance(array, np.ndarray):
-            array.setflags(write=False)
-    return arrays
+    return read_only(arrays)
 
 
 def digest_of(problem: Problem) -> str:

@@ -51,11 +51,7 @@ class Registry(Mapping[str, T]):
         self._admitted: dict[str, T] = {}
 
     def add(self, name: str, thing: object) -> None:
-        """Register a thing, or the text ``"package.module:Name"`` of one; again if defined anew.
-
-        Raises:
-            ValueError: If the name is none, or taken by another, or the thing does not belong here.
-        """
+        """Register a thing, or the text ``"package.module:Name"`` of one; again if defined anew."""
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise ValueError(
                 f"{self.what} name {shown(name)} is none; give one of letters, digits, hyphens, dots and underscores"
@@ -73,12 +69,7 @@ class Registry(Mapping[str, T]):
         return tuple(self._registered)
 
     def origin(self, name: str) -> object:
-        """Return what was registered under a name, or its import path.
-
-        Raises:
-            KeyError: If there is no such name.
-            ValueError: If several lay claim to it.
-        """
+        """Return what was registered under a name, or its import path."""
         claims = [self._registered[name]] if name in self._registered else []
         claims += [f"{entry.module}:{entry.attr}" for entry in self._entry_points.get(name, ())]
         if not claims:
@@ -97,21 +88,13 @@ class Registry(Mapping[str, T]):
         return all(other == first for other in others)
 
     def look_up(self, name: object) -> T:
-        """Return the thing of this name.
-
-        Raises:
-            ValueError: If nothing has, several lay claim to it, or it cannot be loaded.
-        """
+        """Return the thing of this name."""
         if not isinstance(name, str) or name not in self:
             raise unknown(self.what, name, self)
         return self[name]
 
     def find(self, text: object) -> T:
-        """Return the thing that a name, or an import path, stands for.
-
-        Raises:
-            ValueError: As :meth:`look_up` and :func:`load_reference`.
-        """
+        """Return the thing that a name, or an import path, stands for."""
         if not isinstance(text, str) or text in self or ":" not in text:
             return self.look_up(text)
         try:
@@ -229,11 +212,7 @@ def written(thing: object) -> type | Callable[..., object]:
 
 
 def check_sendable(thing: object, owner: str) -> None:
-    """Find out whether other processes can import what a thing is made of.
-
-    Raises:
-        ValueError: If not.
-    """
+    """Find out whether other processes can import what a thing is made of."""
     remedy = "define it at the top level of a module that is a file, or run with workers=1 and no trial_timeout"
     try:
         pickle.dumps(thing)

@@ -15,27 +15,16 @@ _MEASURED = "flown in crazyflow 0.4.0 with the Mellinger controller: largest tra
 
 @dataclass(frozen=True, kw_only=True)
 class RobotType:
-    """A robot that can be bought. Numbers are what it reaches in a team's everyday, not its records.
+    """A robot that can be bought. Numbers are what it reaches in a team's everyday, not its records."""
 
-    Attributes:
-        model: Name of its model.
-        radius: Of the circle (sphere) around it [m].
-        max_speed: [m/s].
-        max_acceleration: [m/s^2]; of no use to first-order models.
-        max_turn_rate: [rad/s]; of no use to models without a heading.
-        margin: Distance for what tracking is off [m].
-        lag: Time constant of its actuators [s], for :class:`~d4orm_planners.base.controller.Controller`.
-        sources: Where the numbers come from, by attribute.
-    """
-
-    model: str
-    radius: float
-    max_speed: float
-    max_acceleration: float = 1.0
-    max_turn_rate: float = 1.0
-    margin: float
-    lag: float
-    sources: Mapping[str, str]
+    model: str  #: Name of its model
+    radius: float  #: Of the circle (sphere) around it [m]
+    max_speed: float  #: [m/s]
+    max_acceleration: float = 1.0  #: [m/s^2]; of no use to first-order models
+    max_turn_rate: float = 1.0  #: [rad/s]; of no use to models without a heading
+    margin: float  #: Distance for what tracking is off [m]
+    lag: float  #: Time constant of its actuators [s], for :class:`~d4orm_planners.base.controller.Controller`
+    sources: Mapping[str, str]  #: Where the numbers come from, by attribute
 
     @property
     def settings(self) -> dict[str, object]:
@@ -98,11 +87,7 @@ ROBOTS: Mapping[str, RobotType] = MappingProxyType({
 
 
 def find_robot(name: str) -> RobotType:
-    """The robot of that name.
-
-    Raises:
-        ValueError: If there is none; the message lists those there are.
-    """
+    """The robot of that name."""
     if not isinstance(name, str) or name not in ROBOTS:
         raise ValueError(f"robot {shown(name)} is unknown; choose one of {', '.join(ROBOTS)}")
     return ROBOTS[name]

@@ -20,11 +20,9 @@ def team_text(models: Iterable[str]) -> str:
 
 
 def outcome_rows(metrics: dict[str, float], num_robots: int) -> list[KeyFigure]:
-    """The key figures of a motion: what arrived, what went wrong, and how long it took.
+    """The key figures of a plan or an episode: what arrived, what went wrong, and how long it took.
 
-    Args:
-        metrics: Of a plan or an episode; those that it lacks are left out.
-        num_robots: Size of the team.
+    Metrics that it lacks are left out.
     """
     texts = {
         "arrived": ("arrived", f"{{:.0f}} of {num_robots}"),

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, shown
-from d4orm_env.core.bodies import Body, body_poses, find_bodies
-from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
+from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, read_only, shown
+from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, find_bodies
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint, Train
@@ -220,15 +219,12 @@ class Team(Frozen):
         for robot, model in enumerate(models):
             for column, limit in enumerate(model.own_limits, len(STANDARD_LIMITS)):
                 limits[robot, column] = self.own_limits[limit.name][robot]
-        limits.setflags(write=False)
-        return limits
+        return read_only(limits)
 
     @cached_property
     def control_limits(self) -> FloatArray:
         """``(K, m)`` largest magnitude of each control component; zero on padding."""
-        limits = np.abs(self.control_bounds).max(axis=0)
-        limits.setflags(write=False)
-        return limits
+        return read_only(np.abs(self.control_bounds).max(axis=0))
 
     @cached_property
     def control_bounds(self) -> FloatArray:
@@ -237,8 +233,7 @@ class Team(Frozen):
         for robot, (model, limits) in enumerate(zip(self.robot_models, self.limits, strict=True)):
             bounds[0, robot, : model.control_size] = -model.lower_bounds(limits)[list(model.control_limits)]
             bounds[1, robot, : model.control_size] = limits[list(model.control_limits)]
-        bounds.setflags(write=False)
-        return bounds
+        return read_only(bounds)
 
     @cached_property
     def control_units(self) -> FloatArray:
@@ -248,8 +243,7 @@ class Team(Frozen):
             defaults = np.array([*DEFAULT_LIMITS, *(limit.default for limit in model.own_limits)], np.float32)
             size, columns = model.control_size, list(model.control_limits)
             units[robot, :size] = self.limits[robot, columns] / defaults[columns]
-        units.setflags(write=False)
-        return units
+        return read_only(units)
 
     @cached_property
     def largest_radius(self) -> float:
@@ -263,9 +257,7 @@ class Team(Frozen):
     def turning_radius(self) -> FloatArray:
         """``(K,)`` radius of the smallest circle that each can drive [m]; zero for those that turn in place."""
         models = zip(self.robot_models, self.limits, strict=True)
-        radius = np.array([model.turning_radius(limits) for model, limits in models], np.float32)
-        radius.setflags(write=False)
-        return radius
+        return read_only(np.array([model.turning_radius(limits) for model, limits in models], np.float32))
 
     def select(self, robots: Sequence[int]) -> Team:
         """The team of these robots only, in the order given."""

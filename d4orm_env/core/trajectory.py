@@ -64,16 +64,11 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class DisturbanceEvents:
-    """Disturbances that a team met in ``T`` steps.
+    """Disturbances that a team met in ``T`` steps."""
 
-    Attributes:
-        pushed: ``(T + 1, K, d)`` velocity that the step before gave to each robot [m/s]; zero for none.
-        stalled: ``(T + 1, K)`` bool: does not obey.
-        bodies: ``(T + 1, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots.
-    """
-
-    pushed: FloatArray
-    stalled: BoolArray
+    pushed: FloatArray  #: ``(T + 1, K, d)`` velocity that the step before gave to each robot [m/s]; zero for none
+    stalled: BoolArray  #: ``(T + 1, K)`` bool: does not obey
+    #: ``(T + 1, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots
     bodies: FloatArray
 
     def until(self, step: int) -> DisturbanceEvents:

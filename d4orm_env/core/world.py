@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Frozen, frozen_array
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Frozen, frozen_array, read_only
 from d4orm_env.geometry.polygon import MAX_ALL_CORNERS, check_polygon, triangulate
 from d4orm_env.geometry.shapes import Shapes
 from d4orm_env.geometry.world_index import WorldIndex, build_index, is_farther, nearest_distance
@@ -164,11 +164,8 @@ class World(Frozen):
         triangles = [
             corners[np.array(own)].reshape(-1, 6) for corners, own in zip(self.polygons, self.triangles, strict=True)
         ]
-        boxes: FloatArray = np.concatenate(rows)
-        angular: FloatArray = np.concatenate([np.empty((0, 6), np.float32), *triangles])
-        for table in (boxes, angular):
-            table.setflags(write=False)
-        return Shapes(boxes, angular)
+        angular = np.concatenate([np.empty((0, 6), np.float32), *triangles])
+        return Shapes(*read_only((np.concatenate(rows), angular)))
 
     @cached_property
     def _indices(self) -> dict[tuple[float, int, float, int, float], WorldIndex]:

@@ -17,8 +17,7 @@ if "scipy" in sys.modules and os.environ.get("SCIPY_ARRAY_API") != "1":
         "SCIPY_ARRAY_API=1, or import d4orm_env.crazyflow first"
     )
 
-from d4orm_env.crazyflow.drone_bodies import DroneBodies, DronePhysics, check_problem
-from d4orm_env.crazyflow.environment import parallel_env
+from d4orm_env.crazyflow.environment import DroneBodies, DronePhysics, check_problem, parallel_env
 from d4orm_env.crazyflow.flight import FlightRecord
 
 __all__ = ["DroneBodies", "DronePhysics", "FlightRecord", "check_problem", "parallel_env"]

@@ -26,16 +26,9 @@ _QUATERNION_W = 12
 
 
 class Flight:
-    """Drones in the air.
+    """Drones in the air, at ``position`` ``(K, 3)`` [m] and ``velocity`` ``(K, 3)`` [m/s].
 
-    Args:
-        num_drones: ``K``.
-        drone: Their type.
-        mass_factor: Their mass over that which their controller reckons with.
-
-    Attributes:
-        position: ``(K, 3)`` [m].
-        velocity: ``(K, 3)`` [m/s].
+    Their mass is ``mass_factor`` times that which their controller reckons with.
     """
 
     def __init__(self, num_drones: int, drone: str, mass_factor: float) -> None:
@@ -65,16 +58,9 @@ class Flight:
         self._look()
 
     def fly(self, position: Floats, velocity: Floats, acceleration: Floats, force: Floats) -> Floats:
-        """Follow setpoints, one after the other, each for a period.
+        """Follow setpoints ``(S, K, 3)`` [m, m/s, m/s^2], one after the other, each for a period.
 
-        Args:
-            position: ``(S, K, 3)`` [m].
-            velocity: ``(S, K, 3)`` [m/s].
-            acceleration: ``(S, K, 3)`` [m/s^2].
-            force: ``(S, K, 3)`` that acts on the drones from outside [N].
-
-        Returns:
-            ``(S, K, 3)`` positions at the ends of the periods.
+        The force ``(S, K, 3)`` acts on the drones from outside [N]. Returned are positions at the ends of the periods.
         """
         commands = np.zeros((*position.shape[:2], COMMAND_SIZE), np.float32)
         commands[..., :9] = np.concatenate([position, velocity, acceleration], axis=2)

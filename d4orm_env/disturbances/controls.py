@@ -8,16 +8,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, shown, whole_number
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, M, Memory, Scene
-from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.levels import (
+from d4orm_env.disturbances.disturbance import (
     MAX_DELAY,
+    Disturbance,
+    Kept,
+    M,
+    Memory,
+    Scene,
     check_components,
     level,
     per_component,
@@ -26,12 +29,7 @@ from d4orm_env.disturbances.levels import (
     standard_deviation,
     truth,
 )
-
-
-class Drawn(NamedTuple):
-    """Random values of an episode, from its beginning or drawn on: ``values`` ``(B, K, .)``."""
-
-    values: FloatArray
+from d4orm_env.disturbances.draws import Draws
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class ControlNoise(_Spread[Memory]):
 
 
 @dataclass(frozen=True)
-class CorrelatedNoise(_Spread[Drawn]):
+class CorrelatedNoise(_Spread[Kept]):
     """Gaussian noise on the controls that is correlated over time: an Ornstein-Uhlenbeck process per component.
 
     It is stationary from the beginning, with autocorrelation ``exp(-t / time_constant)`` (G. E. Uhlenbeck and L. S.
@@ -75,10 +73,10 @@ class CorrelatedNoise(_Spread[Drawn]):
 
     time_constant: float = level(partial(positive_number, most=LARGEST), 1.0)
 
-    def begin(self, scene: Scene, draws: Draws) -> Drawn:
-        return Drawn(draws.normal(*scene.controls.shape[1:]))
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
+        return Kept(draws.normal(*scene.controls.shape[1:]))
 
-    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+    def command(self, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws) -> FloatArray:
         disturbed = controls + scaled(self.std, memory.values)
         kept = math.exp(-scene.problem.dt / self.time_constant)
         fresh = draws.normal(*controls.shape[1:])
@@ -88,22 +86,22 @@ class CorrelatedNoise(_Spread[Drawn]):
 
 
 @dataclass(frozen=True)
-class Bias(_Spread[Drawn]):
+class Bias(_Spread[Kept]):
     """A constant added to the controls of a robot, Gaussian, drawn per robot, component and episode.
 
     Attributes:
         std: Standard deviation, one number or one per component [control units].
     """
 
-    def begin(self, scene: Scene, draws: Draws) -> Drawn:
-        return Drawn(scaled(self.std, draws.normal(*scene.controls.shape[1:])))
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
+        return Kept(scaled(self.std, draws.normal(*scene.controls.shape[1:])))
 
-    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+    def command(self, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws) -> FloatArray:
         return controls + memory.values
 
 
 @dataclass(frozen=True)
-class Gain(Disturbance[Drawn]):
+class Gain(Disturbance[Kept]):
     """Weaker or stronger motors: the controls of a robot times ``1 + std n``, at least zero, drawn per robot and
     episode. They are clipped to the limits afterwards.
 
@@ -113,11 +111,11 @@ class Gain(Disturbance[Drawn]):
 
     std: float = level(standard_deviation, off=0)
 
-    def begin(self, scene: Scene, draws: Draws) -> Drawn:
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
         factors = 1 + np.float32(self.std) * draws.normal(scene.problem.num_robots, 1)
-        return Drawn(np.maximum(factors, np.float32(0)))
+        return Kept(np.maximum(factors, np.float32(0)))
 
-    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+    def command(self, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws) -> FloatArray:
         return controls * memory.values
 
 
@@ -136,12 +134,6 @@ class Quantisation(Disturbance[Memory]):
         return np.rint(controls / step) * step
 
 
-class Queue(NamedTuple):
-    """The last commands, the newest first: ``values`` ``(B, L, K, m)``."""
-
-    values: FloatArray
-
-
 def _steps_or_range(value: Any, name: str) -> int | tuple[int, int]:
     ends = value if isinstance(value, tuple | list) else (value, value)
     if len(ends) != 2:
@@ -152,7 +144,7 @@ def _steps_or_range(value: Any, name: str) -> int | tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Delay(Disturbance[Queue]):
+class Delay(Disturbance[Kept]):
     """Commands are executed some time steps late; until the first one arrives, the control is zero.
 
     Attributes:
@@ -165,11 +157,11 @@ class Delay(Disturbance[Queue]):
     def _range(self) -> tuple[int, int]:
         return self.steps if isinstance(self.steps, tuple) else (self.steps, self.steps)
 
-    def begin(self, scene: Scene, draws: Draws) -> Queue:
-        worlds, *shape = scene.controls.shape
-        return Queue(np.zeros((worlds, self._range[1] + 1, *shape), np.float32))
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
+        worlds, *shape = scene.controls.shape  # of the last commands, the newest first
+        return Kept(np.zeros((worlds, self._range[1] + 1, *shape), np.float32))
 
-    def command(self, controls: FloatArray, memory: Queue, scene: Scene, draws: Draws) -> FloatArray:
+    def command(self, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws) -> FloatArray:
         least, most = self._range
         memory.values[:, 1:] = memory.values[:, :-1]
         memory.values[:, 0] = controls
@@ -180,7 +172,7 @@ class Delay(Disturbance[Queue]):
 
 
 @dataclass(frozen=True)
-class Lag(Disturbance[Drawn]):
+class Lag(Disturbance[Kept]):
     """Slow actuators: what a robot does follows what it is told as a first-order system, from rest.
 
     A time step executes the mean of what happens in it.
@@ -191,10 +183,10 @@ class Lag(Disturbance[Drawn]):
 
     time_constant: float = level(standard_deviation, off=0)
 
-    def begin(self, scene: Scene, draws: Draws) -> Drawn:
-        return Drawn(np.zeros_like(scene.controls))
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
+        return Kept(np.zeros_like(scene.controls))
 
-    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+    def command(self, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws) -> FloatArray:
         steps = scene.problem.dt / self.time_constant
         left = math.exp(-steps)
         gap = memory.values - controls
@@ -204,7 +196,7 @@ class Lag(Disturbance[Drawn]):
 
 
 @dataclass(frozen=True)
-class Dropout(Disturbance[Drawn]):
+class Dropout(Disturbance[Kept]):
     """Commands get lost on their way, independently for every robot and step.
 
     Attributes:
@@ -215,10 +207,10 @@ class Dropout(Disturbance[Drawn]):
     probability: float = level(share, off=0)
     hold: bool = level(truth, True)
 
-    def begin(self, scene: Scene, draws: Draws) -> Drawn:
-        return Drawn(np.zeros_like(scene.controls))
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
+        return Kept(np.zeros_like(scene.controls))
 
-    def command(self, controls: FloatArray, memory: Drawn, scene: Scene, draws: Draws) -> FloatArray:
+    def command(self, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws) -> FloatArray:
         lost = draws.uniform(controls.shape[1]) < self.probability
         np.copyto(memory.values, controls, where=~lost[..., None])
         if not self.hold:

@@ -7,15 +7,15 @@ to the bit. All arrays have a leading axis over the worlds.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
-from functools import reduce
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from functools import partial, reduce
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, shown
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, positive_number, shown
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -27,6 +27,12 @@ Memory = tuple[NDArray[np.generic], ...]
 """Memory of a disturbance over an episode: arrays ``(B, ...)``, changed in place. A ``NamedTuple`` names them."""
 
 M = TypeVar("M", bound=Memory)
+
+
+class Kept(NamedTuple):
+    """A memory of one array ``(B, ...)``."""
+
+    values: FloatArray
 
 
 class Scene(NamedTuple):
@@ -212,11 +218,7 @@ def checked_disturbances(given: object) -> Disturbances:
 
 
 def at_work(disturbances: Disturbances, problem: Problem) -> Disturbances:
-    """Return those that change anything, so that all others leave the environment as it is to the bit.
-
-    Raises:
-        ValueError: If the robots or the world of the problem cannot have one of them.
-    """
+    """Return those that change anything, so that all others leave the environment as it is to the bit."""
     for one in disturbances:
         one.check(problem)
     return tuple(one for one in disturbances if not one.negligible)
@@ -237,3 +239,60 @@ def marks_of(effects: Sequence[DisturbanceEffect], problem: Problem) -> Disturba
         stalled=np.concatenate([obeying if effect.stalled is None else effect.stalled for effect in effects]),
         bodies=np.concatenate([nothing if effect.bodies is None else effect.bodies for effect in effects]),
     )
+
+
+MAX_DELAY = 1000
+"""Most steps of a delay: every world remembers so many."""
+Check = Callable[[Any, str], object]
+"""``(value, name) -> value`` as it is kept, or a ``ValueError`` that has the name."""
+
+standard_deviation: Callable[[object, str], float] = partial(positive_number, zero_allowed=True, most=LARGEST)
+"""A number of zero or more."""
+share: Callable[[object, str], float] = partial(positive_number, zero_allowed=True, most=1.0)
+"""A probability."""
+
+
+def level(check: Check, default: object = MISSING, **neutral: object) -> Any:
+    """An attribute of a disturbance that is checked; where it is ``off=``, if that is given, nothing is disturbed."""
+    return field(default=default, metadata={"check": check, **neutral})
+
+
+def unless(special: object, check: Check) -> Check:
+    """The check of all values but a special one."""
+    return lambda value, name: value if value is special or value == special else check(value, name)
+
+
+def truth(value: object, name: str) -> bool:
+    """True or False."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} is {shown(value)}; it must be True or False")
+    return value
+
+
+def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:
+    """One number, or one per control component, of zero or more."""
+    try:
+        array = as_float32(value)
+    except ValueError:
+        raise ValueError(f"{name} must be a number or one per control component, not {shown(value)}") from None
+    if array.ndim > 1:
+        raise ValueError(f"{name} has shape {array.shape}; give one number, or one per control component")
+    if not np.isfinite(array).all() or (array < 0).any():
+        raise ValueError(f"{name} is {shown(value)}; it must be zero or more and finite")
+    if (array > LARGEST).any():
+        raise ValueError(f"{name} is {shown(value)}; it must be at most {LARGEST:g}")
+    return tuple(array.tolist()) if array.ndim else float(np.asarray(value, np.float64))
+
+
+def check_components(value: float | tuple[float, ...], name: str, control_size: int) -> None:
+    """Refuse levels that are neither one nor one per control component."""
+    if isinstance(value, tuple) and len(value) != control_size:
+        raise ValueError(
+            f"{name} has shape ({len(value)},); give one number, or {control_size}, one per control component"
+        )
+
+
+def scaled(value: float | tuple[float, ...], numbers: FloatArray) -> FloatArray:
+    """``numbers`` ``(..., m)`` times levels."""
+    level = np.array(value, np.float32) if isinstance(value, tuple) else np.float32(value)
+    return level * numbers

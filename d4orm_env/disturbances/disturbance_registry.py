@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import shown
+from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.registry import Registry
-from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance
 from d4orm_env.disturbances.moving_obstacle import Intruder
@@ -109,21 +109,13 @@ def _split_path(text: str) -> tuple[str, str, str]:
 
 
 def disturbance_at(text: str, level: object) -> AnyDisturbance:
-    """The disturbance of a name, as for :func:`find_level`, at a level, all else as by default.
-
-    Raises:
-        ValueError: If there is no such disturbance, the level makes no sense, or another attribute has no default.
-    """
+    """The disturbance of a name, as for :func:`find_level`, at a level, all else as by default."""
     kind, attribute, fixed = find_level(text)
     return _make(kind, {**fixed, attribute: level}, text)
 
 
 def disturbances_at(levels: Mapping[str, object]) -> tuple[AnyDisturbance, ...]:
-    """Disturbances by name and level; what is said of several attributes of one kind is said of one disturbance.
-
-    Raises:
-        ValueError: As :func:`disturbance_at`, or if an attribute is given twice.
-    """
+    """Disturbances by name and level; what is said of several attributes of one kind is said of one disturbance."""
     kinds: dict[type[AnyDisturbance], dict[str, object]] = {}
     for text, level in levels.items():
         kind, attribute, fixed = find_level(text)

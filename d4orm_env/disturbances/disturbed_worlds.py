@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, read_only
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, DisturbanceEffect, Memory, Observed, Scene
@@ -66,13 +66,8 @@ class _ActiveDisturbance:
 
 
 class DisturbedWorlds:
-    """Disturbances with the memory of ``B`` worlds.
-
-    Args:
-        disturbances: In the order in which they act; none of them negligible.
-        problem: Problem that the worlds share.
-        num_worlds: ``B``.
-        max_cycles: Steps in an episode.
+    """Disturbances in the order in which they act, none of them negligible, with the memory of ``B`` worlds of a
+    problem.
     """
 
     def __init__(
@@ -110,9 +105,7 @@ class DisturbedWorlds:
         """``(K, L)`` what limits truly are, read-only."""
         for one in self._all:
             limits = one.disturbance.limits(limits)
-        limits = np.array(limits, np.float32)
-        limits.setflags(write=False)
-        return limits
+        return read_only(np.array(limits, np.float32))
 
     def scene(
         self,
@@ -154,11 +147,7 @@ class DisturbedWorlds:
         self._begun = True
 
     def act(self, scene: Scene, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States ``(B, K, n)`` and controls ``(B, K, m)`` that a step truly begins from, of those commanded.
-
-        Raises:
-            ValueError: If a disturbance returns another shape.
-        """
+        """States ``(B, K, n)`` and controls ``(B, K, m)`` that a step truly begins from, of those commanded."""
         for one in self._commanding:
             wanted = one.disturbance.command(controls, one.memory, scene, self._draws(one, scene, _Purpose.COMMAND))
             controls = _checked(wanted, controls.shape, one, "command")
@@ -186,11 +175,7 @@ class DisturbedWorlds:
         )
 
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Observed:
-        """Return the view of all worlds, or of some, as they are in ``scene``, which is always of all.
-
-        Raises:
-            ValueError: If a disturbance returns another shape.
-        """
+        """Return the view of all worlds, or of some, as they are in ``scene``, which is always of all."""
         part = scene if worlds is None else scene.of(worlds)
         seen = Observed(part.states, part.controls, part.bodies)
         for one in self._seeing:

@@ -12,9 +12,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.lazy import LazyModule
 
 if TYPE_CHECKING:
-    from d4orm_env.engine import counter_draws
+    from d4orm_env.engine import sample_noise
 else:
-    counter_draws = LazyModule("d4orm_env.engine.counter_draws")
+    sample_noise = LazyModule("d4orm_env.engine.sample_noise")
 
 Keys = NDArray[np.uint32]
 Steps = NDArray[np.int64]
@@ -97,7 +97,7 @@ class Draws:
         """``(R, *shape)`` numbers, a row for each of the keys ``(R, 2)`` at its step ``(R,)``."""
         rows = len(keys)
         out: FloatArray = np.empty((rows, *shape), np.float32)
-        draw = counter_draws.draw_uniforms if kind else counter_draws.draw_normals
+        draw = sample_noise.draw_uniforms if kind else sample_noise.draw_normals
         draw(keys, steps, np.uint32(self._stream), np.uint32(self._call), out.reshape(rows, -1))
         return out
 

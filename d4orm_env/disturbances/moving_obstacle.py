@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, IntArray, frozen_array, positive_number, whole_number
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Scene
+from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Kept, Scene, level, standard_deviation
 from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.levels import level, standard_deviation
 
 MAX_INTRUDERS = 100
 _radius = partial(positive_number, least=1e-3, most=LARGEST)
@@ -126,14 +125,8 @@ _ROUNDING = 1e-6
 """Rounding of the time after so many steps [s]."""
 
 
-class BodiesNow(NamedTuple):
-    """Bodies ``(B, N, 2 d + 1)``, as in :class:`~d4orm_env.disturbances.Observed`; all zeros for one that is absent."""
-
-    bodies: FloatArray
-
-
 @dataclass(frozen=True, eq=False)
-class MovingObstacle(Disturbance[BodiesNow]):
+class MovingObstacle(Disturbance[Kept]):
     """A body, disc or ball, or several, on a given trajectory: it meets robots as an :class:`Intruder` does.
 
     Between the times it moves on straight lines. It is absent before the first time and after the last, and where its
@@ -209,20 +202,20 @@ class MovingObstacle(Disturbance[BodiesNow]):
             radius=self.radius,
         )
 
-    def begin(self, scene: Scene, draws: Draws) -> BodiesNow:
-        return BodiesNow(self._at(scene.steps, scene.problem.dt))
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
+        return Kept(self._at(scene.steps, scene.problem.dt))
 
     def move(
-        self, states: FloatArray, controls: FloatArray, memory: BodiesNow, scene: Scene, draws: Draws
+        self, states: FloatArray, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws
     ) -> tuple[FloatArray, FloatArray]:
-        memory.bodies[:] = self._at(scene.steps + 1, scene.problem.dt)
+        memory.values[:] = self._at(scene.steps + 1, scene.problem.dt)
         return states, controls
 
-    def effect(self, memory: BodiesNow, scene: Scene) -> DisturbanceEffect:
-        return DisturbanceEffect(bodies=memory.bodies)
+    def effect(self, memory: Kept, scene: Scene) -> DisturbanceEffect:
+        return DisturbanceEffect(bodies=memory.values)
 
     def _at(self, steps: IntArray, dt: float) -> FloatArray:
-        """``(B, N, 2 d + 1)`` bodies after ``(B,)`` steps."""
+        """``(B, N, 2 d + 1)`` bodies after ``(B,)`` steps; all zeros for one that is absent."""
         times, places = self._track
         now = steps.astype(np.float64) * dt
         index = np.clip(np.searchsorted(times, now + _ROUNDING, side="right") - 1, 0, len(times) - 2)

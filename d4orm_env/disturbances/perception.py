@@ -14,9 +14,17 @@ import numpy as np
 from d4orm_env.core.arrays import LARGEST, FloatArray, positive_number, whole_number
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, Memory, Observed, Scene
+from d4orm_env.disturbances.disturbance import (
+    MAX_DELAY,
+    Disturbance,
+    Memory,
+    Observed,
+    Scene,
+    level,
+    standard_deviation,
+    unless,
+)
 from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.levels import MAX_DELAY, level, standard_deviation, unless
 
 _FARTHEST = 6.0
 """No normal that is drawn lies so many standard deviations from zero."""

@@ -14,22 +14,25 @@ from d4orm_env.core.arrays import FloatArray, positive_number, whole_number
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.portable import cos, sin
 from d4orm_env.core.problem import Problem
-from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Memory, Scene
+from d4orm_env.disturbances.disturbance import (
+    Disturbance,
+    DisturbanceEffect,
+    Kept,
+    Memory,
+    Scene,
+    level,
+    share,
+    standard_deviation,
+    unless,
+)
 from d4orm_env.disturbances.draws import Draws
-from d4orm_env.disturbances.levels import level, share, standard_deviation, unless
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS
 
 _NEVER = 2**62
 
 
-class Given(NamedTuple):
-    """The last pushes ``(B, K, d)`` [m/s]."""
-
-    velocity: FloatArray
-
-
 @dataclass(frozen=True)
-class Push(Disturbance[Given]):
+class Push(Disturbance[Kept]):
     """Random impulses: a robot gets ``speed`` more in a random direction, at the moments of a Poisson process.
 
     It is at most once in a time step, with probability ``1 - exp(-rate dt)``, at the step's beginning. Double
@@ -48,25 +51,25 @@ class Push(Disturbance[Given]):
     def slack(self, problem: Problem) -> BoundsSlack:
         return BoundsSlack(drift=self.speed)
 
-    def begin(self, scene: Scene, draws: Draws) -> Given:
-        return Given(np.zeros(scene.goal.shape, np.float32))
+    def begin(self, scene: Scene, draws: Draws) -> Kept:
+        return Kept(np.zeros(scene.goal.shape, np.float32))
 
     def move(
-        self, states: FloatArray, controls: FloatArray, memory: Given, scene: Scene, draws: Draws
+        self, states: FloatArray, controls: FloatArray, memory: Kept, scene: Scene, draws: Draws
     ) -> tuple[FloatArray, FloatArray]:
         hit = draws.uniform(states.shape[1]) < -math.expm1(-self.rate * scene.problem.dt)
         hit &= ~scene.standing
-        memory.velocity[:] = 0
+        memory.values[:] = 0
         if hit.any():
             worlds = np.flatnonzero(hit.any(axis=1))
-            directions = draws.of(worlds).direction(*memory.velocity.shape[1:])
-            memory.velocity[worlds] = given = np.float32(self.speed) * directions * hit[worlds, :, None]
+            directions = draws.of(worlds).direction(*memory.values.shape[1:])
+            memory.values[worlds] = given = np.float32(self.speed) * directions * hit[worlds, :, None]
             states = states.copy()
             states[worlds] = pushed(scene.problem, states[worlds], given)
         return states, controls
 
-    def effect(self, memory: Given, scene: Scene) -> DisturbanceEffect:
-        return DisturbanceEffect(pushed=memory.velocity)
+    def effect(self, memory: Kept, scene: Scene) -> DisturbanceEffect:
+        return DisturbanceEffect(pushed=memory.values)
 
 
 def pushed(problem: Problem, states: FloatArray, velocity: FloatArray) -> FloatArray:

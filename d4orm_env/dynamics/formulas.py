@@ -62,3 +62,23 @@ def turn_towards(heading: Number, velocity: Vector, ops: Ops) -> tuple[Number, N
     none = along - along
     # To stand still no heading is better than the present one.
     return along, ops.where(along * along + across * across > 0, ops.arctan2(across, along), none)
+
+
+def present_drive(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
+    """:attr:`ModelFunctions.velocity` of a model whose heading and speed are the components 2 and 3 of its state."""
+    return (x[3] * ops.cos(x[2]), x[3] * ops.sin(x[2]))
+
+
+def commanded_drive(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
+    """The same where the speed is the first component of the control."""
+    return (u[0] * ops.cos(x[2]), u[0] * ops.sin(x[2]))
+
+
+def at_once(x: Vector, zero: Number) -> Vector:
+    """:attr:`ModelFunctions.rest` of a model that takes a new speed at once."""
+    return x
+
+
+def without_limit(x: Vector, limits: Vector, ops: Ops) -> Vector:
+    """:attr:`ModelFunctions.limit_state` of a model whose state holds nothing to limit."""
+    return x

@@ -1,4 +1,4 @@
-"""One time step of one robot, in scalar style: clip, integrate, limit the speed, dock.
+"""One time step of one robot, in scalar style: clip, integrate, limit the speed, dock, and the reward.
 
 The order is the definition of a step for every engine: the control is clipped to the limits, RK4 integrates the model
 over ``dt``, the speed limit is applied, and a robot within its goal radius at no more than the goal speed, at its goal
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from d4orm_env.dynamics.robot_model import Flag, ModelFunctions, N, Number, Ops, TimeStep, Truth
 
-__all__ = ["TimeStep", "advance", "arrives"]
+__all__ = ["TimeStep", "advance", "arrives", "step_reward"]
 
 SPEED_ALLOWANCE = 2**-13
 """Share of the speed limit by which a robot may exceed its goal speed: many come down to just that and a rounding."""
@@ -45,3 +45,15 @@ def docking_speed(goal_speed: N, max_speed: N) -> N:
 def stands(arrived: Truth, docks: Truth) -> Flag:
     """Check whether a robot that has arrived stays at rest, whatever its control; ``docks`` says whether any does."""
     return arrived & docks
+
+
+def step_reward(distance: N, inverse_initial_distance: N, violations: tuple[N, N, N], penalty: N, one: N) -> N:
+    """``1 - distance / initial distance``, minus a penalty for each kind of body within the margin (paper, section
+    III-D, with the obstacle term of section IV).
+
+    ``violations`` are 0 or 1 for any robot, for any obstacle or the bounds, and for any dynamic obstacle; ``penalty``
+    is 1 in the paper, and ``one`` is 1, all in the caller's precision.
+    """
+    robot, obstacle, dynamic = violations
+    progress = one - distance * inverse_initial_distance
+    return progress - penalty * robot - penalty * obstacle - penalty * dynamic

@@ -1,4 +1,4 @@
-"""Engines by name."""
+"""Engines by name, and the rollout of controls by any of them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import sys
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from numpy.typing import ArrayLike
+
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.lazy import LazyModule
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.types import Engine
 
 if TYPE_CHECKING:
@@ -37,12 +41,25 @@ def get_engine(name: str = "auto", num_threads: int | None = None) -> Engine:
     return cpu.CpuEngine(num_threads)
 
 
-def resolve_engine(name: str) -> str:
-    """Return ``"cpu"`` or ``"jax"``, whichever a name means here.
+def rollout(problem: Problem, controls: ArrayLike, engine: str = "auto") -> Trajectory:
+    """The motion of the team under ``controls``, clipped to the robots' limits.
+
+    Args:
+        problem: Starts, goals, limits and world.
+        controls: ``(H, K, m)``.
+        engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
+
+    Returns:
+        States, executed controls, rewards and flags over time.
 
     Raises:
-        ValueError: If there is no such engine.
+        ValueError: If the controls have another shape or are not finite, or the engine is unknown.
     """
+    return get_engine(engine).rollout(problem, controls)
+
+
+def resolve_engine(name: str) -> str:
+    """Return ``"cpu"`` or ``"jax"``, whichever a name means here."""
     if name not in ENGINES:
         raise unknown("engine", name, ENGINES)
     if name == "auto":

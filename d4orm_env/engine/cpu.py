@@ -1,6 +1,13 @@
-"""The CPU engine: the physics compiled with numba for all cores of one processor."""
+"""The CPU engine: the physics compiled with numba for all cores of one processor.
+
+Its kernels step and observe many worlds of one problem at once. These share the team, the obstacles and the bounds;
+each has its own goals, state and clock. A single environment is a batch of one.
+"""
 
 from __future__ import annotations
+
+from functools import cache, lru_cache
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,19 +17,95 @@ from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.engine.compiling import aligned_zeros
-from d4orm_env.engine.observing import ObservationSpec
+from d4orm_env.dynamics.models import COMMON, names_of_codes
+from d4orm_env.engine.borrowing import borrow
+from d4orm_env.engine.caching import Kernel, cached_kernel
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, aligned_zeros
+from d4orm_env.engine.episodes import advance_worlds_kernel
+from d4orm_env.engine.observing import ObservationSpec, observe_worlds_kernel
 from d4orm_env.engine.ray_casting import Surroundings, cast_rays
-from d4orm_env.engine.simd import TILE
+from d4orm_env.engine.simd import TILE, use_wide_registers
+from d4orm_env.engine.stepping import models_key, models_of_kernel
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.engine.tiles import STRIDE, pose_rows
+from d4orm_env.engine.tiles import STRIDE, measure_goal_distance, pose_rows, robot_mover
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
-from d4orm_env.engine.world_tiles import WorldArrays, allocate_boxes
-from d4orm_env.engine.worlds import WorldKernels, kernels_of_codes
+from d4orm_env.engine.world_tiles import WorldArrays, allocate_boxes, check_contacts, load, load_world, store_world
+
+RollOut: TypeAlias = Kernel[[ProblemArrays, WorldArrays, FloatArray, NDArray[np.uint64], FloatArray], None]
+"""A kernel of :func:`roll_out_kernel`."""
+
+
+@cache
+def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
+    """A kernel that steps one world through the rows of ``moments.control``, keeping every moment.
+
+    ``moments`` is a :class:`WorldArrays` of ``H+1`` rows, of which the first is the start and has no control. The
+    motion comes first; then 64 moments at a time are checked, as if they were worlds, as far as there are rewards.
+    ``w`` is zero, ``(K STRIDE + P TILE,)`` with ``P`` rows of poses, and ``near`` ``(K, 3)``: see
+    :mod:`~d4orm_env.engine.tiles`; ``boxes`` are of :func:`~d4orm_env.engine.world_tiles.allocate_boxes`.
+    """
+    move_robot = robot_mover(names)
+
+    @cached_kernel(variant="_".join(names), key=models_key(names), **WITHOUT_ARRAYS)
+    def roll_out(
+        arrays: ProblemArrays, moments: WorldArrays, w: FloatArray, near: NDArray[np.uint64], boxes: FloatArray
+    ) -> None:
+        use_wide_registers()
+        arrays, moments = borrow(arrays), borrow(moments)
+        num_robots, dimension = arrays.goal.shape
+        lane = np.int64(0)  # a literal zero would compile what it is passed to once more
+        state, docked = moments.state, moments.docked
+        for t in range(1, state.shape[0]):
+            # Loops, because numba takes seconds to compile assignments of slices.
+            idle = arrays.docks
+            for k in range(num_robots):
+                for i in range(state.shape[2]):
+                    state[t, k, i] = state[t - 1, k, i]
+                docked[t, k] = docked[t - 1, k]
+                idle &= docked[t, k]
+                for i in range(moments.control.shape[2]):
+                    idle &= moments.control[t, k, i] == 0
+            if idle:
+                continue
+            load_world(moments, t, lane, w)
+            for k in range(num_robots):
+                move_robot(arrays, k, w)
+            store_world(moments, t, lane, w)
+        for first in range(0, moments.rewards.shape[0], TILE):
+            load(moments, first, w)
+            measure_goal_distance(num_robots, dimension, w)
+            check_contacts(arrays, moments, first, w, boxes, near)
+
+    return roll_out
+
+
+class WorldKernels(NamedTuple):
+    """The kernels that step and observe teams of some models."""
+
+    roll_out: RollOut
+    observe_worlds: Kernel[[ProblemArrays, ObservationInputs, ObservationSpec, IntArray, FloatArray], None]
+    advance_worlds: Kernel[
+        [ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None
+    ]
+
+
+def world_kernels(models: tuple[str, ...]) -> WorldKernels:
+    """Kernels for a team of these models. Rolling out, which a first plan waits for, has them by models as sampling;
+    the others are the same for all mixtures of common models.
+    """
+    own = models_of_kernel(models)
+    names = COMMON if set(own) <= set(COMMON) else own
+    return WorldKernels(roll_out_kernel(own), observe_worlds_kernel(names), advance_worlds_kernel(names))
+
+
+@lru_cache(maxsize=256)
+def kernels_of_codes(codes: bytes) -> WorldKernels:
+    """:func:`world_kernels` by the bytes of ``model_codes``."""
+    return world_kernels(names_of_codes(np.frombuffer(codes, np.int32)))
 
 
 class CpuEngine:
-    """The physics on the CPU, compiled with numba. Stateless: all instances are alike."""
+    """The physics on the CPU, and what environments need beside it. Stateless: all instances are alike."""
 
     name = "cpu"
 
@@ -43,15 +126,15 @@ class CpuEngine:
     def observe_worlds(
         self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
     ) -> None:
-        """See :meth:`d4orm_env.engine.types.WorldEngine.observe_worlds`."""
+        """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees, inside the layout's bounds."""
         arrays = typed(arrays)
-        kernel, view = _kernels(arrays).observe_worlds, _view(layout)
+        kernel, view = kernels_of_codes(arrays.model_codes.tobytes()).observe_worlds, _view(layout)
         self._threads.over(-(-len(out) // TILE), lambda part: kernel(arrays, sight, view, part, out))
 
     def cast_rays(
         self, arrays: ProblemArrays, layout: ObservationLayout, state: FloatArray, bodies: FloatArray, out: FloatArray
     ) -> None:
-        """See :meth:`d4orm_env.engine.types.WorldEngine.cast_rays`."""
+        """Fill the rays of ``out`` ``(B, K, D)``, for states ``(B, K, n)`` among bodies ``(B, N, 2 d + 1)``."""
         around, first = Surroundings.of(arrays, layout.ray_directions, layout.ray_range), layout.rays.start
         self._threads.over(-(-len(out) // TILE), lambda part: cast_rays(around, state, bodies, first, part, out))
 
@@ -64,19 +147,24 @@ class CpuEngine:
         batch: WorldBatch,
         out: FloatArray,
     ) -> None:
-        """See :meth:`d4orm_env.engine.types.WorldEngine.advance`."""
+        """Step, reset and observe the worlds of a batch in place, each as it is ordered to.
+
+        Args:
+            arrays: The problem that the worlds share; each has its own starts and goals.
+            layout: Components of an observation, and their bounds.
+            max_cycles: Steps in an episode.
+            orders: ``(B,)`` one of :data:`STEP` and its like for every world.
+            batch: The worlds; ``batch.control`` holds what to do.
+            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written. ``(0, K, D)`` makes none.
+        """
         arrays = typed(arrays)
-        kernel, view = _kernels(arrays).advance_worlds, _view(layout)
+        kernel, view = kernels_of_codes(arrays.model_codes.tobytes()).advance_worlds, _view(layout)
         self._threads.over(
             -(-len(orders) // TILE), lambda part: kernel(arrays, view, max_cycles, orders, batch, part, out)
         )
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
-        """See :meth:`d4orm_env.engine.types.Engine.rollout`.
-
-        Raises:
-            ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
-        """
+        """See :meth:`d4orm_env.engine.types.Engine.rollout`."""
         nobody = np.zeros(problem.num_robots, bool)
         moments = _rolled_out(problem.arrays, problem.start, nobody, checked_controls(problem, controls))
         return Trajectory(
@@ -90,11 +178,7 @@ class CpuEngine:
         )
 
     def score(self, problem: Problem, controls: ArrayLike) -> FloatArray:
-        """See :meth:`d4orm_env.engine.types.Engine.score`.
-
-        Raises:
-            ValueError: If the controls have another shape than ``(M, H, K, m)`` or are not finite.
-        """
+        """See :meth:`d4orm_env.engine.types.Engine.score`."""
         samples, nobody = checked_controls(problem, controls, batch=True), np.zeros(problem.num_robots, bool)
         rewards = np.empty((len(samples), problem.num_robots), np.float32)
 
@@ -105,10 +189,6 @@ class CpuEngine:
 
         self._threads.over(len(samples), work)
         return rewards
-
-
-def _kernels(arrays: ProblemArrays) -> WorldKernels:
-    return kernels_of_codes(arrays.model_codes.tobytes())
 
 
 def _view(layout: ObservationLayout) -> ObservationSpec:
@@ -136,7 +216,7 @@ def _rolled_out(
     moments = WorldArrays(goal, inverse, state, control, arrived, nothing, collided, violated, rewards)
     w = aligned_zeros(len(states) * STRIDE + pose_rows(arrays.footprints) * TILE)
     near = np.empty((len(states), 3), np.uint64)
-    _kernels(arrays).roll_out(arrays, moments, w, near, allocate_boxes(arrays))
+    kernels_of_codes(arrays.model_codes.tobytes()).roll_out(arrays, moments, w, near, allocate_boxes(arrays))
     return moments
 
 

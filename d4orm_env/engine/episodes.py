@@ -107,19 +107,10 @@ def _move_tile(
 def advance_worlds_kernel(
     names: tuple[str, ...],
 ) -> Kernel[[ProblemArrays, ObservationSpec, int, NDArray[np.uint8], WorldBatch, IntArray, FloatArray], None]:
-    """A kernel that steps, resets and observes worlds, each as it is ordered to.
+    """A kernel that steps, resets and observes worlds, each as it is ordered to, for teams of these models.
 
-    Args:
-        names: Models that the kernel is for.
-        arrays: The problem that the worlds share; its starts and goals are not looked at.
-        view: Contents of an observation, a :class:`ObservationSpec`.
-        max_cycles: Steps in an episode.
-        orders: ``(B,)`` uint8, one of ``STEP``, ``MOVED``, ``RESET``, ``LOOK`` and ``SKIP`` for every
-            world.
-        batch: The worlds, a :class:`WorldBatch`.
-        tile_range: First tile of worlds and the one after the last.
-        out: ``(B, K, D)`` observations; those of skipped worlds are not written. ``(0, K, D)`` leaves them to
-            :func:`observe_worlds_kernel`.
+    Arguments are those of :meth:`~d4orm_env.engine.cpu.CpuEngine.advance`; ``tile_range`` is the first tile of worlds
+    and the one after the last. Starts and goals of ``arrays`` are not looked at.
     """
     move_robot = robot_mover(names)
     read_motion = motion_reader(names)

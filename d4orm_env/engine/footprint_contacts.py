@@ -1,6 +1,6 @@
 """Exact contacts of footprints that are no discs, compiled with numba, for the samples that their outer discs flag.
 
-A robot is a body, and its trailers are further ones: see :class:`~d4orm_env.core.footprint_arrays.FootprintArrays`.
+A robot is a body, and its trailers are further ones: see :class:`~d4orm_env.core.bodies.FootprintArrays`.
 Where the bodies of the plane are is kept in ``poses``, :data:`POSE` rows each: the heading as a unit vector, and the
 reference point relative to the robot's place. Those of body ``i`` begin at ``i * stride + begin``.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from numba.cpython.unsafe import numbers
 
 from d4orm_env.core.arrays import FloatArray, Whole
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.convex_cores import (
@@ -25,9 +25,10 @@ from d4orm_env.engine.convex_cores import (
     place_box,
     place_disc,
     place_triangle,
+    rectangles_within,
 )
 from d4orm_env.engine.elementary import cosine, sine
-from d4orm_env.engine.rectangle_contacts import rectangles_within
+from d4orm_env.engine.obstacles import cell_at
 from d4orm_env.engine.simd import CHUNK, NOWHERE, TILE, use_wide_registers
 
 POSE = 4
@@ -258,10 +259,7 @@ def touches_static(
         return True
     if index.clearance.shape[0] == 0:
         return False
-    cell, (x, y, z) = np.int64(0), place
-    for axis in range(dimension):
-        steps = np.int64(max((place[axis] - index.low[axis]) * index.scale, ZERO))
-        cell = cell * index.size[axis] + min(steps, np.int64(index.size[axis]) - 1)
+    cell, (x, y, z) = cell_at(index, place, dimension), place
     for number in range(index.first[cell], index.first[cell + 1]):
         item = np.int64(index.items[number])
         if dimension == 3:

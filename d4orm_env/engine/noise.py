@@ -110,16 +110,12 @@ def normal_pair(sample: Word, key: tuple[Word, Word], ops: BitOps) -> tuple[Real
 
 
 def turned(sample: Word, ops: BitOps) -> tuple[Word, Real, Real]:
-    """``(counter, cosine, sine)`` of a sample: of every 64 samples the first 16 draw pairs of normals, and the others
-    turn them by 180, 90 and 270 degrees.
+    """``(counter, cosine, sine)`` of a sample (uint32): of every 64 samples the first 16 draw pairs of normals, and
+    the others turn them by 180, 90 and 270 degrees.
 
     The pair of a sample is ``(cosine * x - sine * y, sine * x + cosine * y)`` of the normals ``(x, y)`` of its counter,
     which is as normal as they are. So a sample costs a quarter of the noise; the deformations that share it are
     mirrored (the odd part of the sampling error cancels) or at right angles to each other.
-
-    Args:
-        sample: uint32 sample number.
-        ops: The library's operations.
     """
     counter = ops.uint32(ops.uint32(ops.uint32(sample >> S6) << S4) + ops.uint32(sample & LOW_4_BITS))
     mirrored = ops.to_float(ops.int32(ops.uint32(sample >> S4) & LOW_BIT))

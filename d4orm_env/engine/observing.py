@@ -1,4 +1,4 @@
-"""Kernels that observe many worlds of one problem at once."""
+"""Kernels that observe many worlds of one problem at once, and who knows of whom."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core import observation
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.engine.caching import Kernel, cached_kernel
@@ -40,21 +41,13 @@ for _function in (
 
 
 class ObservationSpec(NamedTuple):
-    """Contents of an observation, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`.
+    """Contents of an observation, see :class:`~d4orm_env.core.observation_layout.ObservationLayout`."""
 
-    Attributes:
-        bounds: ``(2, D)`` lowest and highest observation.
-        num_neighbors: Robots in it.
-        num_obstacles: Obstacles in it.
-        squared_range: Square of the distance beyond which robots are not observed [m²].
-        line_of_sight: Whether those behind obstacles are not observed either.
-    """
-
-    bounds: FloatArray
-    num_neighbors: int
-    num_obstacles: int
-    squared_range: np.float32
-    line_of_sight: bool
+    bounds: FloatArray  #: ``(2, D)`` lowest and highest observation
+    num_neighbors: int  #: Robots in it
+    num_obstacles: int  #: Obstacles in it
+    squared_range: np.float32  #: Square of the distance beyond which robots are not observed [m²]
+    line_of_sight: bool  #: Whether those behind obstacles are not observed either
 
 
 @numba.njit(nogil=True, **OPTIONS)
@@ -69,17 +62,43 @@ def allocate_sensed(num_robots: int, num_bodies: int, dimension: int, view: Obse
 
 
 @compiled
-def _hide(k: int, arrays: ProblemArrays, view: ObservationSpec, sensed: observation.Sensed) -> None:
-    """Mark whom robot ``k`` does not observe."""
-    place = sensed.position[k]
-    for other in range(sensed.hidden.shape[0]):
+def _hide(
+    place: FloatArray, positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32,
+    line_of_sight: bool, ray: FloatArray, hidden: BoolArray,
+) -> None:  # fmt: skip
+    """Mark who is not observed from a place: beyond a range, and behind obstacles if asked."""
+    for other in range(hidden.shape[0]):
         gap2 = ZERO
         for axis in range(place.shape[0]):
-            gap = sensed.position[other, axis] - place[axis]
+            gap = positions[other, axis] - place[axis]
             gap2 += gap * gap
-        sensed.hidden[other] = gap2 > view.squared_range
-        if view.line_of_sight and not sensed.hidden[other]:
-            sensed.hidden[other] = is_blocked(place, sensed.position[other], arrays.boxes, arrays.triangles, sensed.ray)
+        hidden[other] = gap2 > squared_range
+        if line_of_sight and not hidden[other]:
+            hidden[other] = is_blocked(place, positions[other], boxes, triangles, ray)
+
+
+@cached_kernel(**OPTIONS)
+def _hide_each(
+    positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32, sight: bool,
+    ray: FloatArray, hidden: BoolArray,
+) -> None:  # fmt: skip
+    for k in range(len(positions)):
+        _hide(positions[k], positions, boxes, triangles, squared_range, sight, ray, hidden[k])
+
+
+def communication_links(
+    problem: Problem, positions: FloatArray, communication_range: float | None, line_of_sight: bool
+) -> BoolArray:
+    """``(K, K)`` bool: robot ``k`` at ``positions`` ``(K, d)`` knows of another one, as observations have it.
+
+    It knows nobody beyond ``communication_range`` [m], ``None`` for no limit, and with ``line_of_sight`` nobody behind
+    the problem's obstacles either.
+    """
+    hidden = np.empty((len(positions), len(positions)), np.bool_)
+    square = np.float32(np.inf if communication_range is None else communication_range**2)
+    places, ray = np.ascontiguousarray(positions, np.float32), np.empty((5, 1), np.float32)
+    _hide_each(places, problem.arrays.boxes, problem.arrays.triangles, square, line_of_sight, ray, hidden)
+    return ~hidden & ~np.eye(len(hidden), dtype=np.bool_)
 
 
 @compiled
@@ -120,7 +139,10 @@ def observe(
     for k in range(num_robots):
         row = out[k]
         if view.line_of_sight or view.squared_range < np.inf:
-            _hide(k, arrays, view, sensed)
+            _hide(
+                sensed.position[k], sensed.position, arrays.boxes, arrays.triangles, view.squared_range,
+                view.line_of_sight, sensed.ray, sensed.hidden,
+            )  # fmt: skip
         observation.observe_robot(k, arrays, worlds.goal[b], sensed, time_left, row)
         for i in range(row.shape[0]):
             value = row[i]
@@ -132,14 +154,10 @@ def observe(
 def observe_worlds_kernel(
     names: tuple[str, ...],
 ) -> Kernel[[ProblemArrays, ObservationInputs, ObservationSpec, IntArray, FloatArray], None]:
-    """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees.
+    """A kernel that fills ``out`` ``(B, K, D)`` with what every robot of every world sees, for teams of these models.
 
-    Args:
-        names: Models that the kernel is for.
-        arrays: The problem that the worlds share; its starts and goals are not looked at.
-        sight: Inputs of the observation, a :class:`~d4orm_env.engine.types.ObservationInputs`.
-        view: Contents of an observation, a :class:`ObservationSpec`.
-        tile_range: First tile of worlds and the one after the last.
+    ``arrays`` is the problem that the worlds share; its starts and goals are not looked at. ``tile_range`` is the first
+    tile of worlds and the one after the last.
     """
     read_motion = motion_reader(names)
 

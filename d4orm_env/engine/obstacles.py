@@ -7,6 +7,7 @@ are tested one by one, with the arithmetic of :mod:`d4orm_env.dynamics.collision
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba.cpython.unsafe import numbers
@@ -87,6 +88,16 @@ def is_closed(arrays: ProblemArrays) -> bool:
 
 
 @inlined
+def cell_at(index: WorldIndex, place: Any, dimension: int) -> np.int64:
+    """The number of the cell that holds a place, of the outermost one beyond the grid."""
+    cell = np.int64(0)
+    for axis in range(dimension):
+        steps = np.int64(max((place[axis] - index.low[axis]) * index.scale, ZERO))
+        cell = cell * index.size[axis] + min(steps, np.int64(index.size[axis]) - 1)
+    return cell
+
+
+@inlined
 def touches_static(arrays: ProblemArrays, reach: np.float32, place: FloatArray) -> bool:
     """Check whether a body of this radius, centred at ``place`` ``(d,)``, touches an obstacle or the bounds."""
     index = arrays.grid
@@ -95,10 +106,7 @@ def touches_static(arrays: ProblemArrays, reach: np.float32, place: FloatArray) 
             return True
     if index.clearance.shape[0] == 0:
         return False
-    cell = np.int64(0)
-    for axis in range(place.shape[0]):
-        steps = np.int64(max((place[axis] - index.low[axis]) * index.scale, ZERO))
-        cell = cell * index.size[axis] + min(steps, np.int64(index.size[axis]) - 1)
+    cell = cell_at(index, place, place.shape[0])
     clearance = index.clearance[cell]
     if clearance > reach + index.slack or clearance <= reach - index.slack:
         return clearance <= reach

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, IntArray, Ints, Whole
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS, names_of_codes
 from d4orm_env.engine import elementary
@@ -37,27 +37,17 @@ coordinates."""
 
 
 class Surroundings(NamedTuple):
-    """Parts of a planar problem that rays meet, and the sensor.
+    """Parts of a planar problem that rays meet, and the sensor."""
 
-    Attributes:
-        radius: ``(K,)`` of the robots [m].
-        heading_index: ``(K,)`` components of the states that are headings, -1 for a robot without one.
-        boxes: See :class:`~d4orm_env.core.problem_arrays.ProblemArrays`; in the plane a round one is a disc.
-        triangles: Likewise.
-        bounds: ``(2, 2)``.
-        directions: ``(R, 2)`` unit vectors of the rays in the robots' frames, at equal angles, the first ahead.
-        range: ``()`` of the sensor [m].
-        footprints: Of the robots; ``None`` where all are discs.
-    """
-
-    radius: FloatArray
-    heading_index: IntArray
-    boxes: FloatArray
-    triangles: FloatArray
-    bounds: FloatArray
+    radius: FloatArray  #: ``(K,)`` of the robots [m]
+    heading_index: IntArray  #: ``(K,)`` components of the states that are headings, -1 for a robot without one
+    boxes: FloatArray  #: See :class:`~d4orm_env.core.problem_arrays.ProblemArrays`; in the plane a round one is a disc
+    triangles: FloatArray  #: Likewise
+    bounds: FloatArray  #: ``(2, 2)``
+    #: ``(R, 2)`` unit vectors of the rays in the robots' frames, at equal angles, the first ahead
     directions: FloatArray
-    range: np.float32
-    footprints: FootprintArrays | None
+    range: np.float32  #: ``()`` of the sensor [m]
+    footprints: FootprintArrays | None  #: Of the robots; ``None`` where all are discs
 
     @classmethod
     def of(cls, arrays: ProblemArrays, directions: FloatArray, reach: float) -> Surroundings:

@@ -1,4 +1,8 @@
-"""The noise of a tile of samples: pairs of normals from counters, of which four samples each take a turn."""
+"""Noise from counters, compiled: of a tile of samples, and of many worlds at once.
+
+Of a tile's pairs of normals four samples each take a turn. What a world draws depends on nothing but its own key and
+the moment, so that it is the same alone and in any batch.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +12,22 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.engine import noise
-from d4orm_env.engine.compiling import INLINED, compiled, inlined
+from d4orm_env.engine.caching import cached_kernel
+from d4orm_env.engine.compiling import INLINED, OPTIONS, compiled, inlined
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.simd import copy_chunk, use_wide_registers
 from d4orm_env.engine.tile_layout import Row
 
 
 class Drawing(NamedTuple):
-    """Distribution of the samples of a denoising step.
+    """Distribution of the samples of a denoising step."""
 
-    Attributes:
-        offset: ``(H, K, m)`` base controls plus mean deformation.
-        scale: ``(H, K, m)`` standard deviation of the noise.
-        seed: Two uint32 words.
-        step: Number of the denoising step.
-    """
-
-    offset: FloatArray
-    scale: FloatArray
-    seed: NDArray[np.uint32]
-    step: int
+    offset: FloatArray  #: ``(H, K, m)`` base controls plus mean deformation
+    scale: FloatArray  #: ``(H, K, m)`` standard deviation of the noise
+    seed: NDArray[np.uint32]  #: Two uint32 words
+    step: int  #: Number of the denoising step
 
 
 for _function in (
@@ -157,3 +155,40 @@ def _vector3(x: FloatArray) -> Row:
 
 TURN = {2: _turn2, 3: _turn3}
 VECTOR = {2: _vector2, 3: _vector3}
+
+
+@cached_kernel(**OPTIONS)
+def draw_normals(
+    keys: NDArray[np.uint32], steps: IntArray, stream: np.uint32, call: np.uint32, out: FloatArray
+) -> None:
+    """Fill ``out`` ``(B, N)`` with independent standard normals.
+
+    Of each world there are a key ``(2,)`` uint32 and the steps taken since the episode began; ``stream`` is the number
+    of the purpose, and ``call`` that of the call in the step.
+    """
+    num_pairs = out.shape[1] // 2
+    for b in range(out.shape[0]):
+        key = noise.stream_key(
+            keys[b, 0], keys[b, 1], np.uint32(steps[b]), np.uint32(stream), np.uint32(call), np.uint32(0), BIT_OPS
+        )
+        for j in range(num_pairs):  # without a branch, so that the compiler takes several at once
+            x, y = noise.normal_pair(np.uint32(2 * j), key, BIT_OPS)
+            out[b, 2 * j] = x
+            out[b, 2 * j + 1] = y
+        if 2 * num_pairs < out.shape[1]:
+            out[b, 2 * num_pairs] = noise.normal_pair(np.uint32(2 * num_pairs), key, BIT_OPS)[0]
+
+
+@cached_kernel(**OPTIONS)
+def draw_uniforms(
+    keys: NDArray[np.uint32], steps: IntArray, stream: np.uint32, call: np.uint32, out: FloatArray
+) -> None:
+    """Fill ``out`` ``(B, N)`` with independent numbers, uniform in (0, 1); arguments as for :func:`draw_normals`."""
+    for b in range(out.shape[0]):
+        key = noise.stream_key(
+            keys[b, 0], keys[b, 1], np.uint32(steps[b]), np.uint32(stream), np.uint32(call), np.uint32(1), BIT_OPS
+        )
+        for i in range(out.shape[1]):
+            counter = np.uint32(np.uint32(i) * noise.GOLDEN)
+            bits = noise.hash32(np.uint32(counter ^ key[0]), key[1], BIT_OPS)
+            out[b, i] = noise.unit_interval(bits, BIT_OPS)

@@ -19,11 +19,7 @@ from d4orm_env.core.arrays import IntArray
 
 
 def available_cores() -> int:
-    """Cores this process may use; ``D4ORM_NUM_THREADS`` overrides it.
-
-    Raises:
-        ValueError: If ``D4ORM_NUM_THREADS`` is not a positive whole number.
-    """
+    """Cores this process may use; ``D4ORM_NUM_THREADS`` overrides it."""
     wanted = os.environ.get("D4ORM_NUM_THREADS")
     if wanted is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -28,21 +28,6 @@ def read3(w: FloatArray, o: int, s: int) -> Row:
 
 
 @compiled
-def _read4(w: FloatArray, o: int, s: int) -> Row:
-    return read2(w, o, s) + read2(w, o + 2 * TILE, s)
-
-
-@compiled
-def _read5(w: FloatArray, o: int, s: int) -> Row:
-    return read2(w, o, s) + read3(w, o + 2 * TILE, s)
-
-
-@compiled
-def _read6(w: FloatArray, o: int, s: int) -> Row:
-    return read3(w, o, s) + read3(w, o + 3 * TILE, s)
-
-
-@compiled
 def _write2(w: FloatArray, o: int, s: int, x: Row) -> None:
     w[o + s] = x[0]
     w[o + TILE + s] = x[1]
@@ -55,25 +40,6 @@ def _write3(w: FloatArray, o: int, s: int, x: Row) -> None:
 
 
 @compiled
-def _write4(w: FloatArray, o: int, s: int, x: Row) -> None:
-    _write3(w, o, s, x)
-    w[o + 3 * TILE + s] = x[3]
-
-
-@compiled
-def _write5(w: FloatArray, o: int, s: int, x: Row) -> None:
-    _write4(w, o, s, x)
-    w[o + 4 * TILE + s] = x[4]
-
-
-@compiled
-def _write6(w: FloatArray, o: int, s: int, x: Row) -> None:
-    _write4(w, o, s, x)
-    w[o + 4 * TILE + s] = x[4]
-    w[o + 5 * TILE + s] = x[5]
-
-
-@compiled
 def _pick2(first: bool, x: Row, y: Row) -> Row:
     return (x[0] if first else y[0], x[1] if first else y[1])
 
@@ -81,21 +47,6 @@ def _pick2(first: bool, x: Row, y: Row) -> Row:
 @compiled
 def _pick3(first: bool, x: Row, y: Row) -> Row:
     return (x[0] if first else y[0], x[1] if first else y[1], x[2] if first else y[2])
-
-
-@compiled
-def _pick4(first: bool, x: Row, y: Row) -> Row:
-    return _pick2(first, x, y) + _pick2(first, (x[2], x[3]), (y[2], y[3]))
-
-
-@compiled
-def _pick5(first: bool, x: Row, y: Row) -> Row:
-    return _pick2(first, x, y) + _pick3(first, (x[2], x[3], x[4]), (y[2], y[3], y[4]))
-
-
-@compiled
-def _pick6(first: bool, x: Row, y: Row) -> Row:
-    return _pick3(first, x, y) + _pick3(first, (x[3], x[4], x[5]), (y[3], y[4], y[5]))
 
 
 @compiled
@@ -118,8 +69,30 @@ def squared_gap3(x: Row, y: Row) -> np.float32:
     return _squared_norm3((x[0] - y[0], x[1] - y[1], x[2] - y[2]))
 
 
-READ = {2: read2, 3: read3, 4: _read4, 5: _read5, 6: _read6}
-WRITE = {2: _write2, 3: _write3, 4: _write4, 5: _write5, 6: _write6}
-PICK = {2: _pick2, 3: _pick3, 4: _pick4, 5: _pick5, 6: _pick6}
+READ, WRITE, PICK = {2: read2, 3: read3}, {2: _write2, 3: _write3}, {2: _pick2, 3: _pick3}
 SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
 SQUARED_GAP = {2: squared_gap2, 3: squared_gap3}
+
+
+def _add_size(size: int, rest: int) -> None:
+    """Put together the functions of tuples of ``size`` numbers and of the ``rest``."""
+    (read, read_rest), (write, write_rest), (pick, pick_rest) = ((of[size], of[rest]) for of in (READ, WRITE, PICK))
+
+    @compiled
+    def read_both(w: FloatArray, o: int, s: int) -> Row:
+        return read(w, o, s) + read_rest(w, o + size * TILE, s)
+
+    @compiled
+    def write_both(w: FloatArray, o: int, s: int, x: Row) -> None:
+        write(w, o, s, x)
+        write_rest(w, o + size * TILE, s, x[size:])
+
+    @compiled
+    def pick_both(first: bool, x: Row, y: Row) -> Row:
+        return pick(first, x, y) + pick_rest(first, x[size:], y[size:])
+
+    READ[size + rest], WRITE[size + rest], PICK[size + rest] = read_both, write_both, pick_both
+
+
+for _sizes in ((2, 2), (2, 3), (3, 3)):
+    _add_size(*_sizes)

@@ -5,33 +5,23 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST_NUMBER, BoolArray, FloatArray, Floats, IntArray, as_float32
-from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
 
 
 class StepResult(NamedTuple):
-    """One step of the whole team.
+    """One step of the whole team."""
 
-    Attributes:
-        states: ``(K, n)`` after the step.
-        controls: ``(K, m)`` as executed: clipped, zero for docked robots.
-        arrived: ``(K,)`` bool.
-        collided: ``(K,)`` bool, hard contact.
-        margin_violated: ``(K,)`` bool.
-        rewards: ``(K,)``.
-    """
-
-    states: FloatArray
-    controls: FloatArray
-    arrived: BoolArray
-    collided: BoolArray
-    margin_violated: BoolArray
-    rewards: FloatArray
+    states: FloatArray  #: ``(K, n)`` after the step
+    controls: FloatArray  #: ``(K, m)`` as executed: clipped, zero for docked robots
+    arrived: BoolArray  #: ``(K,)`` bool
+    collided: BoolArray  #: ``(K,)`` bool, hard contact
+    margin_violated: BoolArray  #: ``(K,)`` bool
+    rewards: FloatArray  #: ``(K,)``
 
 
 class Engine(Protocol):
@@ -54,7 +44,7 @@ class Engine(Protocol):
         ...
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
-        """Roll ``controls`` ``(H, K, m)`` out from the problem's start."""
+        """Roll ``controls`` ``(H, K, m)`` out from the problem's start; ``ValueError`` as :func:`checked_controls`."""
         ...
 
     def score(self, problem: Problem, controls: ArrayLike) -> FloatArray:
@@ -63,24 +53,16 @@ class Engine(Protocol):
 
 
 class ObservationInputs(NamedTuple):
-    """Inputs to the observations of ``B`` worlds.
+    """Inputs to the observations of ``B`` worlds."""
 
-    Attributes:
-        goal: ``(B, K, d)`` [m].
-        state: ``(B, K, n)``.
-        control: ``(B, K, m)`` executed last.
-        docked: ``(B, K)`` bool.
-        bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
-            none; a radius of zero for one that is not seen.
-        time_left: ``(B,)`` share of the time left, 1 to 0.
-    """
-
-    goal: FloatArray
-    state: FloatArray
-    control: FloatArray
-    docked: BoolArray
+    goal: FloatArray  #: ``(B, K, d)`` [m]
+    state: FloatArray  #: ``(B, K, n)``
+    control: FloatArray  #: ``(B, K, m)`` executed last
+    docked: BoolArray  #: ``(B, K)`` bool
+    #: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is none; a
+    #: radius of zero for one that is not seen
     bodies: FloatArray
-    time_left: FloatArray
+    time_left: FloatArray  #: ``(B,)`` share of the time left, 1 to 0
 
     def select(self, worlds: slice) -> ObservationInputs:
         """The same of some of the worlds."""
@@ -95,49 +77,27 @@ observe it, or leave it alone altogether."""
 
 
 class WorldBatch(NamedTuple):
-    """``B`` worlds in the middle of their episodes; kernels change them in place.
+    """``B`` worlds in the middle of their episodes; kernels change them in place."""
 
-    Attributes:
-        start: ``(B, K, n)`` where an episode begins.
-        goal: ``(B, K, d)``.
-        inverse: ``(B, K)`` one over the start distances.
-        state: ``(B, K, n)``.
-        control: ``(B, K, m)``; what to do goes in, what was executed comes out.
-        docked: ``(B, K)`` bool.
-        steps: ``(B,)`` int64 steps since the reset.
-        distance: ``(B, K)`` to the goals.
-        bodies: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, after the step.
-        collided: ``(B, K)`` bool, hard contact; after ``MOVED``, what was in contact within the step goes in.
-        violated: ``(B, K)`` bool, within the margin.
-        rewards: ``(B, K)`` of each robot where it is now.
-        reward: ``(B,)`` float64 mean of the team in the last step; zero at a reset.
-        terminated: ``(B,)`` bool: all have docked.
-        truncated: ``(B,)`` bool: out of time before that.
-        total_reward: ``(B,)`` float64 sum over robots and steps of the episode.
-        arrival: ``(B, K)`` int64 step since which a robot is at its goal, 0 for not there.
-        contacts: ``(B, K)`` int64 steps in contact.
-        violations: ``(B, K)`` int64 steps within the margin.
-    """
-
-    start: FloatArray
-    goal: FloatArray
-    inverse: FloatArray
-    state: FloatArray
-    control: FloatArray
-    docked: BoolArray
-    steps: IntArray
-    distance: FloatArray
-    bodies: FloatArray
-    collided: BoolArray
-    violated: BoolArray
-    rewards: FloatArray
-    reward: Floats
-    terminated: BoolArray
-    truncated: BoolArray
-    total_reward: Floats
-    arrival: IntArray
-    contacts: IntArray
-    violations: IntArray
+    start: FloatArray  #: ``(B, K, n)`` where an episode begins
+    goal: FloatArray  #: ``(B, K, d)``
+    inverse: FloatArray  #: ``(B, K)`` one over the start distances
+    state: FloatArray  #: ``(B, K, n)``
+    control: FloatArray  #: ``(B, K, m)``; what to do goes in, what was executed comes out
+    docked: BoolArray  #: ``(B, K)`` bool
+    steps: IntArray  #: ``(B,)`` int64 steps since the reset
+    distance: FloatArray  #: ``(B, K)`` to the goals
+    bodies: FloatArray  #: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, after the step
+    collided: BoolArray  #: ``(B, K)`` bool, hard contact; after ``MOVED``, what was in contact within the step goes in
+    violated: BoolArray  #: ``(B, K)`` bool, within the margin
+    rewards: FloatArray  #: ``(B, K)`` of each robot where it is now
+    reward: Floats  #: ``(B,)`` float64 mean of the team in the last step; zero at a reset
+    terminated: BoolArray  #: ``(B,)`` bool: all have docked
+    truncated: BoolArray  #: ``(B,)`` bool: out of time before that
+    total_reward: Floats  #: ``(B,)`` float64 sum over robots and steps of the episode
+    arrival: IntArray  #: ``(B, K)`` int64 step since which a robot is at its goal, 0 for not there
+    contacts: IntArray  #: ``(B, K)`` int64 steps in contact
+    violations: IntArray  #: ``(B, K)`` int64 steps within the margin
 
     @classmethod
     def from_problem(cls, problem: Problem, num_worlds: int, num_bodies: int = 0) -> WorldBatch:
@@ -171,49 +131,8 @@ class WorldBatch(NamedTuple):
         return WorldBatch(*(part[worlds] for part in self))  # type: ignore[arg-type]
 
 
-class WorldEngine(Engine, Protocol):
-    """An engine with what environments need as well."""
-
-    def observe_worlds(
-        self, arrays: ProblemArrays, layout: ObservationLayout, sight: ObservationInputs, out: FloatArray
-    ) -> None:
-        """Fill ``out`` ``(B, K, D)`` with what every robot of every world sees, inside the layout's bounds."""
-        ...
-
-    def cast_rays(
-        self, arrays: ProblemArrays, layout: ObservationLayout, state: FloatArray, bodies: FloatArray, out: FloatArray
-    ) -> None:
-        """Fill the rays of ``out`` ``(B, K, D)``, for states ``(B, K, n)`` among bodies ``(B, N, 2 d + 1)``."""
-        ...
-
-    def advance(
-        self,
-        arrays: ProblemArrays,
-        layout: ObservationLayout,
-        max_cycles: int,
-        orders: NDArray[np.uint8],
-        batch: WorldBatch,
-        out: FloatArray,
-    ) -> None:
-        """Step, reset and observe the worlds of a batch in place, each as it is ordered to.
-
-        Args:
-            arrays: The problem that the worlds share; each has its own starts and goals.
-            layout: Components of an observation, and their bounds.
-            max_cycles: Steps in an episode.
-            orders: ``(B,)`` one of :data:`STEP` and its like for every world.
-            batch: The worlds; ``batch.control`` holds what to do.
-            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written. ``(0, K, D)`` makes none.
-        """
-        ...
-
-
 def checked_controls(problem: Problem, controls: ArrayLike, *, batch: bool = False) -> FloatArray:
-    """``controls`` as a contiguous ``(H, K, m)`` float32 array, or with ``batch`` as ``(M, H, K, m)``.
-
-    Raises:
-        ValueError: If the shape is another, or a value is not finite or so large that its square would not be.
-    """
+    """``(H, K, m)`` controls as a contiguous float32 array, or with ``batch`` ``(M, H, K, m)``, with finite squares."""
     try:
         array = as_float32(controls)
     except ValueError as error:

@@ -9,9 +9,9 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import reward
+from d4orm_env.dynamics import transition
 from d4orm_env.engine import obstacles
 from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined
 from d4orm_env.engine.footprint_contacts import POSE, meets_body, refine_static
@@ -37,29 +37,18 @@ from d4orm_env.engine.types import ObservationInputs, WorldBatch
 
 
 class WorldArrays(NamedTuple):
-    """``B`` worlds, or ``B`` moments of one; kernels change them in place.
+    """``B`` worlds, or ``B`` moments of one; kernels change them in place."""
 
-    Attributes:
-        goal: ``(B, K, d)``, or ``(1, K, d)`` for all.
-        inverse: ``(B, K)`` one over the start distances, or ``(1, K)``.
-        state: ``(B, K, n)``.
-        control: ``(B, K, m)``; what to do goes in, what was executed comes out.
-        docked: ``(B, K)`` bool.
-        bodies: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, or ``(0, 0, 2 d + 1)``.
-        collided: ``(B, K)`` bool, hard contact; those known already go in, all come out.
-        violated: ``(B, K)`` bool, within the margin.
-        rewards: ``(B, K)`` of each robot where it is.
-    """
-
-    goal: FloatArray
-    inverse: FloatArray
-    state: FloatArray
-    control: FloatArray
-    docked: BoolArray
+    goal: FloatArray  #: ``(B, K, d)``, or ``(1, K, d)`` for all
+    inverse: FloatArray  #: ``(B, K)`` one over the start distances, or ``(1, K)``
+    state: FloatArray  #: ``(B, K, n)``
+    control: FloatArray  #: ``(B, K, m)``; what to do goes in, what was executed comes out
+    docked: BoolArray  #: ``(B, K)`` bool
+    #: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, or ``(0, 0, 2 d + 1)``
     bodies: FloatArray
-    collided: BoolArray
-    violated: BoolArray
-    rewards: FloatArray
+    collided: BoolArray  #: ``(B, K)`` bool, hard contact; those known already go in, all come out
+    violated: BoolArray  #: ``(B, K)`` bool, within the margin
+    rewards: FloatArray  #: ``(B, K)`` of each robot where it is
 
 
 @inlined
@@ -191,7 +180,7 @@ def check_contacts(
             robots, bounds, dynamic = _bit(near[k, ROBOT], s), _bit(near[k, OBSTACLE], s), _bit(near[k, DYNAMIC], s)
             # A body that was touched within the step and is gone counts as a dynamic obstacle.
             dynamic |= np.uint64(worlds.violated[first + s, k]) ^ (robots | bounds | dynamic)
-            worlds.rewards[first + s, k] = reward.step_reward(
+            worlds.rewards[first + s, k] = transition.step_reward(
                 np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s]), worlds.inverse[own, k],
                 (np.float32(robots), np.float32(bounds), np.float32(dynamic)), arrays.collision_penalty, ONE,
             )  # fmt: skip

@@ -29,14 +29,7 @@ RENDER_MODES = ("human", "rgb_array")
 
 
 class Viewer:
-    """Draws a simulation in the environment's render mode.
-
-    Args:
-        render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
-
-    Raises:
-        ValueError: For another mode.
-    """
+    """Draws a simulation in the environment's render mode: ``"rgb_array"``, ``"human"`` or ``None``."""
 
     def __init__(self, render_mode: str | None) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
@@ -81,6 +74,8 @@ class Viewer:
 class BaseEnv:
     """A simulation, read and drawn; how it is reset and stepped is up to the environment.
 
+    Before the first reset all that asks about an episode is a ``RuntimeError``.
+
     Attributes:
         options: Options that it was made of.
     """
@@ -113,35 +108,19 @@ class BaseEnv:
         return self._simulation.setup.lifelong
 
     def state(self) -> FloatArray:
-        """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.envs.joint_state`.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
+        """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.envs.joint_state`."""
         return self._simulation.state()
 
     def true_state(self) -> FloatArray:
-        """:meth:`state` as it truly is, where a disturbance of what is seen has it told otherwise.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
+        """:meth:`state` as it truly is, where a disturbance of what is seen has it told otherwise."""
         return self._simulation.true_state()
 
     def effect(self) -> DisturbanceEffect:
-        """Return the effect of the disturbances up to now, as arrays with one world as their first axis.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
+        """Return the effect of the disturbances up to now, as arrays with one world as their first axis."""
         return self._simulation.effect()
 
     def metrics(self) -> dict[str, float]:
-        """The episode so far in numbers; see :func:`d4orm_env.envs.team_step.episode_metrics`.
-
-        Raises:
-            RuntimeError: Before the first reset.
-        """
+        """The episode so far in numbers; see :func:`d4orm_env.envs.team_step.episode_metrics`."""
         return self._simulation.metrics()
 
     def render(self) -> Frame | None:

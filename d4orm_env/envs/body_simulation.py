@@ -25,27 +25,17 @@ Robots = NDArray[np.intp]
 
 
 class Moved(NamedTuple):
-    """Result of a step.
+    """Result of a step."""
 
-    Attributes:
-        states: ``(K, n)`` as the problem's models have them.
-        touched: ``(K,)`` bool: was in contact with a robot, an obstacle or an intruder at any moment of it.
-    """
-
-    states: FloatArray
-    touched: BoolArray
+    states: FloatArray  #: ``(K, n)`` as the problem's models have them
+    touched: BoolArray  #: ``(K,)`` bool: was in contact with a robot, an obstacle or an intruder at any moment of it
 
 
 class SimulatedBodies(Protocol):
-    """The bodies of a problem's team in another physics.
+    """The bodies of a problem's team in another physics."""
 
-    Attributes:
-        problem: The problem.
-        intruder_radius: ``(N,)`` of bodies that are no robots [m].
-    """
-
-    problem: Problem
-    intruder_radius: FloatArray
+    problem: Problem  #: The problem
+    intruder_radius: FloatArray  #: ``(N,)`` of bodies that are no robots [m]
 
     @property
     def sensed(self) -> FloatArray | None:
@@ -79,15 +69,8 @@ class BodySimulation(TeamSimulation):
 
     A robot docks as in any environment, at the end of a step, and is held from then on. It has collided if it was in
     contact at any moment of a step, or is judged to be at its end. What a disturbance does to states is done to the
-    bodies.
-
-    Args:
-        options: Options of the simulation.
-        check: Refuses a problem whose robots have no bodies.
-        make_bodies: Makes the bodies of a problem, given the radii of those that are no robots.
-
-    Raises:
-        ValueError: For an argument out of range, or a robot that has no body in the physics.
+    bodies. ``check`` refuses a problem whose robots have no bodies, and ``make_bodies`` makes those of a problem, given
+    the radii of bodies that are no robots.
     """
 
     def __init__(

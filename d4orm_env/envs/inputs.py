@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_states, unwound_states
-from d4orm_env.disturbances.levels import check_components, per_component
+from d4orm_env.disturbances.disturbance import check_components, per_component
 
 MAX_ACTION = 1e15
 """Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
@@ -76,11 +79,7 @@ def noise_std(value: ArrayLike, control_size: int) -> FloatArray | None:
 
 
 def joint_controls(actions: ArrayLike, shape: tuple[int, ...], num_robots: int) -> FloatArray:
-    """``(..., K, m)`` controls from joint actions of that shape, ``(..., K * m)``, as a checked copy.
-
-    Raises:
-        ValueError: If they have another shape, or a value that is not finite or beyond :data:`MAX_ACTION`.
-    """
+    """``(..., K, m)`` controls from joint actions of that shape, ``(..., K * m)``, as a checked copy."""
     noun, axes = ("action has", "(K * m,)") if len(shape) == 1 else ("actions have", "(B, K * m)")
     try:
         controls = as_float32(actions)
@@ -96,3 +95,42 @@ def joint_controls(actions: ArrayLike, shape: tuple[int, ...], num_robots: int) 
             f"{controls[*world, robot].tolist()}; every value must be finite and at most {MAX_ACTION:g} in magnitude"
         )
     return controls
+
+
+def reset_mask(options: Mapping[str, object] | None, running: BoolArray) -> BoolArray:
+    """``(B,)`` bool: which worlds ``reset(options=...)`` resets, of which these are ``running`` ``(B,)``."""
+    check_options(options, ("reset_mask",))
+    if options is None or "reset_mask" not in options:
+        return np.ones_like(running)
+    mask = options["reset_mask"]
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, not {mask!r}")
+    if mask.shape != running.shape or not mask.any():
+        raise ValueError(
+            f"options['reset_mask'] has shape {mask.shape} and {int(mask.sum())} worlds; it must have shape "
+            f"{running.shape} and at least one world"
+        )
+    if not (mask | running).all():
+        raise RuntimeError("the first reset must not leave worlds out; call reset() without a mask")
+    return mask
+
+
+def world_seeds(seed: int | Sequence[int | None] | None, num_worlds: int) -> list[int | None]:
+    """One seed for each world, from the argument of ``reset``."""
+    if seed is None:
+        return [None] * num_worlds
+    if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str):
+        first = whole_number(seed, "seed", 0)
+        return [first + world for world in range(num_worlds)]
+    if len(seed) != num_worlds:
+        raise ValueError(f"seed has {len(seed)} entries for {num_worlds} worlds; give one per world")
+    return [None if one is None else whole_number(one, f"seed[{world}]", 0) for world, one in enumerate(seed)]
+
+
+def checked_autoreset_mode(value: str | AutoresetMode) -> AutoresetMode:
+    """The mode itself, or by its value."""
+    try:
+        return AutoresetMode(value)
+    except ValueError:
+        names = ", ".join(repr(mode.value) for mode in AutoresetMode)
+        raise ValueError(f"autoreset_mode {value!r} is unknown; choose one of {names}") from None

@@ -61,17 +61,8 @@ def fresh_goal(
     """A random goal ``(d,)`` where ``robot`` would keep the margin to every body, other goals, obstacles and bounds.
 
     It is uniform over the free part of :func:`goal_region`. Among obstacles it is one that has a free path to the
-    robot's first goal, unless its start has none.
-
-    Args:
-        problem: The problem; its goals are not looked at.
-        robot: The robot that gets the goal.
-        positions: ``(K, d)`` where the robots are [m].
-        goals: ``(K, d)`` present goals; ``robot``'s own is ignored.
-        random: Generator of the draws.
-
-    Raises:
-        RuntimeError: If 5120 draws find no free place.
+    robot's first goal, unless its start has none. Robots are at ``positions`` ``(K, d)``, and ``goals`` ``(K, d)`` are
+    the present ones [m].
     """
     radius = np.asarray(problem.team.radius, np.float64)
     reach = radius + radius[robot] + problem.margin

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, read_only
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -63,9 +63,7 @@ class RewardInput:
         for attribute in fields(self):
             value = getattr(self, attribute.name)
             if isinstance(value, np.ndarray):
-                copy = value.copy()
-                copy.setflags(write=False)
-                object.__setattr__(self, attribute.name, copy)
+                object.__setattr__(self, attribute.name, read_only(value.copy()))
 
     @classmethod
     def of_worlds(
@@ -195,11 +193,7 @@ def no_terms(function: RewardFunction | None, shape: tuple[int, ...]) -> dict[st
 
 
 def compute_rewards(function: RewardFunction, step: RewardInput) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """``(..., K)`` float32 rewards of a step, checked, and their terms, of which a reward that has some is the sum.
-
-    Raises:
-        ValueError: If the function returns another shape, or a value that is not finite.
-    """
+    """``(..., K)`` float32 rewards of a step, checked, and their terms, of which a reward that has some is the sum."""
     name, shape = getattr(function, "__name__", type(function).__name__), step.distances.shape
     names = term_names(function)
     if not names:

@@ -43,9 +43,6 @@ class EnvSetup:
         reward: The reward function; ``None`` for the paper's, which the engines compute.
         along_paths: Whether distances of rewards are lengths of shortest paths.
         layout: Layout of one robot's observation.
-
-    Raises:
-        ValueError: For an argument out of range, or an instance that differs from the first in more than it may.
     """
 
     def __init__(

@@ -15,7 +15,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, Scene
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
-from d4orm_env.engine.types import LOOK, RESET, SKIP, STEP, ObservationInputs, WorldBatch, WorldEngine
+from d4orm_env.engine.types import LOOK, RESET, SKIP, STEP, ObservationInputs, WorldBatch
 from d4orm_env.envs.inputs import checked_states
 from d4orm_env.envs.lifelong import assign_goals, reached_goals
 from d4orm_env.envs.rewards import RewardInput, along_paths, compute_rewards, no_terms
@@ -52,7 +52,7 @@ class Simulation:
         from d4orm_env.engine.cpu import CpuEngine
 
         self.setup, self.max_cycles = setup, setup.max_cycles
-        self._engine: WorldEngine = CpuEngine(num_threads)
+        self._engine = CpuEngine(num_threads)
         self._make_worlds(setup.problem, num_worlds)
 
     def _make_worlds(self, problem: Problem, num_worlds: int) -> None:
@@ -83,16 +83,10 @@ class Simulation:
         return np.asarray(self.worlds.terminated | self.worlds.truncated)
 
     def reset_worlds(self, seeds: Mapping[int, int], out: FloatArray, *, others: np.uint8 = LOOK) -> None:
-        """Begin episodes, and fill the observations ``out`` ``(B, K, D)``.
+        """Begin the episodes of some worlds, and fill the observations ``out`` ``(B, K, D)``.
 
-        Args:
-            seeds: Of each world that begins one, the number from 0 to ``2**63 - 1`` that all that is random in it
-                follows from.
-            out: Output.
-            others: Order for the other worlds, ``LOOK`` or ``SKIP``.
-
-        Raises:
-            ValueError: If an instance drawn does not fit the spaces fixed by the first one.
+        The seeds, from 0 to ``2**63 - 1``, are what all that is random follows from. The order for the ``others`` is
+        ``LOOK`` or ``SKIP``.
         """
         self._begin(seeds)
         orders = np.full(len(self.problems.all), others)
@@ -101,15 +95,9 @@ class Simulation:
         self._observe(orders, out)
 
     def step_worlds(self, controls: FloatArray, out: FloatArray, restarts: Mapping[int, int] | None = None) -> None:
-        """Advance one time step.
+        """Advance one time step under controls ``(B, K, m)``, of which those of docked robots do not matter.
 
-        Args:
-            controls: ``(B, K, m)``; those of docked robots do not matter.
-            out: ``(B, K, D)`` observations, output.
-            restarts: Seeds of the worlds that begin an episode instead.
-
-        Raises:
-            RuntimeError: If lifelong mode finds no room for a goal.
+        Observations ``(B, K, D)`` are filled. ``restarts`` are seeds of the worlds that begin an episode instead.
         """
         worlds, before = self.worlds, None
         if self.setup.reward is not None:
@@ -127,18 +115,11 @@ class Simulation:
         self._observe(orders, out)
 
     def put_robots(self, states: ArrayLike, docked: BoolArray, out: FloatArray) -> None:
-        """Put the robots elsewhere in the middle of an episode; all else stays as it is.
+        """Put the robots elsewhere, ``(B, K, n)`` or ``(K, n)`` of one world, in the middle of an episode.
 
         Goals, clock, the controls executed last and the metrics so far are kept. A robot that has docked stays docked
-        where it is put; one that is put at its goal docks at the end of the next step, if it is still there.
-
-        Args:
-            states: ``(B, K, n)``, or ``(K, n)`` of one world.
-            docked: ``(B, K)`` or ``(K,)`` bool, robots that must be at rest.
-            out: ``(B, K, D)`` observations, output.
-
-        Raises:
-            ValueError: If a state is none that a robot may be in; contact is allowed.
+        where it is put, and must be at rest; one that is put at its goal docks at the end of the next step, if it is
+        still there. Contact is allowed. ``out`` ``(B, K, D)`` are the observations.
         """
         problem, shape = self.problems.all[0], self.worlds.docked.shape
         checked = checked_states(problem, states, docked & problem.docks, self.state_bounds)

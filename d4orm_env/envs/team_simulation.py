@@ -22,14 +22,7 @@ _TRAIL_LENGTH = 50
 
 
 class TeamSimulation(Simulation):
-    """A team in its world, stepped with the whole team's controls.
-
-    Args:
-        setup: The environment.
-
-    Attributes:
-        last: Result of the last step, reset or :meth:`set_state`.
-    """
+    """A team in its world, stepped with the whole team's controls; ``last`` is the result of the last step or reset."""
 
     reward_rows = 0
 
@@ -78,11 +71,7 @@ class TeamSimulation(Simulation):
             raise RuntimeError("no episode has begun; call reset() first")
 
     def reset(self, random: np.random.Generator) -> TeamStep:
-        """Begin an episode at the start; everything random in it follows from one draw from ``random``.
-
-        Raises:
-            ValueError: If the instance drawn does not fit the spaces fixed by the first one.
-        """
+        """Begin an episode at the start; everything random in it follows from one draw from ``random``."""
         # One draw per episode, so that an episode does not depend on how long those before it were.
         observations, self._running = self._unseen(), True
         self.reset_worlds({0: int(random.integers(2**63))}, observations)
@@ -91,23 +80,14 @@ class TeamSimulation(Simulation):
         return self._unpaid(observations)
 
     def step(self, controls: FloatArray) -> TeamStep:
-        """Advance one time step under ``controls`` ``(K, m)``; those of docked robots do not matter.
-
-        Raises:
-            RuntimeError: Before the first reset, or if lifelong mode finds no room for a goal.
-        """
+        """Advance one time step under ``controls`` ``(K, m)``; those of docked robots do not matter."""
         self.require_reset()
         observations = self._unseen()
         self.step_worlds(controls[None], observations)
         return self._report(observations, self.robot_rewards[0], self.reached[0])
 
     def set_state(self, states: ArrayLike) -> TeamStep:
-        """Put the robots into states ``(K, n)``; see :meth:`Simulation.put_robots`.
-
-        Raises:
-            RuntimeError: Before the first reset.
-            ValueError: If a state is none that a robot may be in.
-        """
+        """Put the robots into states ``(K, n)``; see :meth:`Simulation.put_robots`."""
         self.require_reset()
         observations = self._unseen()
         self.put_robots(states, self.arrived, observations)

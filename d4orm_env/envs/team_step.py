@@ -18,26 +18,17 @@ AgentInfos: TypeAlias = dict[str, Info]
 
 
 class TeamStep(NamedTuple):
-    """Result of a step or a reset for the team; every array is the caller's to keep.
+    """Result of a step or a reset for the team; every array is the caller's to keep."""
 
-    Attributes:
-        observations: ``(K, D)`` local observations.
-        rewards: ``(K,)``; zero at a reset.
-        arrived: ``(K,)`` bool: docked, or in lifelong mode, reached a goal in this step.
-        collided: ``(K,)`` bool, hard contact.
-        margin_violated: ``(K,)`` bool.
-        distances: ``(K,)`` to the present goals [m].
-        partners: Robots that each robot in contact with others touches, by number.
-        terms: ``(K,)`` each, what the rewards were made of, where the reward says so.
-    """
-
-    observations: FloatArray
-    rewards: FloatArray
-    arrived: BoolArray
-    collided: BoolArray
-    margin_violated: BoolArray
-    distances: FloatArray
+    observations: FloatArray  #: ``(K, D)`` local observations
+    rewards: FloatArray  #: ``(K,)``; zero at a reset
+    arrived: BoolArray  #: ``(K,)`` bool: docked, or in lifelong mode, reached a goal in this step
+    collided: BoolArray  #: ``(K,)`` bool, hard contact
+    margin_violated: BoolArray  #: ``(K,)`` bool
+    distances: FloatArray  #: ``(K,)`` to the present goals [m]
+    #: Robots that each robot in contact with others touches, by number
     partners: Mapping[int, list[int]] = MappingProxyType({})
+    #: ``(K,)`` each, what the rewards were made of, where the reward says so
     terms: Mapping[str, FloatArray] = MappingProxyType({})
 
 
@@ -59,29 +50,54 @@ def agent_infos(names: Iterable[str], robots: Iterable[int], step: TeamStep) -> 
     }
 
 
+def masked(values: Mapping[str, NDArray[np.generic]], mask: BoolArray) -> Info:
+    """Copies of batched values, zero outside ``mask`` ``(B,)``, each with its mask."""
+    infos: Info = {}
+    whole = bool(mask.all())
+    for key, value in values.items():
+        infos[key] = value.copy()
+        if not whole:
+            infos[key][~mask] = 0
+        infos[f"_{key}"] = mask.copy()
+    return infos
+
+
+def final_infos(observations: FloatArray, infos: Info, ended: BoolArray) -> Info:
+    """Return what is kept of episodes that have ``ended`` ``(B,)``, before their worlds are reset.
+
+    ``infos`` go into the result.
+    """
+    final_obs = np.full(len(ended), None, dtype=object)
+    for world in np.flatnonzero(ended):
+        final_obs[world] = observations[world].copy()
+    final_info: Info = {}
+    for key in [name for name in infos if not name.startswith("_")]:
+        final_info[key] = infos[key]
+        if isinstance(infos[key], np.ndarray):
+            final_info[key][~ended] = 0
+        final_info[f"_{key}"] = ended.copy()
+    return {
+        "final_obs": final_obs,
+        "_final_obs": ended.copy(),
+        "final_info": final_info,
+        "_final_info": ended.copy(),
+    }
+
+
 Counts = NDArray[np.int64]
 
 
 class EpisodeCounts(NamedTuple):
-    """Counts of an episode of one world or, with leading axes, of many.
+    """Counts of an episode of one world or, with leading axes, of many."""
 
-    Attributes:
-        steps: ``(...)`` steps taken.
-        reward: ``(...)`` sum over steps and robots.
-        goals: ``(..., K)`` goals reached by each robot.
-        contacts: ``(..., K)`` steps in contact.
-        violations: ``(..., K)`` steps within the margin.
-        arrival_step: ``(..., K)`` step since which a robot is at its goal, infinite where it is not; ``None`` in
-            lifelong mode.
-        lost: ``(..., K)`` robots that a disturbance keeps from ever arriving, if there can be any.
-    """
-
-    steps: int | Counts
-    reward: float | Floats
-    goals: Counts | BoolArray
-    contacts: Counts
-    violations: Counts
+    steps: int | Counts  #: ``(...)`` steps taken
+    reward: float | Floats  #: ``(...)`` sum over steps and robots
+    goals: Counts | BoolArray  #: ``(..., K)`` goals reached by each robot
+    contacts: Counts  #: ``(..., K)`` steps in contact
+    violations: Counts  #: ``(..., K)`` steps within the margin
+    #: ``(..., K)`` step since which a robot is at its goal, infinite where it is not; ``None`` in lifelong mode
     arrival_step: Floats | None
+    #: ``(..., K)`` robots that a disturbance keeps from ever arriving, if there can be any
     lost: BoolArray | None = None
 
 

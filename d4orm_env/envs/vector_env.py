@@ -14,13 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.engine.types import SKIP
-from d4orm_env.envs.inputs import joint_controls
+from d4orm_env.envs.inputs import checked_autoreset_mode, joint_controls, reset_mask, world_seeds
 from d4orm_env.envs.joint_env import joint_spaces
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.simulation import Simulation
-from d4orm_env.envs.team_step import Info
-from d4orm_env.envs.vector_io import checked_autoreset_mode, final_infos, masked, reset_mask, world_seeds
+from d4orm_env.envs.team_step import Info, final_infos, masked
 from d4orm_env.scenarios.problems import ScenarioLike
 
 __all__ = ["NavigationVectorEnv"]

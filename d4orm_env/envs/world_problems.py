@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,23 +12,21 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
-from d4orm_env.engine.types import WorldBatch, WorldEngine
+from d4orm_env.engine.types import WorldBatch
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.paths.shortest_paths import ahead_in_each
+
+if TYPE_CHECKING:
+    from d4orm_env.engine.cpu import CpuEngine
 
 
 class WorldProblems:
     """The problem of each of ``B`` worlds.
 
-    Args:
-        setup: The environment.
-        disturbed: Its disturbances, which may alter limits.
-        num_worlds: ``B``.
-
     Attributes:
         all: ``B`` problems.
         seen: Arrays that robots are observed with, of each.
-        true: Arrays that they are stepped with, of each.
+        true: Arrays that they are stepped with, of each, as disturbances leave the limits.
         alike: Whether those of the first do for all, in one kernel call.
     """
 
@@ -56,7 +55,7 @@ class WorldProblems:
         worlds.inverse[world] = problem.arrays.inverse_initial_distance
 
     def sense_ranges(
-        self, engine: WorldEngine, batch: WorldBatch, out: FloatArray, worlds: NDArray[np.intp] | None = None
+        self, engine: CpuEngine, batch: WorldBatch, out: FloatArray, worlds: NDArray[np.intp] | None = None
     ) -> None:
         """Fill the rays of the observations ``out`` ``(b, K, D)`` of some worlds, or of all, as these truly are."""
         layout = self._setup.layout
@@ -83,11 +82,7 @@ class WorldProblems:
 
 
 class WorldPaths:
-    """Paths of ``B`` worlds to the goals, as they were last looked for.
-
-    Args:
-        problems: Of each world; it may change.
-        one_world: Whether all are one.
+    """Paths of ``B`` worlds to the goals, as they were last looked for; ``one_world`` where all are one.
 
     Attributes:
         direction: ``(B, K, d)`` unit vectors.

@@ -17,15 +17,10 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """The obstacles of a world of dimension ``d``, numbered through: first the rounded boxes, then the triangles.
+    """The obstacles of a world of dimension ``d``, numbered through: first the rounded boxes, then the triangles."""
 
-    Attributes:
-        boxes: ``(B, 2 d + 1)`` float32 lower corner, upper corner, radius [m]; corners may be infinitely far.
-        triangles: ``(T, 6)`` float32 corners ``x, y, x, y, x, y``, counterclockwise [m]; none in space.
-    """
-
-    boxes: FloatArray
-    triangles: FloatArray
+    boxes: FloatArray  #: ``(B, 2 d + 1)`` float32 lower corner, upper corner, radius [m]; corners may be infinitely far
+    triangles: FloatArray  #: ``(T, 6)`` float32 corners ``x, y, x, y, x, y``, counterclockwise [m]; none in space
 
     @property
     def dimension(self) -> int:
@@ -61,11 +56,8 @@ class Shapes:
         return np.where(ends, lowest, 0.0), np.where(ends, highest, 0.0)
 
     def within(self, points: Floats, reach: float) -> tuple[IntArray, IntArray]:
-        """Pairs ``(P,)``, ``(P,)`` of points and obstacles that may be within a distance of each other; all that are.
-
-        Args:
-            points: ``(N, d)``.
-            reach: The distance.
+        """Pairs ``(P,)``, ``(P,)`` of points ``(N, d)`` and obstacles that may be within reach of each other; all that
+        are.
         """
         low, high = self.corners()
         pairs = np.ones((len(points), len(low)), bool)
@@ -76,11 +68,8 @@ class Shapes:
         return rows, items
 
     def signed_distance(self, points: Floats, items: NDArray[np.int64]) -> Floats:
-        """``(N,)`` distance from each point to the surface of the obstacle of that number, negative inside [m].
-
-        Args:
-            points: ``(N, d)``.
-            items: ``(N,)``.
+        """``(N,)`` distance from points ``(N, d)`` to the surface of the obstacle of each's number, negative inside
+        [m].
         """
         if not len(self.triangles):
             return _box_distance(points, self._columns, items)

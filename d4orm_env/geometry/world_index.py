@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import FloatArray, Floats, Ints
+from d4orm_env.core.arrays import FloatArray, Floats, Ints, read_only
 from d4orm_env.geometry.grid_refinement import PAIRS_AT_ONCE, fill_grid
 from d4orm_env.geometry.shapes import Shapes
 
@@ -33,35 +33,25 @@ _EPSILON = float(np.finfo(np.float32).eps)
 
 
 class WorldIndex(NamedTuple):
-    """A grid over a world of dimension ``d``; cells are numbered with the last axis fastest.
+    """A grid over a world of dimension ``d``; cells are numbered with the last axis fastest."""
 
-    Attributes:
-        low: ``(d,)`` float32 lowest corner [m].
-        scale: ``()`` float32 one over the size of a cell [1/m].
-        ends: ``(2, d)`` float32 lowest and highest corner, infinite along an axis on which an obstacle has no end.
-        size: ``(d,)`` int32 cells along each axis; all zero in a world without obstacles.
-        slack: ``()`` float32 by how much the clearance at the centre of its cell and that at a point may differ [m],
-            rounding included.
-        clearance: ``(C,)`` float32 at the centres [m], negative inside an obstacle.
-        first: ``(levels C + 1,)`` int32 where each cell's part of ``items`` begins.
-        items: int32 numbers of the obstacles, as in :class:`~d4orm_env.geometry.shapes.Shapes`, those of a cell by
-            their distance from its centre.
-        longest: ``()`` int32 the most obstacles of any cell.
-        nearest: ``()`` int32 how many of the nearest obstacles of any of its points a cell is sure to have.
-        levels: ``()`` int32 for how many grids, one round the other, there are lists: each has ``C`` cells about the
-            same middle, ``WIDER`` times as large as those of the one inside it. All else is said of the first.
-    """
-
-    low: FloatArray
-    scale: np.float32
+    low: FloatArray  #: ``(d,)`` float32 lowest corner [m]
+    scale: np.float32  #: ``()`` float32 one over the size of a cell [1/m]
+    #: ``(2, d)`` float32 lowest and highest corner, infinite along an axis on which an obstacle has no end
     ends: FloatArray
-    size: Ints
+    size: Ints  #: ``(d,)`` int32 cells along each axis; all zero in a world without obstacles
+    #: ``()`` float32 by how much the clearance at the centre of its cell and that at a point may differ [m], rounding
+    #: included
     slack: np.float32
-    clearance: FloatArray
-    first: Ints
+    clearance: FloatArray  #: ``(C,)`` float32 at the centres [m], negative inside an obstacle
+    first: Ints  #: ``(levels C + 1,)`` int32 where each cell's part of ``items`` begins
+    #: int32 numbers of the obstacles, as in :class:`~d4orm_env.geometry.shapes.Shapes`, those of a cell by their
+    #: distance from its centre
     items: Ints
-    longest: np.int32
-    nearest: np.int32
+    longest: np.int32  #: ``()`` int32 the most obstacles of any cell
+    nearest: np.int32  #: ``()`` int32 how many of the nearest obstacles of any of its points a cell is sure to have
+    #: ``()`` int32 for how many grids, one round the other, there are lists: each has ``C`` cells about one middle,
+    #: ``WIDER`` times as large as those of the one inside it. All else is said of the first.
     levels: np.int32
 
     @property
@@ -174,17 +164,10 @@ def _filled(
     return _frozen(low, 1 / cell, ends, size, slack, clearance, first, items, longest, nearest, levels)
 
 
-_KINDS: dict[str, Any] = {
-    "low": np.float32, "scale": np.float32, "ends": np.float32, "size": np.int32, "slack": np.float32,
-    "clearance": np.float32, "first": np.int32, "items": np.int32, "longest": np.int32, "nearest": np.int32,
-    "levels": np.int32,
-}  # fmt: skip
+_KINDS: tuple[Any, ...] = (*(np.float32,) * 3, np.int32, *(np.float32,) * 2, *(np.int32,) * 5)
+"""Of the fields of :class:`WorldIndex`, in their order."""
 
 
 def _frozen(*parts: ArrayLike) -> WorldIndex:
     """The index of these parts, as engines read it."""
-    index = WorldIndex(*(kind(part) for kind, part in zip(_KINDS.values(), parts, strict=True)))
-    for array in index:
-        if isinstance(array, np.ndarray):
-            array.setflags(write=False)
-    return index
+    return read_only(WorldIndex(*(kind(part) for kind, part in zip(_KINDS, parts, strict=True))))

@@ -229,11 +229,7 @@ def _refuse(options: EnvOptions) -> None:
 
 
 def _stacked(problems: list[Problem]) -> tuple[dict[int, jax.Array], list[ArrayLike], PyTreeDef]:
-    """Leaves that differ from instance to instance, stacked, by their place; those of the first; and the structure.
-
-    Raises:
-        ValueError: If the instances differ in shapes, or in what is not an array.
-    """
+    """Leaves that differ from instance to instance, stacked, by their place; those of the first; and the structure."""
     flattened: list[tuple[list[ArrayLike], PyTreeDef]] = [jax.tree.flatten(problem) for problem in problems]
     common, structure = flattened[0]
     shapes = [np.shape(leaf) for leaf in common]

@@ -52,17 +52,10 @@ def _params() -> triton.CompilerParams:
 def move_robots(
     advance: Advance, numbers: Any, state: Array, docked: Array, controls: Array
 ) -> tuple[Array, Array, Array]:
-    """Roll robots of one model out, each on its own.
+    """Roll robots of one model out, each on its own, by ``advance`` and a tree of numbers ``(R, 1)`` for it.
 
-    Args:
-        advance: Its step.
-        numbers: A tree of numbers ``(R, 1)`` for it.
-        state: ``(R, n, S)``.
-        docked: ``(R, S)`` bool.
-        controls: ``(H, R, m, S)``.
-
-    Returns:
-        The same after each step ``(H, ...)``, the controls as executed.
+    From ``state`` ``(R, n, S)`` and ``docked`` ``(R, S)`` on under ``controls`` ``(H, R, m, S)``. Returned is the same
+    after each step ``(H, ...)``, the controls as executed.
     """
     horizon, num_robots, _, num_samples = controls.shape
     columns, structure = jax.tree.flatten(numbers)
@@ -113,12 +106,9 @@ def _move(
 
 
 def count_near(dimension: int, state: Array, squared_reach: Array) -> Array:
-    """``(K, S)`` how many others each robot is near.
+    """``(K, S)`` how many others each robot in ``state`` ``(K, n, S)`` is near.
 
-    Args:
-        dimension: ``d``.
-        state: ``(K, n, S)``, the place first.
-        squared_reach: ``(K, K)`` squared distances up to which two are near; negative for a robot and itself.
+    ``squared_reach`` ``(K, K)`` are squared distances up to which two are near; negative for a robot and itself.
     """
     num_robots, _, num_samples = state.shape
     kernel = pl.pallas_call(

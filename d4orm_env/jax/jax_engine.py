@@ -16,11 +16,11 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.dynamics import collision, reward
+from d4orm_env.dynamics import collision, transition
 from d4orm_env.dynamics.models import names_of_codes
 from d4orm_env.engine import noise
 from d4orm_env.engine.types import (
@@ -166,7 +166,7 @@ def rewards_of(
     """``(K, S)`` reward of one step."""
     distance, one = goal_distance(arrays, place), jnp.float32(1)
     violations = pair_violation.astype(jnp.float32), obstacle_violation.astype(jnp.float32), jnp.float32(0)
-    return reward.step_reward(distance, arrays.inverse_initial_distance[:, None], violations, penalty, one)
+    return transition.step_reward(distance, arrays.inverse_initial_distance[:, None], violations, penalty, one)
 
 
 def check_contacts(arrays: ProblemArrays, state: Array) -> Contacts:
@@ -231,11 +231,7 @@ class JaxEngine:
         return np.concatenate([states[None], np.asarray(after)[..., 0]])
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
-        """See :meth:`d4orm_env.engine.types.Engine.rollout`.
-
-        Raises:
-            ValueError: If the controls have another shape than ``(H, K, m)`` or are not finite.
-        """
+        """See :meth:`d4orm_env.engine.types.Engine.rollout`."""
         num_robots = problem.num_robots
         first, (worlds, contacts) = _rolled_out(problem, checked_controls(problem, controls)[None])
         states = np.concatenate([problem.start[None], np.asarray(worlds.state)[..., 0]])
@@ -253,10 +249,6 @@ class JaxEngine:
         )
 
     def score(self, problem: Problem, controls: ArrayLike) -> FloatArray:
-        """See :meth:`d4orm_env.engine.types.Engine.score`.
-
-        Raises:
-            ValueError: If the controls have another shape than ``(M, H, K, m)`` or are not finite.
-        """
+        """See :meth:`d4orm_env.engine.types.Engine.score`."""
         _, (_, contacts) = _rolled_out(problem, checked_controls(problem, controls, batch=True))
         return np.asarray(contacts[2].mean(axis=0).T)

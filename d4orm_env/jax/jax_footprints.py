@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.convex_cores import BISECTIONS
 
@@ -23,39 +23,23 @@ Given: TypeAlias = Array | FloatArray | np.float32
 
 
 class MovingBodies(NamedTuple):
-    """Bodies that are not simulated, at one time.
+    """Bodies that are not simulated, at one time."""
 
-    Attributes:
-        places: ``(O, d)``.
-        headings: ``(F,)`` of the bodies and their trailers, or ``None`` where all are discs.
-        radius: ``(O,)`` outer radii.
-        footprints: Theirs; ``None`` where all are discs.
-    """
-
-    places: Array | FloatArray
-    headings: Array | FloatArray | None
-    radius: Array | FloatArray
-    footprints: FootprintArrays | None
+    places: Array | FloatArray  #: ``(O, d)``
+    headings: Array | FloatArray | None  #: ``(F,)`` of the bodies and their trailers, or ``None`` where all are discs
+    radius: Array | FloatArray  #: ``(O,)`` outer radii
+    footprints: FootprintArrays | None  #: Theirs; ``None`` where all are discs
 
 
 class PlacedBodies(NamedTuple):
-    """Placed bodies: ``R`` robots in ``S`` samples, or one.
+    """Placed bodies: ``R`` robots in ``S`` samples, or one."""
 
-    Attributes:
-        place: ``(d, R, S)`` reference points.
-        corners: ``(2, n, R, S)`` of the cores, relative to them; ``None`` in space.
-        axes: ``(2, m, R, S)``; zeros tell nothing.
-        extents: ``(m, R, S)`` how far the cores reach along them.
-        rounding: ``(R, 1)``.
-        semi_axes: ``(3, R, 1)`` of ellipsoids.
-    """
-
-    place: Array
-    corners: Array
-    axes: Array
-    extents: Array
-    rounding: Array
-    semi_axes: Array
+    place: Array  #: ``(d, R, S)`` reference points
+    corners: Array  #: ``(2, n, R, S)`` of the cores, relative to them; ``None`` in space
+    axes: Array  #: ``(2, m, R, S)``; zeros tell nothing
+    extents: Array  #: ``(m, R, S)`` how far the cores reach along them
+    rounding: Array  #: ``(R, 1)``
+    semi_axes: Array  #: ``(3, R, 1)`` of ellipsoids
 
 
 def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius: Given | None = None) -> PlacedBodies:

@@ -29,38 +29,23 @@ Given: TypeAlias = Array | FloatArray
 
 
 class Worlds(NamedTuple):
-    """A block of worlds on the way.
+    """A block of worlds on the way."""
 
-    Attributes:
-        state: ``(K, n, S)``.
-        docked: ``(K, S)`` bool.
-        control: ``(K, m, S)`` executed last.
-    """
-
-    state: Array
-    docked: Array
-    control: Array
+    state: Array  #: ``(K, n, S)``
+    docked: Array  #: ``(K, S)`` bool
+    control: Array  #: ``(K, m, S)`` executed last
 
 
 class Numbers(NamedTuple):
-    """Numbers that a robot's motion depends on, each a number or an array that fits its state's components.
+    """Numbers that a robot's motion depends on, each a number or an array that fits its state's components."""
 
-    Attributes:
-        time_step: Four, see :class:`~d4orm_env.dynamics.transition.TimeStep`.
-        limits: The model's.
-        goal: ``d``.
-        squared_goal_radius: Arriving within its root.
-        squared_goal_speed: And no faster than its root.
-        docks: Positive if a robot that has arrived stays.
-        facing: Cosine and sine of the goal heading, and the squared chord by which it may be missed; empty without.
-    """
-
-    time_step: tuple[Given, ...]
-    limits: tuple[Given, ...]
-    goal: tuple[Given, ...]
-    squared_goal_radius: Given
-    squared_goal_speed: Given
-    docks: Given
+    time_step: tuple[Given, ...]  #: Four, see :class:`~d4orm_env.dynamics.transition.TimeStep`
+    limits: tuple[Given, ...]  #: The model's
+    goal: tuple[Given, ...]  #: ``d``
+    squared_goal_radius: Given  #: Arriving within its root
+    squared_goal_speed: Given  #: And no faster than its root
+    docks: Given  #: Positive if a robot that has arrived stays
+    #: Cosine and sine of the goal heading, and the squared chord by which it may be missed; empty without
     facing: tuple[Given, ...]
 
 
@@ -114,14 +99,7 @@ def by_model(models: tuple[str, ...]) -> Iterator[tuple[Model, np.ndarray[Any, A
 
 
 def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> Worlds:
-    """One step of every robot in every world, docking included.
-
-    Args:
-        models: The team's model names; static.
-        arrays: The problem.
-        worlds: Before the step.
-        control: ``(K, m, S)`` not yet clipped.
-    """
+    """One step of every robot in every world, docking included, under ``control`` ``(K, m, S)``, not yet clipped."""
     state, executed, docked = worlds.state, jnp.zeros_like(control), worlds.docked
     for model, robots in by_model(models):
         x = tuple(worlds.state[robots, i] for i in range(model.state_size))

@@ -30,14 +30,9 @@ UNROLLED = 16
 def observe_team(
     models: tuple[str, ...], arrays: ProblemArrays, world: Worlds, layout: ObservationLayout, time_left: Array
 ) -> Array:
-    """``(K, D)`` what every robot sees.
+    """``(K, D)`` what every robot sees of one world: ``(K, n)``, ``(K,)`` and ``(K, m)``.
 
-    Args:
-        models: The team's model names; static.
-        arrays: The problem; ``bounds`` is ``None`` where the world has none.
-        world: One world: ``(K, n)``, ``(K,)`` and ``(K, m)``.
-        layout: Of the observations; static.
-        time_left: Share of the time left, 1 to 0.
+    ``arrays.bounds`` is ``None`` where it has none; ``time_left`` is the share of the time left, 1 to 0.
     """
     place = [world.state[:, axis] for axis in range(layout.dimension)]
     velocity, heading = _motion(models, arrays, world)
@@ -80,15 +75,10 @@ def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds) -> tu
 
 
 class _Nearest(NamedTuple):
-    """The nearest things so far, in order; of those with equal keys the first comes first.
+    """The nearest things so far, in order; of those with equal keys the first comes first."""
 
-    Attributes:
-        keys: One ``(K,)`` for each, infinite where there is nothing.
-        rows: Columns of each.
-    """
-
-    keys: tuple[Array, ...]
-    rows: tuple[tuple[Array, ...], ...]
+    keys: tuple[Array, ...]  #: One ``(K,)`` for each, infinite where there is nothing
+    rows: tuple[tuple[Array, ...], ...]  #: Columns of each
 
     @classmethod
     def nothing(cls, num_robots: int, count: int, width: int) -> _Nearest:

@@ -9,26 +9,19 @@ import jax.numpy as jnp
 from jax import Array
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.jax.jax_footprints import PlacedBodies, place_robots
 
 
 class OtherBodies(NamedTuple):
-    """Bodies of all robots, seen from one of them.
+    """Bodies of all robots, seen from one of them."""
 
-    Attributes:
-        x: ``(F,)`` reference points.
-        y: Likewise.
-        radius: ``(F,)`` of discs; -1 of its own bodies.
-        cores: Footprints, as ``(.., F)``; ``None`` of a team of discs.
-    """
-
-    x: Array
-    y: Array
-    radius: Array
-    cores: PlacedBodies | None
+    x: Array  #: ``(F,)`` reference points
+    y: Array  #: Likewise
+    radius: Array  #: ``(F,)`` of discs; -1 of its own bodies
+    cores: PlacedBodies | None  #: Footprints, as ``(.., F)``; ``None`` of a team of discs
 
 
 def cast_rays(
@@ -36,12 +29,8 @@ def cast_rays(
 ) -> list[Array]:
     """``R`` columns ``(K,)``: how far each ray of every robot reaches [m].
 
-    Args:
-        arrays: The problem; ``bounds`` is ``None`` where the world has none.
-        state: ``(K, n)``.
-        place: Positions, two columns ``(K,)``.
-        heading: Their headings' cosines and sines, both zero for robots without.
-        layout: Of the observations; static.
+    Places are two columns ``(K,)``, and headings cosines and sines, both zero for robots without. ``arrays.bounds`` is
+    ``None`` where the world has none.
     """
     if not layout.num_rays:
         return []

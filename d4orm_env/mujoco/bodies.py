@@ -34,13 +34,7 @@ _SPIN, _FREE_DOFS, _FREE_PLACE = 2, 6, 7
 
 
 class TeamBodies:
-    """The bodies of a problem's team.
-
-    Args:
-        problem: The problem; every robot has a body, see :func:`~d4orm_env.mujoco.scene.check_problem`.
-        intruder_radius: ``(N,)`` of bodies that are no robots [m].
-        physics: Their material.
-    """
+    """The bodies of a problem's team, which all have one, and of bodies that are no robots, of radii ``(N,)`` [m]."""
 
     sensed = None
 
@@ -215,19 +209,12 @@ class TeamBodies:
 
 
 class WheelCommands(NamedTuple):
-    """Commands of ``D`` drives from the beginning of a step on, each ``(D,)``.
+    """Commands of ``D`` drives from the beginning of a step on, each ``(D,)``."""
 
-    Attributes:
-        speed: At the beginning [m/s].
-        acceleration: From there on [m/s^2].
-        turn_rate: [rad/s].
-        max_speed: [m/s].
-    """
-
-    speed: Floats
-    acceleration: Floats
-    turn_rate: Floats
-    max_speed: Floats
+    speed: Floats  #: At the beginning [m/s]
+    acceleration: Floats  #: From there on [m/s^2]
+    turn_rate: Floats  #: [rad/s]
+    max_speed: Floats  #: [m/s]
 
 
 class WheelControl:
@@ -266,11 +253,8 @@ class WheelControl:
     def torque(self, commands: WheelCommands, time: float, step: float, spin: Floats) -> Floats:
         """``(D, 2)`` torques of left and right wheels for the next step [N m].
 
-        Args:
-            commands: Commands of the drives.
-            time: Since the commands were given, at the end of the step [s].
-            step: [s].
-            spin: ``(D, 2)`` present speeds of the wheels [rad/s].
+        ``time`` is since the commands were given, at the end of the step [s], and ``spin`` ``(D, 2)`` the present
+        speeds of the wheels [rad/s].
         """
         wanted = commands.speed + time * commands.acceleration
         speed = np.clip(wanted, -commands.max_speed, commands.max_speed)

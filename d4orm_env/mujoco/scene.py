@@ -73,22 +73,16 @@ _PALETTE = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.1
 
 
 class MujocoScene(NamedTuple):
-    """A compiled scene and where things are in it.
+    """A compiled scene and where things are in it."""
 
-    Attributes:
-        model: The scene.
-        joints: ``(K,)`` first address of every robot's positions; a puck has ``x, y, angle`` there, a drive place and
-            quaternion, and then two wheels.
-        dofs: ``(K,)`` first address of its velocities.
-        owner: ``(geoms,)`` the robot that a solid geom belongs to, :data:`OBSTACLE`, or :data:`NOT_SOLID`.
-        mass: ``(K,)`` [kg].
-    """
-
-    model: mujoco.MjModel
+    model: mujoco.MjModel  #: The scene
+    #: ``(K,)`` first address of a robot's positions; a puck has ``x, y, angle`` there, a drive place and quaternion,
+    #: and then two wheels
     joints: NDArray[np.int64]
-    dofs: NDArray[np.int64]
+    dofs: NDArray[np.int64]  #: ``(K,)`` first address of its velocities
+    #: ``(geoms,)`` the robot that a solid geom belongs to, :data:`OBSTACLE`, or :data:`NOT_SOLID`
     owner: NDArray[np.int64]
-    mass: NDArray[np.float64]
+    mass: NDArray[np.float64]  #: ``(K,)`` [kg]
 
 
 OBSTACLE, NOT_SOLID = -1, -2
@@ -119,17 +113,7 @@ def check_problem(problem: Problem) -> None:
 
 
 def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, step: float) -> MujocoScene:
-    """The scene of a problem, all robots at their starts.
-
-    Args:
-        problem: The problem.
-        physics: Material of the bodies.
-        body_radius: ``(N,)`` of bodies that are no robots and move as they like [m].
-        step: Of MuJoCo [s].
-
-    Raises:
-        ValueError: If MuJoCo cannot make bodies of the obstacles.
-    """
+    """The scene of a problem, all robots at their starts, and bodies of radii ``(N,)`` [m] that are no robots."""
     spec = mujoco.MjSpec()
     spec.option.timestep = step
     spec.option.gravity = [0, 0, -GRAVITY]

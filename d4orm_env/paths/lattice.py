@@ -25,25 +25,15 @@ it each time, so as to end in the middle of narrow gaps."""
 
 
 class Lattice(NamedTuple):
-    """A grid whose free points are the nodes of a wavefront, both numbered with the last axis fastest.
+    """A grid whose free points are the nodes of a wavefront, both numbered with the last axis fastest."""
 
-    Attributes:
-        low: ``(3,)`` the first point [m].
-        step: Between neighbours along an axis [m].
-        size: ``(3,)`` int64 points along each axis.
-        moves: ``(M, 3)`` int64 to the neighbours of a point.
-        nodes: ``(G,)`` int32 the node of each point; -1 where it is not free.
-        points: ``(N,)`` int32 the point of each node.
-        places: ``(N, 3)`` where each node is [m].
-    """
-
-    low: Floats
-    step: float
-    size: IntArray
-    moves: IntArray
-    nodes: Ints
-    points: Ints
-    places: Floats
+    low: Floats  #: ``(3,)`` the first point [m]
+    step: float  #: Between neighbours along an axis [m]
+    size: IntArray  #: ``(3,)`` int64 points along each axis
+    moves: IntArray  #: ``(M, 3)`` int64 to the neighbours of a point
+    nodes: Ints  #: ``(G,)`` int32 the node of each point; -1 where it is not free
+    points: Ints  #: ``(N,)`` int32 the point of each node
+    places: Floats  #: ``(N, 3)`` where each node is [m]
 
 
 @inlined

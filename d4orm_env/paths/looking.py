@@ -16,43 +16,25 @@ from d4orm_env.paths.wavefront import NOBODY, Front
 
 
 class Fields(NamedTuple):
-    """The wavefronts of a team, one behind the other, and the lattices that they are on.
+    """The wavefronts of a team, one behind the other, and the lattices that they are on."""
 
-    Attributes:
-        reach: ``(K,)`` the distance that each robot keeps [m].
-        room: ``(K,)`` clearance at its goal [m].
-        lattice: ``(K,)`` int64 number of its lattice.
-        low: ``(L, 3)`` the first nodes of the lattices [m].
-        step: ``(L,)`` between neighbours along an axis [m].
-        size: ``(L, 3)`` int64 points along each axis.
-        first_node: ``(L + 1,)`` int64 where the part of ``nodes`` of each lattice begins, and the end.
-        nodes: int32 the node of each point; -1 where it is not free.
-        first_place: ``(L + 1,)`` int64 where the part of ``places`` of each lattice begins, and the end.
-        places: ``(., 3)`` where the nodes are [m].
-        first_anchor: ``(K + 1,)`` int64 where the part of ``anchor`` of each robot begins, and the end.
-        anchor: int32, see :class:`Front`.
-        first_point: ``(K + 1,)`` int64 where those of ``points``, ``values`` and ``parents`` begin, and the end.
-        points: ``(., 3)`` [m].
-        values: [m].
-        parents: int32, counted from the first one of the robot.
-    """
-
-    reach: Floats
-    room: Floats
-    lattice: IntArray
-    low: Floats
-    step: Floats
-    size: IntArray
-    first_node: IntArray
-    nodes: Ints
-    first_place: IntArray
-    places: Floats
-    first_anchor: IntArray
-    anchor: Ints
+    reach: Floats  #: ``(K,)`` the distance that each robot keeps [m]
+    room: Floats  #: ``(K,)`` clearance at its goal [m]
+    lattice: IntArray  #: ``(K,)`` int64 number of its lattice
+    low: Floats  #: ``(L, 3)`` the first nodes of the lattices [m]
+    step: Floats  #: ``(L,)`` between neighbours along an axis [m]
+    size: IntArray  #: ``(L, 3)`` int64 points along each axis
+    first_node: IntArray  #: ``(L + 1,)`` int64 where the part of ``nodes`` of each lattice begins, and the end
+    nodes: Ints  #: int32 the node of each point; -1 where it is not free
+    first_place: IntArray  #: ``(L + 1,)`` int64 where the part of ``places`` of each lattice begins, and the end
+    places: Floats  #: ``(., 3)`` where the nodes are [m]
+    first_anchor: IntArray  #: ``(K + 1,)`` int64 where the part of ``anchor`` of each robot begins, and the end
+    anchor: Ints  #: int32, see :class:`Front`
+    #: ``(K + 1,)`` int64 where those of ``points``, ``values`` and ``parents`` begin, and the end
     first_point: IntArray
-    points: Floats
-    values: Floats
-    parents: Ints
+    points: Floats  #: ``(., 3)`` [m]
+    values: Floats  #: [m]
+    parents: Ints  #: int32, counted from the first one of the robot
 
 
 def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts: Sequence[Front]) -> Fields:
@@ -130,16 +112,11 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Plac
 def look(
     space: Space, fields: Fields, first: int, places: Floats, target: Floats, length: Floats, anchor: Ints
 ) -> None:
-    """The paths of some robots from places.
+    """Fill the paths of robots from number ``first`` on from places ``(R, Q, 3)``.
 
-    Args:
-        space: The world.
-        fields: The wavefronts of all robots.
-        first: Number of the first of these robots, which follow each other.
-        places: ``(R, Q, 3)``.
-        target: ``(R, Q, 3)`` where to go first, the place itself where there is no path; output.
-        length: ``(R, Q)`` of the whole path; infinite where there is none, output.
-        anchor: ``(R, Q)`` int32 the anchor that is the target or comes next, output; -1 where there is none.
+    ``target`` ``(R, Q, 3)`` is where to go first, the place itself where there is no path; ``length`` ``(R, Q)`` that
+    of the whole path, infinite where there is none; ``anchor`` ``(R, Q)`` the anchor that is the target or comes next,
+    else -1.
     """
     for r in range(places.shape[0]):
         for b in range(places.shape[1]):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, read_only
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
@@ -74,11 +74,7 @@ class ShortestPaths:
         return _towards(places, target), length
 
     def path(self, robot: int) -> Floats:
-        """``(w, d)`` float64 corners of the path of a robot, its start first and its goal last; empty if there is none.
-
-        Args:
-            robot: Its number.
-        """
+        """``(w, d)`` float64 corners of the path of a robot, from its start to its goal; empty if there is none."""
         d = self.problem.dimension
         start, goal = self.problem.start[robot, :d].astype(np.float64), self.problem.goal[robot].astype(np.float64)
         if not np.isfinite(self.length[robot]):
@@ -135,9 +131,6 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
 
     In a world without obstacles they are straight, and there is nothing to compute. Otherwise a wavefront spreads from
     every goal over a grid; see :mod:`d4orm_env.paths.wavefront`.
-
-    Args:
-        problem: The team, its starts and goals, and the world.
     """
     start = problem.start[:, : problem.dimension].astype(np.float64)
     if not problem.world.num_obstacles:
@@ -162,9 +155,7 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
         fronts.append(front)
     number = {key: n for n, key in enumerate(lattices)}
     world = space, looking.gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
-    length = _find(world, 0, starts)[1][:, 0]
-    length.setflags(write=False)
-    return ShortestPaths(problem, length, world)
+    return ShortestPaths(problem, read_only(_find(world, 0, starts)[1][:, 0]), world)
 
 
 def _towards(places: Floats, targets: Floats) -> Floats:
@@ -191,14 +182,7 @@ def ahead_in_each(paths: Sequence[ShortestPaths], places: FloatArray) -> tuple[F
 
 
 def observe_paths(observations: FloatArray, layout: ObservationLayout, direction: Floats, length: Floats) -> None:
-    """Fill in what robots see of their paths.
-
-    Args:
-        observations: ``(..., K, D)``.
-        layout: Their layout.
-        direction: ``(..., K, d)`` of the paths, unit vectors.
-        length: ``(..., K)`` of the paths [m].
-    """
+    """Fill in what robots see of their paths: ``(..., K, d)`` unit vectors, and ``(..., K)`` lengths [m]."""
     seen, parts = layout.paths(observations), layout.path
     seen[..., parts.direction] = direction
     seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]

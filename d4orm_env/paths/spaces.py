@@ -25,37 +25,21 @@ Place: TypeAlias = tuple[float, float, float]
 
 
 class Space(NamedTuple):
-    """A world with obstacles as the wavefront reads it; see :class:`~d4orm_env.geometry.world_index.WorldIndex`.
+    """A world with obstacles as the wavefront reads it; see :class:`~d4orm_env.geometry.world_index.WorldIndex`."""
 
-    Attributes:
-        low: ``(3,)`` lowest corner of the index [m].
-        cell: Size of its cells [m].
-        scale: One over that [1/m].
-        size: ``(3,)`` its cells along each axis.
-        rounding: Error of its clearances [m].
-        clearance: ``(C,)`` float32.
-        first: ``(C + 1,)`` int32.
-        items: int32.
-        boxes: ``(., 7)``.
-        triangles: ``(., 6)``.
-        bounds: ``(2, 3)`` of the world.
-        extent: ``(2, 3)`` of the obstacles.
-        pad: Distance from the obstacles that the index covers at least [m].
-    """
-
-    low: Floats
-    cell: float
-    scale: float
-    size: IntArray
-    rounding: float
-    clearance: FloatArray
-    first: Ints
-    items: Ints
-    boxes: Floats
-    triangles: Floats
-    bounds: Floats
-    extent: Floats
-    pad: float
+    low: Floats  #: ``(3,)`` lowest corner of the index [m]
+    cell: float  #: Size of its cells [m]
+    scale: float  #: One over that [1/m]
+    size: IntArray  #: ``(3,)`` its cells along each axis
+    rounding: float  #: Error of its clearances [m]
+    clearance: FloatArray  #: ``(C,)`` float32
+    first: Ints  #: ``(C + 1,)`` int32
+    items: Ints  #: int32
+    boxes: Floats  #: ``(., 7)``
+    triangles: Floats  #: ``(., 6)``
+    bounds: Floats  #: ``(2, 3)`` of the world
+    extent: Floats  #: ``(2, 3)`` of the obstacles
+    pad: float  #: Distance from the obstacles that the index covers at least [m]
 
 
 def make_space(problem: Problem) -> Space:

@@ -27,21 +27,13 @@ NOBODY = np.int32(-1)
 
 
 class Front(NamedTuple):
-    """A wavefront and its anchors.
+    """A wavefront and its anchors."""
 
-    Attributes:
-        anchor: ``(N,)`` int32 the anchor that each node sees; -1 for a node out of reach.
-        points: ``(A, 3)`` the anchors; the first is the goal [m].
-        values: ``(A,)`` length of the path from each to the goal [m].
-        parents: ``(A,)`` int32 the anchor that comes next on that path; -1 for the goal.
-        room: Clearance at the goal [m].
-    """
-
-    anchor: Ints
-    points: Floats
-    values: Floats
-    parents: Ints
-    room: float
+    anchor: Ints  #: ``(N,)`` int32 the anchor that each node sees; -1 for a node out of reach
+    points: Floats  #: ``(A, 3)`` the anchors; the first is the goal [m]
+    values: Floats  #: ``(A,)`` length of the path from each to the goal [m]
+    parents: Ints  #: ``(A,)`` int32 the anchor that comes next on that path; -1 for the goal
+    room: float  #: Clearance at the goal [m]
 
 
 @inlined
@@ -75,23 +67,14 @@ def _turned(space: Space, reach: float, a: Place, own: float, p: Place, q: Place
 
 
 class _Nodes(NamedTuple):
-    """State of the nodes.
+    """State of the nodes."""
 
-    Attributes:
-        value: ``(N,)`` length of the path [m].
-        anchor: ``(N,)`` int32.
-        hidden: ``(N,)`` int32 the anchor last found to be hidden.
-        tested: ``(N,)`` bool, whether the anchor is known to be seen.
-        done: ``(N,)`` bool, whether the wavefront has passed.
-        tried: ``(M,)`` int32 scratch.
-    """
-
-    value: Floats
-    anchor: Ints
-    hidden: Ints
-    tested: BoolArray
-    done: BoolArray
-    tried: Ints
+    value: Floats  #: ``(N,)`` length of the path [m]
+    anchor: Ints  #: ``(N,)`` int32
+    hidden: Ints  #: ``(N,)`` int32 the anchor last found to be hidden
+    tested: BoolArray  #: ``(N,)`` bool, whether the anchor is known to be seen
+    done: BoolArray  #: ``(N,)`` bool, whether the wavefront has passed
+    tried: Ints  #: ``(M,)`` int32 scratch
 
 
 @inlined

@@ -15,12 +15,11 @@ from PIL import Image
 
 from d4orm_env.core.arrays import positive_number, whole_number
 from d4orm_env.core.files import replaced_when_done
-from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 from d4orm_env.render.frames import FrameRenderer
 from d4orm_env.render.panels import picture_palette, view_limits
-from d4orm_env.render.pictures import checked_trajectory, contact_points
+from d4orm_env.render.pictures import checked_trajectory, contact_points, last_moment
 
 ANIMATION_SUFFIXES = (".gif", ".mp4")
 
@@ -84,10 +83,7 @@ def frame_steps(
 ) -> tuple[NDArray[np.int64], float]:
     """Return the time step that each frame shows, and the frames per second after ``max_frames`` has been kept to."""
     whole_number(max_frames, "max_frames", 2)
-    last = len(trajectory.states) - 1
-    everyone = arrival_times(trajectory.arrived, problem.dt).max()
-    if np.isfinite(everyone):
-        last = min(last, round((everyone + _AFTERMATH) / problem.dt))
+    last = last_moment(problem, trajectory, _AFTERMATH)
     duration = last * problem.dt / speed
     intervals = max(1, round(duration * fps))
     if intervals + 1 > max_frames:

@@ -18,24 +18,13 @@ from d4orm_env.render.style import own_style
 
 @dataclass(frozen=True, eq=False)
 class Denoising:
-    """Candidates of some denoising steps ``S``, each at ``P`` points of its time.
+    """Candidates of some denoising steps ``S``, each at ``P`` points of its time."""
 
-    Attributes:
-        labels: ``S`` texts, one for every step shown.
-        paths: ``(S, P, K, d)`` where the candidate leads [m].
-        samples: ``(S, N, P, K, d)`` where some of the samples lead that it was made of [m].
-        alpha: ``(S, N)`` how opaque each sample is drawn, 0 to 1.
-        seconds_per_step: Time for which a replay shows each.
-
-    Raises:
-        ValueError: If the shapes do not go together.
-    """
-
-    labels: tuple[str, ...]
-    paths: FloatArray
-    samples: FloatArray
-    alpha: FloatArray
-    seconds_per_step: float = 0.06
+    labels: tuple[str, ...]  #: ``S`` texts, one for every step shown
+    paths: FloatArray  #: ``(S, P, K, d)`` where the candidate leads [m]
+    samples: FloatArray  #: ``(S, N, P, K, d)`` where some of the samples lead that it was made of [m]
+    alpha: FloatArray  #: ``(S, N)`` how opaque each sample is drawn, 0 to 1
+    seconds_per_step: float = 0.06  #: Time for which a replay shows each
 
     def __post_init__(self) -> None:
         steps, expected = len(self.labels), (len(self.labels), self.alpha.shape[-1], *self.paths.shape[1:])

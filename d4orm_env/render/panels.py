@@ -68,35 +68,21 @@ def picture_palette(num_robots: int, size: int) -> Array:
 def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     """``(2, d)`` lower and upper corner of what a picture shows [m].
 
-    That is every start, goal, obstacle and further point with some room around them, and the bounds where they are
-    near. Neither side of the plane is shown at less than 0.4 of the other.
-
-    Args:
-        problem: The problem.
-        points: ``(..., d)`` further robot positions that must be in view.
+    That is every start, goal, obstacle and further robot position ``(..., d)`` with some room around them, and the
+    bounds where they are near. Neither side of the plane is shown at less than 0.4 of the other.
     """
     d, world, reach = problem.dimension, problem.world, float(np.max(problem.team.radius))
     places = np.concatenate([problem.start[:, :d], problem.goal, np.reshape(points, (-1, d))]).astype(np.float64)
-    lows, highs = [places.min(axis=0) - reach], [places.max(axis=0) + reach]
-    for ball in world.balls:
-        lows.append(ball[:d] - ball[d])
-        highs.append(ball[:d] + ball[d])
-    for cylinder in world.cylinders:
-        lows.append(np.append(cylinder[:2] - cylinder[2], lows[0][2]))
-        highs.append(np.append(cylinder[:2] + cylinder[2], highs[0][2]))
-    for box in world.boxes:
-        lows.append(box[:d])
-        highs.append(box[d:])
-    for corners in world.polygons:
-        lows.append(corners.min(axis=0))
-        highs.append(corners.max(axis=0))
-    lower, upper = np.min(lows, axis=0), np.max(highs, axis=0)
+    nearest, farthest = places.min(axis=0) - reach, places.max(axis=0) + reach
+    corners = np.where(np.isfinite(every := np.stack(world.shapes.corners())), every, nearest)
+    lower, upper = corners[0].min(axis=0, initial=np.inf), corners[1].max(axis=0, initial=-np.inf)
+    lower, upper = np.minimum(lower, nearest), np.maximum(upper, farthest)
     span = float(np.max(upper - lower))
     room = max(1.5 * reach, 0.05 * span)
     bounds = world.bounds.astype(np.float64)
     below = np.where(bounds[0] > lower - 0.3 * span, bounds[0] - 0.25 * room, lower - room)
     above = np.where(bounds[1] < upper + 0.3 * span, bounds[1] + 0.25 * room, upper + room)
-    limits = np.stack([np.minimum(lows[0], below), np.maximum(highs[0], above)])
+    limits = np.stack([np.minimum(nearest, below), np.maximum(farthest, above)])
     sides = np.ptp(limits[:, :2], axis=0)
     limits[:, :2] += np.outer([-0.5, 0.5], np.maximum(0.4 * sides.max() - sides, 0))
     return limits

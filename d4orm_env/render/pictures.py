@@ -53,11 +53,7 @@ def contact_points(trajectory: Trajectory) -> list[Array]:
 
 
 def checked_trajectory(problem: Problem, trajectory: Trajectory) -> None:
-    """Check that a trajectory belongs to a problem of this size.
-
-    Raises:
-        ValueError: If the shapes disagree, or a state is not finite.
-    """
+    """Check that a trajectory belongs to a problem of this size."""
     shape = np.shape(trajectory.states)
     if len(shape) != 3 or shape[0] < 1 or shape[1:] != (problem.num_robots, problem.state_size):
         raise ValueError(
@@ -67,6 +63,12 @@ def checked_trajectory(problem: Problem, trajectory: Trajectory) -> None:
     if not np.isfinite(trajectory.states).all():
         t, robot = (int(i) for i in np.argwhere(~np.isfinite(trajectory.states))[0][:2])
         raise ValueError(f"state of robot_{robot} at step {t} is not finite; roll out finite controls to draw them")
+
+
+def last_moment(problem: Problem, trajectory: Trajectory, aftermath: float) -> int:
+    """The step until which there is something to see: so many seconds after the last arrival, or the end."""
+    everyone, last = arrival_times(trajectory.arrived, problem.dt).max(), len(trajectory.states) - 1
+    return min(last, round((everyone + aftermath) / problem.dt)) if np.isfinite(everyone) else last
 
 
 @own_style()

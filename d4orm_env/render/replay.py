@@ -15,13 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
-from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.render.denoising_frames import Denoising
 from d4orm_env.render.panels import robot_colors, view_limits
-from d4orm_env.render.pictures import checked_trajectory
+from d4orm_env.render.pictures import checked_trajectory, last_moment
 
 REPLAY_SUFFIXES = (".html",)
 
@@ -34,13 +33,9 @@ _NO_CLEARANCE = 1e9
 
 @dataclass(frozen=True, eq=False)
 class ReplayMotion:
-    """One team's motion, ready for a page.
+    """One team's motion, ready for a page."""
 
-    Attributes:
-        content: Data of the page: lists, numbers and texts only.
-    """
-
-    content: dict[str, object]
+    content: dict[str, object]  #: Data of the page: lists, numbers and texts only
 
 
 def motion(
@@ -70,7 +65,7 @@ def motion(
     """
     checked_trajectory(problem, trajectory)
     places = problem.goal[None] if goals is None else _checked_goals(problem, goals, len(trajectory.states))
-    end = _end(problem, trajectory)
+    end = last_moment(problem, trajectory, _AFTERMATH) + 1
     flags = trajectory.arrived * 1 + trajectory.collided * 2 + trajectory.margin_violated * 4
     content = {
         "title": title,
@@ -216,13 +211,6 @@ def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[
             f"({steps}, N, {2 * d + 1})"
         )
     return {"count": bodies.shape[1], **rounded(np.concatenate([bodies[:end, :, :d], bodies[:end, :, -1:]], axis=2))}
-
-
-def _end(problem: Problem, trajectory: Trajectory) -> int:
-    """Return the number of moments at which there is something to see."""
-    everyone = arrival_times(trajectory.arrived, problem.dt).max()
-    last = len(trajectory.states) - 1
-    return last + 1 if np.isinf(everyone) else min(last, round((everyone + _AFTERMATH) / problem.dt)) + 1
 
 
 def _clearance(problem: Problem, positions: FloatArray) -> dict[str, object]:

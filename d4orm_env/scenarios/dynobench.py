@@ -19,10 +19,10 @@ import numpy as np
 
 from d4orm_env.core.arrays import Floats, shown
 from d4orm_env.core.errors import first_line
+from d4orm_env.core.files import read_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.core.yaml_text import read_yaml
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import Box, Disc, Footprint, Train

@@ -23,31 +23,21 @@ HORIZON_SLACK = 1.6
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of a scenario's robots and obstacles.
+    """Positions of a scenario's robots and obstacles."""
 
-    Attributes:
-        starts: ``(K, d)`` start positions [m].
-        goals: ``(K, d)`` goal positions [m].
-        world: Obstacles and bounds of the scenario itself.
-        travel: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in
-            their seed alone have the same shapes.
-        area: Region of starts and goals: random obstacles are placed there, and bounds around it. ``None`` where
-            ``world`` has walls, and its obstacles already.
-    """
-
-    starts: Points
-    goals: Points
-    world: World
+    starts: Points  #: ``(K, d)`` start positions [m]
+    goals: Points  #: ``(K, d)`` goal positions [m]
+    world: World  #: Obstacles and bounds of the scenario itself
+    #: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in their seed
+    #: alone have the same shapes
     travel: float
+    #: Region of starts and goals: random obstacles are placed there, and bounds around it. ``None`` where ``world`` has
+    #: walls, and its obstacles already.
     area: PlacementArea | None = None
 
 
 def build(settings: Settings, layout: Layout) -> Problem:
-    """The problem of that layout.
-
-    Raises:
-        ValueError: If bounds or random obstacles do not fit, or a start or goal does not keep the margin.
-    """
+    """The problem of that layout."""
     team, horizon = settings.team, settings.horizon
     if settings.height is not None:
         layout = _lifted(layout, settings.height)

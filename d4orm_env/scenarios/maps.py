@@ -13,15 +13,12 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import shown
-from d4orm_env.core.files import read_limited
+from d4orm_env.core.files import is_yaml_path, read_limited
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.core.yaml_text import is_yaml_path
-from d4orm_env.scenarios.free_space import FreeSpace, free_space
-from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap
+from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, grid_of_fields, read_occupancy_image
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.occupancy_image import grid_of_fields, read_occupancy_image
-from d4orm_env.scenarios.placement import Points
+from d4orm_env.scenarios.placement import FreeSpace, Points, free_space
 from d4orm_env.scenarios.settings import Settings, bounded, require_plane
 from d4orm_env.scenarios.well_formed import populate, reach_of, with_obstacles
 
@@ -37,9 +34,6 @@ def parse_map(content: bytes, cell: float) -> GridMap:
     Args:
         content: Of the file.
         cell: Side of a cell [m].
-
-    Raises:
-        ValueError: If it is none; one line without the file's name.
     """
     lines = content.removeprefix(BYTE_ORDER_MARK).splitlines()
     height, width = _size(lines)
@@ -97,9 +91,6 @@ def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[M
         content: Of the file.
         shape: Rows and columns of its map.
         count: Number of rows.
-
-    Raises:
-        ValueError: If it is no such file, is of another map, or has fewer rows; one line without the file's name.
     """
     # Split as bytes: of text more would end a line, such as the ellipsis of a map's name.
     lines = [line.decode("latin-1") for line in content.removeprefix(BYTE_ORDER_MARK).splitlines()]
@@ -220,11 +211,7 @@ def map(
 
 
 def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:
-    """Starts and goals of a Moving AI scenario, and the longest path [m].
-
-    Raises:
-        ValueError: If the file is bad, or a robot does not fit where it begins or ends; the message names the line.
-    """
+    """Starts and goals of a Moving AI scenario, and the longest path [m]."""
     with _named(path):
         tasks = parse_scenario(read_limited(path, "a map", MAX_BYTES), grid.blocked.shape, settings.num_robots)
         for task in tasks:

@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import read_yaml, replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.yaml_text import read_yaml
 from d4orm_env.footprints import Disc
 from d4orm_env.scenarios.dynobench import load_dynobench
-from d4orm_env.scenarios.footprint_entries import described
 from d4orm_env.scenarios.schema import VERSION, parse, start_fields
+from d4orm_env.scenarios.settings import described
 
 
 def load_problem(path: str | os.PathLike[str]) -> Problem:

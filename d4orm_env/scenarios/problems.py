@@ -6,17 +6,17 @@ import os
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import numpy as np
 
 from d4orm_env.core.arrays import shown
+from d4orm_env.core.files import is_yaml_path
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import Registry
-from d4orm_env.core.yaml_text import is_yaml_path
 from d4orm_env.scenarios import generators, maps, paper, wall_grid, walled
-from d4orm_env.scenarios.scenario import BuiltIn, Scenario, complain
+from d4orm_env.scenarios.scenario import Scenario, built_in, complain
 
 if TYPE_CHECKING:
     from d4orm_env.scenarios import problem_files
@@ -26,13 +26,16 @@ else:
 ScenarioLike: TypeAlias = str | os.PathLike[str] | Callable[..., Problem] | Scenario
 """A name, a YAML file, a callable, or where one is, ``"package.module:function"`` or ``"folder/file.py:function"``."""
 
-SCENARIOS = Registry(
-    "scenario", "d4orm.scenarios", lambda name, generator: Scenario(name.rpartition(":")[2], generator)
-)
+
+def _admit(name: str, generator: Any) -> Scenario:
+    return generator if isinstance(generator, Scenario) else Scenario(name.rpartition(":")[2], generator)
+
+
+SCENARIOS = Registry("scenario", "d4orm.scenarios", _admit)
 """All scenarios by name; :func:`register_scenario` adds to them."""
 
 
-def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
+def register_scenario(name: str, generator: Callable[..., Problem] | Scenario) -> None:
     """Make a scenario known by name, wherever one is asked for.
 
     Args:
@@ -49,19 +52,19 @@ def register_scenario(name: str, generator: Callable[..., Problem]) -> None:
     SCENARIOS.add(name, generator)
 
 
-_in_space = partial(BuiltIn, model="holonomic3d")
+_in_space = partial(built_in, model="holonomic3d")
 # Instances of others, who let robots stop dead at their goals.
-_paper = partial(BuiltIn, horizon=100, goal_speed=np.inf)
+_paper = partial(built_in, horizon=100, goal_speed=np.inf)
 _amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05, goal_speed=np.inf)
-_drawn = partial(BuiltIn, draws=True)
+_drawn = partial(built_in, draws=True)
 
 for _scenario in (
-    BuiltIn(generators.circle),
+    built_in(generators.circle),
     _in_space(generators.sphere),
     _drawn(generators.random),
-    BuiltIn(generators.four_obstacles),
-    BuiltIn(generators.heterogeneous, model=None, max_acceleration=None),
-    BuiltIn(generators.swap),
+    built_in(generators.four_obstacles),
+    built_in(generators.heterogeneous, model=None, max_acceleration=None),
+    built_in(generators.swap),
     *(
         _amswarm(partial(generators.amswarm, _centres), _name, f"AMSwarm environment {_name[-1]}: {_about}.")
         for _name, (_about, _centres) in generators.AMSWARM.items()
@@ -79,9 +82,9 @@ for _scenario in (
         _drawn(partial(walled.mmd_map, _boxes), _name, _about, goal_speed=np.inf)
         for _name, (_about, _boxes) in walled.MMD_MAPS.items()
     ),
-    BuiltIn(maps.map),
+    built_in(maps.map),
 ):  # fmt: skip
-    register_scenario(_scenario.__name__, _scenario)
+    register_scenario(_scenario.name, _scenario)
 
 
 def list_scenarios() -> tuple[str, ...]:
@@ -111,11 +114,7 @@ def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:
 
 
 def find_scenario(scenario: ScenarioLike) -> Scenario:
-    """The scenario that a name, a YAML file, a ``"package.module:function"`` or a callable stands for.
-
-    Raises:
-        ValueError: If it is none of these.
-    """
+    """The scenario that a name, a YAML file, a ``"package.module:function"`` or a callable stands for."""
     if isinstance(scenario, Scenario):
         return scenario
     if is_scenario_file(scenario):
@@ -132,9 +131,6 @@ def unknown_argument(scenario: ScenarioLike | None, names: Iterable[str], others
         scenario: As for :func:`make_problem`; ``None`` is any of the registered ones.
         names: The arguments given.
         others: Further arguments that the caller takes.
-
-    Raises:
-        ValueError: If there is no such scenario.
     """
     if scenario is not None:
         return find_scenario(scenario).complaint(names, others)

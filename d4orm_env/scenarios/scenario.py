@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,60 +21,45 @@ COMMON_ARGUMENTS = tuple(attribute.name for attribute in fields(Settings) if att
 _KEYWORDS = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 
-class BuiltIn:
-    """One of :mod:`~d4orm_env.scenarios.generators` as ``(seed, num_robots, **settings) -> Problem``.
+def built_in(
+    function: Callable[..., Problem], name: str = "", about: str = "", *, draws: bool = False, **defaults: object
+) -> Scenario:
+    """One of :mod:`~d4orm_env.scenarios.generators`, ``(Settings, **own arguments) -> Problem``, as a scenario.
 
-    Args:
-        function: The generator, ``(Settings, **own arguments) -> Problem``.
-        name: Its name; the function's by default.
-        about: What describes it; the function's docstring by default.
-        draws: Whether every seed is known to give other places, and never another team; ``False`` leaves it to be found
-            out.
-        **defaults: Where its defaults differ from those of :class:`~d4orm_env.scenarios.settings.Settings`.
+    Name and description are the function's by default, and ``defaults`` where its own differ from those of
+    :class:`~d4orm_env.scenarios.settings.Settings`.
     """
+    own = tuple(inspect.signature(function).parameters)[1:]
+    name = name or function.__name__
+    generator = partial(_generate, function, name, own, defaults)
+    return Scenario(name, generator, about or function.__doc__ or "", draws, (*own, *COMMON_ARGUMENTS, "robot"))
 
-    def __init__(
-        self,
-        function: Callable[..., Problem],
-        name: str = "",
-        about: str = "",
-        *,
-        draws: bool = False,
-        **defaults: object,
-    ) -> None:
-        self.__name__, self.__doc__ = name or function.__name__, about or function.__doc__
-        self._function, self._defaults = function, defaults
-        self.draws = draws
-        self._own = tuple(inspect.signature(function).parameters)[1:]
-        self.arguments = (*self._own, *COMMON_ARGUMENTS, "robot")
 
-    def __call__(self, seed: int = 0, num_robots: int | None = None, **settings: Any) -> Problem:
-        own = {name: settings.pop(name) for name in self._own if name in settings}
-        size = {} if num_robots is None else {"num_robots": num_robots}
-        robot = settings.pop("robot", None)
-        team = {} if robot is None else find_robot(robot).settings
-        common = {**self._defaults, **team, **size, **settings}
-        if "footprint" in settings:  # the radius follows
-            common["radius"] = settings.get("radius")
-        # A value too large for float32 becomes infinite, and is then refused by name.
-        with np.errstate(over="ignore"):
-            return self._function(Settings(scenario=self.__name__, seed=seed, **common), **own)
+def _generate(
+    function: Callable[..., Problem], name: str, own: tuple[str, ...], defaults: Mapping[str, object],
+    seed: int = 0, num_robots: int | None = None, **settings: Any,
+) -> Problem:  # fmt: skip
+    arguments = {name: settings.pop(name) for name in own if name in settings}
+    size = {} if num_robots is None else {"num_robots": num_robots}
+    robot = settings.pop("robot", None)
+    team = {} if robot is None else find_robot(robot).settings
+    common = {**defaults, **team, **size, **settings}
+    if "footprint" in settings:  # the radius follows
+        common["radius"] = settings.get("radius")
+    # A value too large for float32 becomes infinite, and is then refused by name.
+    with np.errstate(over="ignore"):
+        return function(Settings(scenario=name, seed=seed, **common), **arguments)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Something that makes problems.
+    """Something that makes problems."""
 
-    Attributes:
-        name: Its name in tables and messages.
-        generator: ``(seed, num_robots, **settings) -> Problem``.
-
-    Raises:
-        ValueError: If the generator cannot be called like that.
-    """
-
-    name: str
-    generator: Callable[..., Problem]
+    name: str  #: Its name in tables and messages
+    generator: Callable[..., Problem]  #: ``(seed, num_robots, **settings) -> Problem``
+    about: str = ""  #: What describes it; the generator's docstring by default
+    draws: bool = False  #: Every seed is known to give other places, and never another team
+    known: tuple[str, ...] = ()  #: All arguments of a generator that does not name them itself
 
     def __post_init__(self) -> None:
         try:
@@ -88,7 +73,7 @@ class Scenario:
     @property
     def description(self) -> str:
         """The first line of the generator's docstring."""
-        return (inspect.getdoc(self.generator) or "").partition("\n")[0]
+        return inspect.cleandoc(self.about or inspect.getdoc(self.generator) or "").partition("\n")[0]
 
     @cached_property
     def _signature(self) -> inspect.Signature:
@@ -101,8 +86,8 @@ class Scenario:
     @property
     def arguments(self) -> tuple[str, ...]:
         """All arguments of :meth:`problem`."""
-        if isinstance(self.generator, BuiltIn):
-            return self.generator.arguments
+        if self.known:
+            return self.known
         settings = [parameter.name for parameter in self._parameters[2:] if parameter.kind in _KEYWORDS]
         return (*settings, "num_robots", "seed")
 
@@ -110,12 +95,7 @@ class Scenario:
     def takes_any(self) -> bool:
         """True if the generator looks at its settings itself."""
         several = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in self._parameters)
-        return several and not isinstance(self.generator, BuiltIn)
-
-    @property
-    def draws(self) -> bool:
-        """True if every seed is known to give other positions, and never another team."""
-        return isinstance(self.generator, BuiltIn) and self.generator.draws
+        return several and not self.known
 
     @property
     def has_own_size(self) -> bool:

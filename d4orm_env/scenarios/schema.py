@@ -19,8 +19,8 @@ from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import Disc, Footprint
-from d4orm_env.scenarios.footprint_entries import parsed
 from d4orm_env.scenarios.problems import SCENARIOS
+from d4orm_env.scenarios.settings import parsed
 
 FLOAT32_MAX = float(str(np.finfo(np.float32).max))
 VERSION = 1
@@ -248,11 +248,7 @@ def start_fields(model: Model) -> tuple[str, ...]:
 
 
 def parse(data: object) -> Problem:
-    """The problem that the content of a file means.
-
-    Raises:
-        ValueError: If it breaks the schema or makes no valid problem; one line that names the field.
-    """
+    """The problem that the content of a file means."""
     if not isinstance(data, dict):
         raise ValueError("expected fields such as 'version: 1' and 'robots:' or 'scenario:' at the top")
     if "scenario" in data and ("robots" in data or "world" in data):

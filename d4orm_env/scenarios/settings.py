@@ -1,20 +1,21 @@
-"""The arguments every scenario shares, checked."""
+"""The arguments every scenario shares, checked, and footprints as settings and problem files hold them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.arrays import positive_number, shown, whole_number
+from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem_checks import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import get_model
-from d4orm_env.scenarios.footprint_entries import parsed
+from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Footprint, Polygon, Train
 
 MAX_COUNT = 10_000
 """Most robots or obstacles a generator makes: a slip of the finger must not fill the memory."""
@@ -25,61 +26,36 @@ LARGEST = 10_000.0
 
 @dataclass(frozen=True)
 class Settings:
-    """Arguments common to all scenarios. Defaults are the paper's and its reference code's.
+    """Arguments common to all scenarios. Defaults are the paper's and its reference code's."""
 
-    Attributes:
-        scenario: Name of the scenario.
-        num_robots: ``K``.
-        seed: Seeds whatever the scenario draws: walls, random starts and goals, random obstacles, jitter.
-        model: One model name for all robots, or ``K`` names.
-        num_obstacles: Random circles (spheres in space) placed inside the scenario.
-        obstacle_radius: Radius of circular obstacles [m].
-        bounds: Of a scenario that is open: a margin [m] around the box in which its robots start and end, or the lower
-            and the upper corner ``(2, d)`` [m].
-        radius: Robot radius [m], one or ``K``; 0.15 by default, or that of the footprint.
-        footprint: One of :mod:`d4orm_env.footprints` or ``K``, or as in files, ``{"shape": "box", ...}``.
-        margin: Safety margin [m].
-        dt: Time step [s].
-        horizon: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`.
-        height: Of the lowest start or goal above zero [m]; only in space. By default scenarios are about the origin.
-        goal_radius: A robot within it has arrived [m].
-        goal_speed: Speed at which a robot may still dock [m/s], one or ``K``;
-            see :class:`~d4orm_env.core.problem.Problem`.
-        goal_heading: Heading with which a robot must arrive [rad], one or ``K``, NaN for any.
-        goal_heading_tolerance: How far it may be off [rad], one or ``K``.
-        arrival: ``"dock"``: a robot that arrives stays there for good. ``"stay"``: it may be moved again.
-        collision_penalty: Taken off the reward per step within the margin of a robot, and of an obstacle.
-        max_speed: Speed limit [m/s], one or ``K``.
-        max_acceleration: Acceleration limit [m/s^2], one or ``K``.
-        max_turn_rate: Turn rate limit [rad/s], one or ``K``.
-        own_limits: Limits that models have for themselves by name, each one or ``K``.
-
-    Raises:
-        ValueError: If a value makes no sense; the message names it.
-    """
-
-    scenario: str
-    num_robots: int = 8
-    seed: int = 0
-    model: str | Sequence[str] | None = "holonomic2d"
-    num_obstacles: int = 0
-    obstacle_radius: float = 0.15
+    scenario: str  #: Name of the scenario
+    num_robots: int = 8  #: ``K``
+    seed: int = 0  #: Seeds whatever the scenario draws: walls, random starts and goals, random obstacles, jitter
+    model: str | Sequence[str] | None = "holonomic2d"  #: One model name for all robots, or ``K`` names
+    num_obstacles: int = 0  #: Random circles (spheres in space) placed inside the scenario
+    obstacle_radius: float = 0.15  #: Radius of circular obstacles [m]
+    #: Of a scenario that is open: a margin [m] around the box in which its robots start and end, or the lower and the
+    #: upper corner ``(2, d)`` [m]
     bounds: SupportsFloat | list[list[float]] | tuple[Sequence[float], ...] | NDArray[np.floating] | None = None
-    radius: ArrayLike | None = None
-    footprint: Any = None
-    margin: float = 0.05
-    dt: float = 0.1
-    horizon: int | None = None
+    radius: ArrayLike | None = None  #: Robot radius [m], one or ``K``; 0.15 by default, or that of the footprint
+    footprint: Any = None  #: One of :mod:`d4orm_env.footprints` or ``K``, or as in files, ``{"shape": "box", ...}``
+    margin: float = 0.05  #: Safety margin [m]
+    dt: float = 0.1  #: Time step [s]
+    horizon: int | None = None  #: Number of steps; ``None`` follows :func:`~d4orm_env.scenarios.layout.default_horizon`
+    #: Of the lowest start or goal above zero [m]; only in space. By default scenarios are about the origin.
     height: float | None = None
-    goal_radius: float = 0.075
+    goal_radius: float = 0.075  #: A robot within it has arrived [m]
+    #: Speed at which a robot may still dock [m/s], one or ``K``; see :class:`~d4orm_env.core.problem.Problem`
     goal_speed: ArrayLike | None = None
-    goal_heading: ArrayLike | None = None
-    goal_heading_tolerance: ArrayLike = 0.1
+    goal_heading: ArrayLike | None = None  #: Heading with which a robot must arrive [rad], one or ``K``, NaN for any
+    goal_heading_tolerance: ArrayLike = 0.1  #: How far it may be off [rad], one or ``K``
+    #: ``"dock"``: a robot that arrives stays there for good. ``"stay"``: it may be moved again.
     arrival: Arrival = "dock"
-    collision_penalty: float = 1.0
-    max_speed: ArrayLike = 1.0
-    max_acceleration: ArrayLike = 1.0
-    max_turn_rate: ArrayLike = float(np.pi / 2)
+    collision_penalty: float = 1.0  #: Taken off the reward per step within the margin of a robot, and of an obstacle
+    max_speed: ArrayLike = 1.0  #: Speed limit [m/s], one or ``K``
+    max_acceleration: ArrayLike = 1.0  #: Acceleration limit [m/s^2], one or ``K``
+    max_turn_rate: ArrayLike = float(np.pi / 2)  #: Turn rate limit [rad/s], one or ``K``
+    #: Limits that models have for themselves by name, each one or ``K``
     own_limits: Mapping[str, ArrayLike] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -155,3 +131,41 @@ def grid_size(value: object, name: str) -> tuple[int, int]:
     if columns * rows > MAX_COUNT:
         raise ValueError(f"{name} is {columns} x {rows}; scenarios make at most {MAX_COUNT} in all")
     return columns, rows
+
+
+KINDS: dict[str, type[Footprint]] = {
+    kind.__name__.lower(): kind for kind in (Disc, Box, Capsule, Polygon, Ellipsoid, Train)
+}
+"""Footprints by their names in files."""
+
+
+def described(footprint: Footprint) -> dict[str, Any]:
+    """The content of a file that means a footprint; the inverse of :func:`parsed`."""
+    if isinstance(footprint, Train):
+        return {
+            "shape": "train",
+            "front": described(footprint.front),
+            "trailers": [*map(described, footprint.trailers)],
+        }
+    fields = asdict(footprint)  # type: ignore[call-overload] # all are dataclasses
+    if "corners" in fields:
+        fields["corners"] = [list(corner) for corner in fields["corners"]]
+    return {"shape": type(footprint).__name__.lower()} | fields
+
+
+def parsed(content: object) -> Footprint:
+    """The footprint that a file means, such as ``{"shape": "box", "length": 0.5, "width": 0.25}``."""
+    if not isinstance(content, dict) or not isinstance(content.get("shape"), str):
+        example = "{shape: box, length: 0.5, width: 0.25}"
+        raise ValueError(f"footprint must be a mapping such as {example}, not {shown(content)}")
+    kind = KINDS.get(content["shape"])
+    if kind is None:
+        raise unknown("footprint", content["shape"], KINDS)
+    sizes = {name: value for name, value in content.items() if name != "shape"}
+    try:
+        if kind is Train:
+            bodies: list[Any] = [parsed(sizes.pop("front")), *map(parsed, sizes.pop("trailers"))]
+            return Train(bodies[0], bodies[1:], **sizes)
+        return kind(**sizes)
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"footprint {content['shape']}: {error}") from None

@@ -12,7 +12,7 @@ from d4orm_env.core.arrays import positive_number
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.free_space import Mask
+from d4orm_env.scenarios.placement import Mask
 from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
 from d4orm_env.scenarios.well_formed import lattice_step, populate, reach_of
 
@@ -27,17 +27,11 @@ SAMPLES, TRIES = 16, 1000
 
 
 class Openings(NamedTuple):
-    """Openings in the walls between ``columns`` times ``rows`` squares; all squares are connected.
+    """Openings in the walls between ``columns`` times ``rows`` squares; all squares are connected."""
 
-    Attributes:
-        right: ``(rows, columns - 1)`` between a square and the next to its right.
-        above: ``(rows - 1, columns)`` between a square and the next above.
-        longest: About the most walls on the shortest path from a square to another.
-    """
-
-    right: Mask
-    above: Mask
-    longest: int
+    right: Mask  #: ``(rows, columns - 1)`` between a square and the next to its right
+    above: Mask  #: ``(rows - 1, columns)`` between a square and the next above
+    longest: int  #: About the most walls on the shortest path from a square to another
 
 
 def draw_openings(random: np.random.Generator, columns: int, rows: int, share: float) -> Openings:

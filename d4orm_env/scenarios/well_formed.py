@@ -18,9 +18,16 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.free_space import FreeSpace, Mask, free_space
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.placement import PlacementArea, Points, round_up, with_random_obstacles
+from d4orm_env.scenarios.placement import (
+    FreeSpace,
+    Mask,
+    PlacementArea,
+    Points,
+    free_space,
+    round_up,
+    with_random_obstacles,
+)
 from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
 
 ndimage: Any = LazyModule("scipy.ndimage")
@@ -162,9 +169,6 @@ def populate(
         remedy: Remedy where the robots do not fit.
         exchange: Half of the robots start at an x below the first of them and end above the second [m], the others the
             other way round; everywhere by default.
-
-    Raises:
-        ValueError: If robots or obstacles do not fit.
     """
     world = with_obstacles(settings, world)
     starts, goals = draw_team(settings, free_space(world, reach_of(settings), step), remedy, exchange)

@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch
+from d4orm_env.verify.discs import surroundings
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
 from d4orm_env.verify.footprints import ConvexBodies, TurningPairs, turning_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
-from d4orm_env.verify.surroundings import surroundings
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem

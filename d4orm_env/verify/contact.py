@@ -32,20 +32,13 @@ MAX_NUMBERS = 2**18
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Some steps of all bodies.
+    """Some steps of all bodies."""
 
-    Attributes:
-        path: ``(T, S+1, B, d)`` positions at the ends of the sub-steps [m].
-        reach: ``(T, B)`` how far from where it began a body, or any point of it, gets in each step [m].
-        start: Time at which it begins [s].
-        dt: Length of a step [s].
-        turn: ``(T, S+1, B)`` headings at the ends of the sub-steps [rad]; of size zero where all bodies are discs.
-    """
-
-    path: Floats
-    reach: Floats
-    start: float
-    dt: float
+    path: Floats  #: ``(T, S+1, B, d)`` positions at the ends of the sub-steps [m]
+    reach: Floats  #: ``(T, B)`` how far from where it began a body, or any point of it, gets in each step [m]
+    start: float  #: Time at which it begins [s]
+    dt: float  #: Length of a step [s]
+    #: ``(T, S+1, B)`` headings at the ends of the sub-steps [rad]; of size zero where all bodies are discs
     turn: Floats
 
     def of(self, steps: Indices, bodies: Indices) -> Floats:

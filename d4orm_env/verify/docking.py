@@ -37,23 +37,15 @@ MAX_READINGS = 8
 
 @dataclass(frozen=True, eq=False)
 class Docking:
-    """All readings of all robots, one body for each.
+    """All readings of all robots, one body for each."""
 
-    Attributes:
-        robot: ``(B,)`` whose body it is.
-        steps: ``(B,)`` steps after which it docks; more than the horizon where it never does.
-        arrival_times: ``(K,)`` of each robot's first reading [s]; infinite where it does not dock in every reading.
-        arrival_speeds: ``(K,)`` speeds then [m/s]; NaN where a robot does not dock, or goals do not absorb.
-        last_steps: ``(K,)`` steps of each robot's last reading.
-        violations: Robots that do not dock in every reading.
-    """
-
-    robot: NDArray[np.intp]
-    steps: NDArray[np.intp]
+    robot: NDArray[np.intp]  #: ``(B,)`` whose body it is
+    steps: NDArray[np.intp]  #: ``(B,)`` steps after which it docks; more than the horizon where it never does
+    #: ``(K,)`` of each robot's first reading [s]; infinite where it does not dock in every reading
     arrival_times: Floats
-    arrival_speeds: Floats
-    last_steps: NDArray[np.intp]
-    violations: list[Violation]
+    arrival_speeds: Floats  #: ``(K,)`` speeds then [m/s]; NaN where a robot does not dock, or goals do not absorb
+    last_steps: NDArray[np.intp]  #: ``(K,)`` steps of each robot's last reading
+    violations: list[Violation]  #: Robots that do not dock in every reading
 
     def note(self, robot: int, dt: float) -> str:
         """Describe a robot with several readings, for the details of a violation."""

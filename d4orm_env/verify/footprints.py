@@ -15,8 +15,7 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.verify.contact import Indices, Pairs, Static, Stretch, Watch
-from d4orm_env.verify.convex_gaps import ball_gap, core_gap
-from d4orm_env.verify.geometry import Floats, norm, polygon_distance
+from d4orm_env.verify.geometry import Floats, ball_gap, core_gap, norm, polygon_distance
 
 if TYPE_CHECKING:
     from d4orm_env.core.team import Team
@@ -33,21 +32,13 @@ RESOLUTION = 1 / 15_000
 
 @dataclass(frozen=True, eq=False)
 class ConvexBodies:
-    """Convex bodies, one row each.
+    """Convex bodies, one row each."""
 
-    Attributes:
-        corners: ``(B, 8, 2)`` of planar cores, the last one repeated; of no use in space.
-        rounding: ``(B,)``.
-        semi_axes: ``(B, 3)`` in space.
-        outer: ``(B,)`` radii of the discs or balls round them.
-        stretch: ``(B,)`` how much faster a gap may change than a body moves.
-    """
-
-    corners: Floats
-    rounding: Floats
-    semi_axes: Floats
-    outer: Floats
-    stretch: Floats
+    corners: Floats  #: ``(B, 8, 2)`` of planar cores, the last one repeated; of no use in space
+    rounding: Floats  #: ``(B,)``
+    semi_axes: Floats  #: ``(B, 3)`` in space
+    outer: Floats  #: ``(B,)`` radii of the discs or balls round them
+    stretch: Floats  #: ``(B,)`` how much faster a gap may change than a body moves
 
     @classmethod
     def of(cls, team: Team) -> ConvexBodies:

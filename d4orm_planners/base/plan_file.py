@@ -18,7 +18,7 @@ from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.rollout import rollout
+from d4orm_env.engine.choice import rollout
 from d4orm_env.scenarios.problem_files import describe
 from d4orm_env.scenarios.schema import parse
 from d4orm_env.verify import verify

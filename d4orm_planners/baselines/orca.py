@@ -17,7 +17,7 @@ from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.core.team import DEFAULT_RADIUS
-from d4orm_env.envs.communication import communication_links
+from d4orm_env.engine.observing import communication_links
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Whole

@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 
 import typer
 
-from d4orm_env.core.files import target_of
-from d4orm_env.core.yaml_text import parse_yaml
+from d4orm_env.core.files import parse_yaml, target_of
 
 N = TypeVar("N", int, float)
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from d4orm_env.core.arrays import duration, whole_number
-from d4orm_env.core.yaml_text import read_yaml
+from d4orm_env.core.files import read_yaml
 from d4orm_env.scenarios import load_problem
 from d4orm_env.scenarios.schema import VERSION, parse
 from d4orm_planners.base.planner_registry import make_planner

@@ -27,8 +27,8 @@ from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.caching import Kernel, check_can_be_kept, has_to_be_compiled
+from d4orm_env.engine.cpu import world_kernels
 from d4orm_env.engine.threads import Threads
-from d4orm_env.engine.worlds import world_kernels
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import d4orm_c2f, mapf, tracking

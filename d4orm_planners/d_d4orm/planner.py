@@ -9,8 +9,8 @@ from typing import ClassVar
 
 from d4orm_env.core.arrays import BoolArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.engine.observing import communication_links
 from d4orm_env.engine.threads import available_cores
-from d4orm_env.envs.communication import communication_links
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.planner import D4ormD

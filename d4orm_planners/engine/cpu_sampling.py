@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.bodies import Body
-from d4orm_env.core.footprint_arrays import FootprintArrays, as_arrays
+from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays
 from d4orm_env.engine import noise
 from d4orm_env.engine.cpu import CpuEngine, typed
 from d4orm_env.engine.noise import DRAWS, TURNS

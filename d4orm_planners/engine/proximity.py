@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Ints, Whole
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import simd
 from d4orm_env.engine.compiling import ZERO, aligned_zeros, compiled, inlined

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import reward, transition
+from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine import obstacles
@@ -166,7 +166,7 @@ def _runner(name: str) -> Callable[..., None]:
                 x, gap2, docked = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
                 w[DOCKED * TILE + s] = ONE if docked else ZERO
-                w[TOTAL * TILE + s] += reward.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
+                w[TOTAL * TILE + s] += transition.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
             _copy(w[: dimension * TILE], places[i * dimension * TILE : (i + 1) * dimension * TILE])
             if f is not None:
                 place_bodies(f, k, w, poses, POSES, pose_of(i))
@@ -182,7 +182,7 @@ def _add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: F
         for axis in range(goal.shape[0]):
             gap = w[(STATE + axis) * TILE + s] - goal[axis]
             gap2 += gap * gap
-        w[TOTAL * TILE + s] += count * reward.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
+        w[TOTAL * TILE + s] += count * transition.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
 
 
 @inlined

@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, Whole
-from d4orm_env.core.footprint_arrays import FootprintArrays
+from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled

@@ -12,8 +12,8 @@ import numpy as np
 import viser
 
 from d4orm_env.core.errors import describe
+from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.scenarios import list_scenarios
 from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_env.scenarios.problems import SCENARIOS

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.envs.team_step import Info
 from d4orm_env.scenarios import make_problem

@@ -14,7 +14,7 @@ from scipy.interpolate import BPoly, PPoly
 
 from d4orm_env.core.arrays import Floats
 from d4orm_env.verify import VerificationReport
-from d4orm_env.verify.curves import verify_curves
+from d4orm_env.verify.discs import verify_curves
 from d4orm_planners.setpoints.smoothing import SmoothMotion
 
 MEMORY, PIECE_BYTES = 4096, 132

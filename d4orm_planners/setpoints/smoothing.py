@@ -22,7 +22,7 @@ from d4orm_env.core.arrays import Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport
-from d4orm_env.verify.curves import verify_curves
+from d4orm_env.verify.discs import verify_curves
 
 DEGREE = 5
 SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
@@ -141,7 +141,7 @@ class SmoothMotion:
 
     @cached_property
     def report(self) -> VerificationReport:
-        """Verdict of :func:`d4orm_env.verify.curves.verify_curves`."""
+        """Verdict of :func:`d4orm_env.verify.discs.verify_curves`."""
         times = np.linspace(0, self.duration, round(self.curves.t[-1] / self.problem.dt) * PER_STEP + 1)
         bend = np.linalg.norm(self.position(times, 2), axis=2).max(axis=0)
         return verify_curves(self.problem, self.position, self.duration, bend)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, rollout
-from d4orm_env.engine import worlds
+from d4orm_env.engine import cpu
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths import lattice, looking, wavefront
 from d4orm_planners.baselines.amswarm.alternation import alternate
@@ -72,7 +72,7 @@ def kernels() -> Iterator[tuple[str, Any]]:
     yield "search", search_kernel("differential_drive")
     yield "meetings", path_index._count_meetings
     yield "alternate", alternate
-    yield "roll out", worlds.world_kernels(("holonomic2d",)).roll_out
+    yield "roll out", cpu.world_kernels(("holonomic2d",)).roll_out
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from d4orm_env.dynamics import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, 
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model, model_digest
 from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.engine.choice import get_engine
-from d4orm_env.engine.worlds import kernels_of_codes, world_kernels
+from d4orm_env.engine.cpu import kernels_of_codes, world_kernels
 from d4orm_env.jax import functional
 from d4orm_env.verify import integrated
 from d4orm_env.verify.integrated import Integrated

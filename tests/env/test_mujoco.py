@@ -21,7 +21,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Delay, Drag, Intruder, Push, Stall, StateNoise
 from d4orm_env.envs.joint_state import split_state
-from d4orm_env.mujoco import Physics, camera
+from d4orm_env.mujoco import Physics, environment
 from d4orm_planners import run_episode
 from d4orm_planners.base.episode import open_env
 
@@ -296,7 +296,7 @@ def test_pictures_where_opengl_cannot_draw(monkeypatch: pytest.MonkeyPatch) -> N
     def broken(name: str) -> Any:
         raise OSError("no such library")
 
-    monkeypatch.setattr(camera, "importlib", type("Broken", (), {"import_module": staticmethod(broken)}))
+    monkeypatch.setattr(environment, "importlib", type("Broken", (), {"import_module": staticmethod(broken)}))
     frames = []
     for renderer in ("auto", "pictures"):
         env = mujoco.parallel_env("circle", 2, render_mode="rgb_array", renderer=renderer)
@@ -312,8 +312,8 @@ def test_pictures_where_opengl_cannot_draw(monkeypatch: pytest.MonkeyPatch) -> N
 
 def has_opengl() -> bool:
     try:
-        camera.open_context(camera.SIZE).free()
-    except camera.NoCameraError:
+        environment.open_context(environment.SIZE).free()
+    except environment.NoCameraError:
         return False
     return True
 
@@ -326,7 +326,7 @@ def test_mujoco_draws_what_moves() -> None:
     for _ in range(10):
         env.step(act(env, np.ones((2, 2), np.float32)))
     second = env.render()
-    assert first.shape == second.shape == (camera.SIZE, camera.SIZE, 3)
+    assert first.shape == second.shape == (environment.SIZE, environment.SIZE, 3)
     assert (first != second).any()
     env.close()
 

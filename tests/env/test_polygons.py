@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from shapely import Polygon
 
 from d4orm_env import World
-from d4orm_env.geometry import simple_polygon
-from d4orm_env.geometry.polygon import triangulate
-from d4orm_env.geometry.simple_polygon import first_crossing, orientation
+from d4orm_env.geometry import polygon as polygons
+from d4orm_env.geometry.polygon import first_crossing, orientation, triangulate
 
 Corners: TypeAlias = list[tuple[float, float]]
 GRID = st.lists(st.tuples(st.integers(0, 4).map(float), st.integers(0, 4).map(float)), min_size=3, max_size=8)
@@ -70,7 +69,7 @@ def test_it_takes_few_comparisons(count: int, monkeypatch: pytest.MonkeyPatch) -
         calls += 1
         return orientation(*corners)
 
-    monkeypatch.setattr(simple_polygon, "orientation", counted)
+    monkeypatch.setattr(polygons, "orientation", counted)
     for corners in (comb(count), comb(count)[:, ::-1], star(count)):
         calls = 0
         assert first_crossing([(x, y) for x, y in corners.tolist()]) is None

@@ -14,7 +14,7 @@ import pytest
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.rollout import rollout
+from d4orm_env.engine.choice import rollout
 from d4orm_env.scenarios import load_problem, save_problem
 
 NAN, INF = float("nan"), float("inf")

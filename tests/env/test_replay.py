@@ -20,8 +20,8 @@ from hypothesis.extra.numpy import arrays
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.disturbances import Intruder
+from d4orm_env.engine.choice import rollout
 from d4orm_env.render.replay import Replay, motion, rounded
-from d4orm_env.rollout import rollout
 from d4orm_planners import make_planner, run_episode
 from d4orm_planners.base.episode import Episode
 from d4orm_planners.base.plan import Plan

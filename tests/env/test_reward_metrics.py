@@ -15,7 +15,7 @@ from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
-from d4orm_env.dynamics.reward import step_reward
+from d4orm_env.dynamics.transition import step_reward
 from d4orm_env.engine.choice import get_engine
 
 

@@ -13,10 +13,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scenario_support import WALLED, needed
 
+from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.core.yaml_text import parse_yaml
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.scenarios import list_scenarios, load_problem, make_problem, save_problem
 

@@ -20,10 +20,10 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, unwound
 from d4orm_env.dynamics.models import MODELS, get_model, register_model
+from d4orm_env.engine.choice import rollout
 from d4orm_env.envs.joint_state import split_state
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_env.jax import functional
-from d4orm_env.rollout import rollout
 from d4orm_env.verify import verify
 
 STEPS, RATE = 12, 1.5

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
-from d4orm_env.envs.communication import communication_links
+from d4orm_env.engine.observing import communication_links
 from d4orm_planners import make_planner, make_policy, run_episode
 from d4orm_planners.base.solve import SolveRun
 

@@ -13,7 +13,7 @@ import pytest
 from numpy.polynomial.polynomial import polyder, polyval
 
 from d4orm_env import Problem, Team, World, make_problem
-from d4orm_env.verify.curves import verify_curves
+from d4orm_env.verify.discs import verify_curves
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.solve import SolveRun

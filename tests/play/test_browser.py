@@ -94,8 +94,8 @@ def test_a_robot_under_the_pointer_tells_about_itself(page: Page, replay: Path) 
 
 @pytest.mark.browser
 def test_a_hundred_robots_play(page: Page, tmp_path: Path) -> None:
+    from d4orm_env.engine.choice import rollout
     from d4orm_env.render.replay import Replay, motion
-    from d4orm_env.rollout import rollout
 
     problem = make_problem("circle", num_robots=100, diameter=24)
     trajectory = rollout(problem, np.full((problem.horizon, 100, 2), 0.05, np.float32))

@@ -10,7 +10,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.counter_draws import draw_normals, draw_uniforms
+from d4orm_env.engine.sample_noise import draw_normals, draw_uniforms
 from d4orm_planners.baselines.mmd.guiding import PathSurroundings, guide
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, sine_table
 from d4orm_planners.baselines.mmd.prior import (
