@@ -155,17 +155,11 @@ SHARES = (1.0, 0.5, 0.75, 0.25)
 def approach_goals(
     team: WorkingPlan, robots: IntArray, part: Problem, trajectory: Trajectory, *, or_longer: bool = False
 ) -> None:
-    """Let robots do as in the trajectory, or turn to their goals in time; those that get worse stay as they were.
+    """Let ``robots`` ``(R,)`` of the team do as in the trajectory in ``part``, the problem of them alone, or turn to
+    their goals in time; those that get worse (:meth:`WorkingPlan.take_best`) stay as they were.
 
     A deformation ends metres from where it was aimed at after a long way: arriving is what sampling does worst, and
     steering does at once.
-
-    Args:
-        team: The team's plan, changed in place.
-        robots: ``(R,)`` their numbers in the team.
-        part: The problem of these robots alone.
-        trajectory: Their motion in it.
-        or_longer: See :meth:`~d4orm_planners.base.working_plan.WorkingPlan.take_best`.
     """
     gap = np.linalg.norm(trajectory.positions - part.goal, axis=2)
     nearest = np.where(trajectory.arrived.any(axis=0), trajectory.arrived.argmax(axis=0), gap.argmin(axis=0))

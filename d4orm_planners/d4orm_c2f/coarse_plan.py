@@ -100,21 +100,11 @@ def visible_subgoals(
     problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, docked: BoolArray,
     walls: bool,
 ) -> IntArray:  # fmt: skip
-    """The furthest waypoint up to its subgoal that a robot can drive to straight, past what is at rest.
+    """``(K,)`` the furthest waypoints up to its subgoal that each robot can drive to straight, past what is at rest.
 
-    A subgoal behind a corner, or behind a robot that has docked, would hold it there.
-
-    Args:
-        problem: The robots, the obstacles and the margin.
-        positions: ``(K, d)`` where the robots are [m].
-        path: ``(H+1, K, d)`` [m].
-        indices: ``(K,)`` where on the path they are.
-        targets: ``(K,)`` their subgoals.
-        docked: ``(K,)`` robots at rest.
-        walls: Whether obstacles count too.
-
-    Returns:
-        ``(K,)`` indices.
+    A subgoal behind a corner, or behind a robot that has docked, would hold it there. Robots at ``positions``
+    ``(K, d)`` are at the waypoints ``indices`` ``(K,)`` of ``path`` ``(H+1, K, d)`` [m] and head for ``targets``
+    ``(K,)``; those ``docked`` ``(K,)`` are at rest, and with ``walls`` obstacles count too.
     """
     radius, standing = np.asarray(problem.team.radius), np.flatnonzero(docked)
     result = targets.copy()
@@ -192,18 +182,10 @@ class StagnationMonitor:
 def keep_time(
     problem: Problem, engine: Engine, joint: JointState, path: FloatArray, indices: IntArray, horizon: int
 ) -> FloatArray:
-    """Controls that take every robot along its path in the path's own time, as if none docked.
+    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time, as if none docked.
 
-    Args:
-        problem: The robots; the path has a waypoint per time step of it.
-        engine: Engine for rollouts.
-        joint: Their state.
-        path: ``(H+1, K, d)`` waypoints [m].
-        indices: ``(K,)`` where on it they should be now; from elsewhere they catch up.
-        horizon: Steps.
-
-    Returns:
-        ``(horizon, K, m)``.
+    Of ``path`` ``(H+1, K, d)``, which has a waypoint per time step of the problem [m], they should be at ``indices``
+    ``(K,)`` now; from elsewhere they catch up.
     """
     every, last, d = np.arange(len(indices)), len(path) - 1, path.shape[2]
 

@@ -204,15 +204,9 @@ def top_k(rewards: ArrayLike, k: int) -> tuple[int, ...]:
 
 
 def k_means(points: ArrayLike, k: int, generator: np.random.Generator) -> IntArray:
-    """Cluster points by Lloyd's rounds from a k-means++ start.
+    """``(n,)`` the cluster, numbered from 0, of each of points ``(n, D)``, by Lloyd's rounds from a k-means++ start.
 
-    Args:
-        points: ``(n, D)``.
-        k: Clusters; there are fewer where there are fewer different points.
-        generator: Generator that the start is drawn with.
-
-    Returns:
-        ``(n,)`` the cluster of each point, numbered from 0.
+    There are fewer than ``k`` where there are fewer different points.
     """
     places = np.asarray(points, np.float64)
     centres = places[[generator.integers(len(places))]]
@@ -236,11 +230,7 @@ def k_means(points: ArrayLike, k: int, generator: np.random.Generator) -> IntArr
 def diverse(rewards: ArrayLike, points: ArrayLike, k: int, generator: np.random.Generator) -> tuple[int, ...]:
     """Indices of the best of each of at most ``k`` clusters of candidates, best first.
 
-    Args:
-        rewards: ``(n,)``.
-        points: ``(n, ...)`` the candidates; their distance is the l2 norm of the difference.
-        k: Clusters.
-        generator: See :func:`k_means`.
+    Of candidates ``points`` ``(n, ...)`` with ``rewards`` ``(n,)``; their distance is the l2 norm of the difference.
     """
     count = np.size(rewards)
     labels = k_means(np.reshape(points, (count, -1)), k, generator)
