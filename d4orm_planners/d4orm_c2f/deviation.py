@@ -38,9 +38,6 @@ class StateFilter:
     of the steady state, ``K = P / (P + R)`` with ``P = (Q + sqrt(Q^2 + 4 Q R)) / 2`` (Bar-Shalom, Li, Kirubarajan,
     Estimation with Applications to Tracking and Navigation, section 5.2.5). Robots of one model share it. As long as
     nothing tells of noise in what is measured it is one: measurements are taken as they are.
-
-    Args:
-        problem: The robots.
     """
 
     def __init__(self, problem: Problem) -> None:

@@ -180,9 +180,6 @@ LONGEST_RUN = 10
 class Losses:
     """Watches an episode for robots that go on with the command before instead of a new one.
 
-    Args:
-        problem: The robots.
-
     Attributes:
         run: So many commands in a row may get lost.
     """
@@ -232,9 +229,6 @@ PROBE = 0.1
 
 class Standing:
     """Watches an episode for robots that brake or stay at rest whatever they are commanded.
-
-    Args:
-        problem: The robots.
 
     Attributes:
         robots: ``(K,)`` those that do.
