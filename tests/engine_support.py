@@ -18,8 +18,7 @@ from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import Ops
 from d4orm_env.engine import noise
 from d4orm_env.engine.types import Engine, ObservationInputs, StepResult
-from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 
 ENGINE_NAMES = ("cpu", "jax")
 MODEL_NAMES = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")

@@ -5,7 +5,7 @@ Written out, because the vectoriser gives up on loops over tuples.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -69,7 +69,9 @@ def squared_gap3(x: Row, y: Row) -> np.float32:
     return _squared_norm3((x[0] - y[0], x[1] - y[1], x[2] - y[2]))
 
 
-READ, WRITE, PICK = {2: read2, 3: read3}, {2: _write2, 3: _write3}, {2: _pick2, 3: _pick3}
+READ: dict[int, Any] = {2: read2, 3: read3}
+WRITE: dict[int, Any] = {2: _write2, 3: _write3}
+PICK: dict[int, Any] = {2: _pick2, 3: _pick3}
 SQUARED_NORM = {2: _squared_norm2, 3: _squared_norm3}
 SQUARED_GAP = {2: squared_gap2, 3: squared_gap3}
 

@@ -36,10 +36,7 @@ class Grouping(NamedTuple):
 def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
     """Find the robots that come within the margin of each other at any step after the start.
 
-    Args:
-        positions: ``(H+1, K, d)`` [m].
-        radius: ``(K,)`` [m].
-        margin: [m].
+    Of ``positions`` ``(H+1, K, d)`` and ``radius`` ``(K,)``, all in metres.
     """
     return graph_of(positions.shape[1], path_index.PathIndex(positions, radius, margin).pairs())
 
@@ -94,15 +91,7 @@ def components(graph: Graph) -> Groups:
 
 
 def failure_groups(failed: BoolArray, groups: Groups) -> Groups:
-    """Groups to replan: those that hold a failed robot.
-
-    Args:
-        failed: ``(K,)`` robots that do not arrive, or violate the margin to anything.
-        groups: All groups, singletons included.
-
-    Returns:
-        Disjoint groups of robots, each in ascending order. A robot that fails without conflict is a group of its own.
-    """
+    """Groups to replan: those, of all with singletons included, that hold a robot that failed ``(K,)``."""
     return tuple(group for group in groups if failed[list(group)].any())
 
 

@@ -18,7 +18,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Actions, Policy
-from d4orm_planners.tracking.steering import by_model, present_velocities, track_velocities
+from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round, track_velocities
 
 Mode = Literal["nominal", "measured"]
 
@@ -248,11 +248,7 @@ class Controller:
 
     def _blended(self, measured: FloatArray) -> FloatArray:
         """``(K, n)`` the reference, moved towards what was measured by a share that the lag allows."""
-        off = measured - self._joint.states
-        for model, robots in by_model(self.problem):
-            if model.heading_index is not None:
-                turn = off[robots, model.heading_index]
-                off[robots, model.heading_index] = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
+        off = short_way_round(self.problem, measured - self._joint.states)
         return self._joint.states + (self._observer.trust * off).astype(np.float32)
 
     def _actions(self) -> Actions | None:

@@ -19,9 +19,9 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.engine.types import checked_controls
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
-from d4orm_planners.base.final_approach import drive_further_in
 from d4orm_planners.base.machine import Provenance
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
+from d4orm_planners.base.working_plan import drive_further_in
 from d4orm_planners.engine.sampling_types import (
     DenoisingStep,
     SamplingEngine,
@@ -29,8 +29,8 @@ from d4orm_planners.engine.sampling_types import (
     SamplingRules,
     SamplingTask,
     StepWatcher,
+    get_sampling_engine,
 )
-from d4orm_planners.engine.select import get_sampling_engine
 
 if TYPE_CHECKING:
     from d4orm_planners.base.planner import Planner, State
@@ -76,7 +76,7 @@ class SolveRun:
     Args:
         planner: Planner that iterates.
         problem: The problem.
-        seed: Non-negative.
+        seed: Of the solve, non-negative.
         initial_controls: ``(H, K, m)`` to start from; zeros by default.
         engine: Engine for rollouts and samples, if not the planner's own.
         evaluate: Function that makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
@@ -84,9 +84,6 @@ class SolveRun:
             margin at all steps.
 
     Attributes:
-        problem: The problem.
-        engine: Engine for rollouts and samples.
-        seed: The solve's seed.
         watch: Time used.
         current: The candidate that the next iteration starts from.
         best: The best candidate so far.

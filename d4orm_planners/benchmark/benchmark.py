@@ -18,7 +18,6 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.benchmark.big_teams import measure_big_loops, measure_big_team, measure_improvement
 from d4orm_planners.benchmark.env_steps import (
     DISTURBANCES,
     RAY_BOXES,
@@ -32,6 +31,9 @@ from d4orm_planners.benchmark.env_steps import (
 )
 from d4orm_planners.benchmark.probes import (
     Where,
+    measure_big_loops,
+    measure_big_team,
+    measure_improvement,
     measure_index,
     measure_memory,
     measure_obstacles,
@@ -40,8 +42,7 @@ from d4orm_planners.benchmark.probes import (
 )
 from d4orm_planners.benchmark.settings import BenchmarkSettings
 from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn, measure
-from d4orm_planners.engine.sampling_types import SamplingTask
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
 from d4orm_planners.sampling.d4orm import D4orm
 
 PRESETS = (None, "paper")

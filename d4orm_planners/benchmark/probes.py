@@ -13,13 +13,13 @@ from typing import Literal
 
 import numpy as np
 
-from d4orm_env import verify
+from d4orm_env import navigation_v0, verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.geometry.world_index import build_index
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
-from d4orm_planners.base.planner_registry import make_planner
+from d4orm_planners.base.planner_registry import make_planner, make_policy
 from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn, measure
 
 _FIRST_PLAN = """
@@ -170,3 +170,65 @@ def measure_index(cells: int) -> Measurement:
     begin = time.perf_counter()
     index = build_index(shapes, 0.0625, 0.25)
     return {"cells": cells, "obstacles": shapes.count, "seconds": time.perf_counter() - begin, "bytes": index.num_bytes}
+
+
+COMPILING = 12
+"""Robots of a problem that is solved first, so that compiling does not count."""
+
+
+def measure_big_team(scenario: str, num_robots: int, seeds: int, time_limit: float) -> Measurement:
+    """Seconds of the recommended planner to its first plan, over so many seeds."""
+    planner = make_planner()
+    planner.solve(make_problem(scenario, num_robots=COMPILING, seed=seeds), seed=0, time_limit=time_limit)
+    plans = [
+        planner.solve(make_problem(scenario, num_robots=num_robots, seed=seed), seed=seed, time_limit=time_limit)
+        for seed in range(seeds)
+    ]
+    return {
+        "scenario": scenario,
+        "num_robots": num_robots,
+        "seeds": seeds,
+        "solved": sum(plan.solved for plan in plans),
+        "seconds": Spread.of([plan.wall_time for plan in plans]),
+        "travel_time": Spread.of([plan.metrics["travel_time"] for plan in plans]),
+    }
+
+
+def measure_improvement(scenario: str, num_robots: int, seeds: int, time_limit: float) -> Measurement:
+    """Reward that improving the first plan gains within a time limit, and how long that takes in truth."""
+    planner, improver, gains, seconds = make_planner(), make_planner(improve=True), [], []
+    for seed in range(-1, seeds):  # the first one compiles
+        problem = make_problem(scenario, num_robots=num_robots, seed=max(seed, 0))
+        plan = planner.solve(problem, seed=max(seed, 0))
+        limit = time_limit if seed >= 0 else None
+        better = improver.solve(problem, initial_controls=plan.controls, time_limit=limit, max_iterations=1)
+        if seed >= 0:
+            gains.append(better.metrics["reward"] - plan.metrics["reward"])
+            seconds.append(better.wall_time)
+    gained = sum(gain > 0 for gain in gains)
+    limits = {"scenario": scenario, "num_robots": num_robots, "seeds": seeds, "limit": time_limit}
+    return {**limits, "gained": gained, "gain": Spread.of(gains), "seconds": Spread.of(seconds)}
+
+
+def measure_big_loops(num_robots: int, loops: int) -> Measurement:
+    """Seconds of control loops of D4orm-C2F for a big team on open ground, from where it starts, and contacts."""
+    env = navigation_v0.parallel_env("random", num_robots=num_robots)
+    policy, seconds, contacts = make_policy("d4orm-c2f"), [], 0
+    observations, _ = env.reset(seed=0)
+    begin = time.perf_counter()
+    policy.reset(env, seed=0)
+    start = time.perf_counter() - begin
+    for _ in range(loops + 1):
+        begin = time.perf_counter()
+        actions = policy.act(observations, env.state())
+        seconds.append(time.perf_counter() - begin)
+        observations, _, _, _, infos = env.step(actions)
+        contacts += sum(info["collided"] for info in infos.values())
+    # The first loop may compile.
+    return {
+        "num_robots": num_robots,
+        "start": start,
+        "loop": Spread.of(seconds[1:]),
+        "loop_95": float(np.percentile(seconds[1:], 95)),
+        "contacts": contacts,
+    }

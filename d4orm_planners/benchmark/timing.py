@@ -67,14 +67,7 @@ def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> 
 def in_turn(
     first: Callable[[], object], second: Callable[[], object], repetitions: int, time_limit: float
 ) -> tuple[list[float], list[float]]:
-    """Seconds that each of two things takes, done in turn after once that does not count.
-
-    Args:
-        first: Function to time.
-        second: Function to compare it with.
-        repetitions: Pairs at most, at least one.
-        time_limit: No further pair begins once the counted ones have taken this long [s].
-    """
+    """Seconds that each of two things takes, done in turn after once that does not count; see :func:`measure`."""
     first()
     second()
     seconds: tuple[list[float], list[float]] = [], []

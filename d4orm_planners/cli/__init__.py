@@ -1,8 +1,13 @@
-"""Commands of the command line that fill a module of their own."""
+"""The command line: its entry, and signals while a command is under way."""
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 
 def main() -> None:
@@ -12,3 +17,17 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     run()
+
+
+@contextmanager
+def on_signals(handle: Callable[[int, Any], Any], *numbers: int) -> Iterator[None]:
+    """Have SIGINT and SIGTERM, or these, call a function meanwhile; in other threads than the main one nothing is."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = {number: signal.signal(number, handle) for number in numbers or (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)

@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from d4orm_planners.base.display import one_line
-from d4orm_planners.cli.signals import on_signals
+from d4orm_planners.cli import on_signals
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -32,7 +32,7 @@ LONGEST = 2000
 
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
-    "demo": ("demo:demo", "Plan, execute, verify and draw a team in a warehouse."),
+    "demo": ("run:demo", "Plan, execute, verify and draw a team in a warehouse."),
     "plan": ("plan_command:plan", "Plan for a team; write plan, picture or animation."),
     "run": ("run:run", "Run a plan or a policy in the environment."),
     "export": ("plan_command:export", "Write a plan as setpoints for robots to execute."),
@@ -44,7 +44,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "train": ("train:train", "Train a policy by reinforcement or imitation."),
     "bench": ("bench:bench", "Measure the speed of this machine."),
     "node": ("node_command:node", "Plan as one node of several on a network."),
-    "serve": ("serve_command:serve", "Drive robots on a ROS 2 network over Zenoh."),
+    "serve": ("node_command:serve", "Drive robots on a ROS 2 network over Zenoh."),
     "warmup": ("warmup:warmup", "Compile ahead, so that the next start is quick."),
     "scenarios": ("listings:scenarios", "List the scenarios."),
     "planners": ("listings:planners", "List planners and policies, or the settings of one."),

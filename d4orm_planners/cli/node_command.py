@@ -1,4 +1,4 @@
-"""``d4orm node``: one node of D-D4orm on a network, as on a robot's own computer, told what to do by a file."""
+"""``d4orm node`` and ``d4orm serve``: one of D-D4orm's nodes, or a ROS 2 node without ROS, as a file describes it."""
 
 from __future__ import annotations
 
@@ -15,15 +15,19 @@ import typer
 
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.core.files import read_yaml
+from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem
 from d4orm_env.scenarios.schema import VERSION, parse
+from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.planner_registry import make_planner
+from d4orm_planners.cli import on_signals
 from d4orm_planners.cli.arguments import check_target
-from d4orm_planners.cli.signals import on_signals
 from d4orm_planners.d_d4orm.planner import DD4orm
+from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
+from d4orm_planners.serve.fleet_server import NODE, FleetServer
+from d4orm_planners.serve.wire import RosSession
 
 if TYPE_CHECKING:
-    from d4orm_env.core.problem import Problem
     from d4orm_planners.base.plan import IterationRecord
 
 T = TypeVar("T")
@@ -178,3 +182,56 @@ def _events_as_lines() -> Iterator[None]:
     finally:
         logger.setLevel(level)
         logger.removeHandler(handler)
+
+
+FIELDS = ("problem", "policy", "settings", "controller", "robots", "deadline", "domain", "seed", "zenoh")
+SHARE = 0.9
+"""Share of a period that the policy may take."""
+
+
+@dataclass(frozen=True)
+class ServeTask:
+    """Task of a server, as its file has it."""
+
+    problem: Problem
+    controller: Controller
+    names: tuple[str, ...]
+    deadline: float
+    domain: int
+    seed: int
+    zenoh: ZenohSettings
+
+
+def serve(
+    config: Annotated[Path, typer.Option("--config", "-c", help="YAML file that says what is to be served.")],
+) -> None:
+    """Drive robots on a ROS 2 network over Zenoh: odometry in, velocities and setpoints out, until Ctrl-C."""
+    task, over = read_task(config, FIELDS[:1], FIELDS[1:], _serve_task), threading.Event()
+    # Robots are told to stand once it is set.
+    with on_signals(lambda *_: over.set()), RosSession(task.zenoh, task.domain, NODE) as session:
+        server = FleetServer(session, task.problem, task.controller, task.names, task.deadline, task.seed)
+        typer.echo(f"serving {', '.join(task.names)} on domain {task.domain}; Ctrl-C ends it")
+        server.run(over)
+
+
+def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
+    problem = problem_in(fields["problem"], folder)
+    zenoh = zenoh_in(fields, folder)
+    for name in ("namespace", "grace_period"):
+        if name in zenoh:
+            raise ValueError(f"zenoh has {name!r}, which is for nodes of d4orm node; leave it out")
+    own = {"timeout": SHARE * problem.dt} | dict(mapping("controller", fields.get("controller", {})))
+    policy = fields.get("policy", "d4orm-c2f")
+    settings = mapping("settings", fields.get("settings", {}))
+    names = fields.get("robots", [f"robot_{robot}" for robot in range(problem.num_robots)])
+    if not isinstance(names, list) or not all(isinstance(name, str) and name.isidentifier() for name in names):
+        raise ValueError(f"robots is {names!r}; give a list of names of letters, digits and '_'")
+    return ServeTask(
+        problem=problem,
+        controller=Controller(policy, **own, **settings),
+        names=tuple(names),
+        deadline=fields.get("deadline", 0.5),
+        domain=whole_number(fields.get("domain", 0), "domain", 0, 232),
+        seed=whole_number(fields.get("seed", 0), "seed", 0),
+        zenoh=ZenohSettings.of(zenoh),
+    )

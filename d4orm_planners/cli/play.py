@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import rich
 import typer
 
+from d4orm_planners.cli import on_signals
 from d4orm_planners.cli.arguments import names
 from d4orm_planners.cli.common_options import ObservationOptions, ProblemOptions, takes
-from d4orm_planners.cli.signals import on_signals
 
 if TYPE_CHECKING:
     from d4orm_planners.play.playground import Playground

@@ -39,16 +39,14 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.engine.cpu_sampling import Sampling
-from d4orm_planners.engine.path_checks import check_alone
-from d4orm_planners.engine.path_index import PathIndex
-from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
+from d4orm_planners.engine.path_index import PathIndex, check_alone
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 from d4orm_planners.engine.score import score_kernel
-from d4orm_planners.engine.select import get_sampling_engine
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.tracking.steering import prepare_drives, standing
-from d4orm_planners.tracking.straight_drives import straight_kernel
+from d4orm_planners.tracking.tracker import straight_kernel
 
 
 @dataclass(frozen=True)

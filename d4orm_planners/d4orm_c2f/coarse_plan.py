@@ -1,4 +1,4 @@
-"""The coarse guidance of D4orm-C2F: a path for the whole team, and where on it the team is (paper, section VI)."""
+"""The coarse guidance of D4orm-C2F: a path for the team, where on it each robot is and heads (paper, section VI)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.engine.types import Engine
+from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.tracking.steering import track_team
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,14 +53,8 @@ def coarse_problem(problem: Problem, factor: int) -> Problem:
 
 
 def interpolate(path: FloatArray, factor: int) -> FloatArray:
-    """Waypoints between those of a coarse path, evenly spaced (paper, Algorithm 4, line 3).
-
-    Args:
-        path: ``(H_c+1, K, d)`` [m].
-        factor: Fine steps per coarse step.
-
-    Returns:
-        ``(factor * H_c + 1, K, d)``; every ``factor``-th is one of the path.
+    """``(factor * H_c + 1, K, d)`` evenly spaced waypoints, of which every ``factor``-th is one of a coarse path
+    ``(H_c+1, K, d)`` (paper, Algorithm 4, line 3).
     """
     share = (np.arange(factor, dtype=path.dtype) / factor)[None, :, None, None]
     between = path[:-1, None] * (1 - share) + path[1:, None] * share
@@ -65,16 +62,9 @@ def interpolate(path: FloatArray, factor: int) -> FloatArray:
 
 
 def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, window: int) -> IntArray:
-    """Return each robot's position on its path: the index of its nearest waypoint.
+    """``(K,)`` where on ``path`` ``(H+1, K, d)`` robots at ``positions`` ``(K, d)`` are: indices of nearest waypoints.
 
-    Args:
-        path: ``(H+1, K, d)`` [m].
-        positions: ``(K, d)`` [m].
-        last: ``(K,)`` indices found before. The search goes on from there, because a path may cross itself.
-        window: Waypoints after those that are looked at.
-
-    Returns:
-        ``(K,)`` indices, at least ``last``, at most ``H``.
+    From those found ``last`` ``(K,)`` on, because a path may cross itself, ``window`` waypoints are looked at.
     """
     index = np.minimum(np.asarray(last)[:, None] + np.arange(window + 1), len(path) - 1)
     ahead = path[index, np.arange(len(index))[:, None]]
@@ -82,20 +72,11 @@ def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, win
 
 
 def subgoal_indices(indices: IntArray, mean: int, offset: int, lag: int, last: int) -> IntArray:
-    """The waypoint that every robot heads for (paper, Algorithm 4, line 7).
+    """``(K,)`` the waypoint, at most the ``last``, that every robot heads for (paper, Algorithm 4, line 7).
 
-    The paper's is the same for all robots: the mean of their indices and an offset. A robot that was held up would then
-    leave its path, straight into whatever the path leads around; it keeps to its own instead.
-
-    Args:
-        indices: ``(K,)`` where the robots are.
-        mean: Their mean over the robots that count.
-        offset: ``m``, waypoints from the mean to the subgoal.
-        lag: Waypoints that a robot may be behind the mean and still head for the same subgoal.
-        last: ``H``, the last waypoint.
-
-    Returns:
-        ``(K,)`` indices, at most ``last``.
+    The paper's is the same for all robots: the ``mean`` of their ``indices`` ``(K,)`` and an ``offset``. A robot that
+    was held up, by more than ``lag`` waypoints, would then leave its path, straight into whatever the path leads
+    around; it keeps to its own instead.
     """
     return np.minimum(np.minimum(mean, indices + lag) + offset, last)
 
@@ -106,3 +87,113 @@ def rest_of(guidance: CoarsePlan, index: int, factor: int) -> tuple[Problem, Flo
     coarse = guidance.problem
     left = coarse.with_state(guidance.states[step], coarse.goal, horizon=coarse.horizon - step)
     return left, guidance.controls[step:]
+
+
+LEAST = 5
+"""Waypoints that a subgoal is ahead all the same: nearer ones hardly pull."""
+
+_SHARES = np.linspace(0, 1, 9)[1:]
+"""Shares of the straight line at which its clearance from obstacles is looked at."""
+
+
+def visible_subgoals(
+    problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, docked: BoolArray,
+    walls: bool,
+) -> IntArray:  # fmt: skip
+    """``(K,)`` the furthest waypoints up to its subgoal that each robot can drive to straight, past what is at rest.
+
+    A subgoal behind a corner, or behind a robot that has docked, would hold it there. Robots at ``positions``
+    ``(K, d)`` are at the waypoints ``indices`` ``(K,)`` of ``path`` ``(H+1, K, d)`` [m] and head for ``targets``
+    ``(K,)``; those ``docked`` ``(K,)`` are at rest, and with ``walls`` obstacles count too.
+    """
+    radius, standing = np.asarray(problem.team.radius), np.flatnonzero(docked)
+    result = targets.copy()
+    waiting = np.flatnonzero(~docked & (targets > indices + LEAST))
+    while len(waiting):
+        offset = path[result[waiting], waiting] - positions[waiting]
+        blocked = _meets_standing(
+            positions[waiting], offset, radius[waiting] + problem.margin / 2, positions[standing], radius[standing]
+        )
+        if walls:
+            places = positions[waiting] + _SHARES[:, None, None] * offset
+            clearance = problem.world.clearance(places.reshape(-1, places.shape[-1])).reshape(places.shape[:-1])
+            blocked |= (clearance <= radius[waiting] + problem.margin / 2).any(axis=0)
+        waiting = waiting[blocked]
+        result[waiting] -= 1
+        waiting = waiting[result[waiting] > indices[waiting] + LEAST]
+    return result
+
+
+def _meets_standing(
+    begin: FloatArray, offset: FloatArray, reach: FloatArray, others: FloatArray, radius: FloatArray
+) -> BoolArray:
+    """``(N,)`` whether the straight path from ``begin`` by ``offset`` comes within reach of one of the others."""
+    gap = others - begin[:, None]
+    square = (offset**2).sum(axis=1)[:, None]
+    share = np.clip((gap * offset[:, None]).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)
+    away = ((gap - share[:, :, None] * offset[:, None]) ** 2).sum(axis=2)
+    meets: BoolArray = (away <= (reach[:, None] + radius) ** 2).any(axis=1)
+    return meets
+
+
+STUCK_WITHIN, STUCK_AFTER = 3, 25
+"""Progress without which a robot is stuck: so many waypoints in so many time steps."""
+
+BARRED_AFTER = 8
+"""The same for robots whose paths lead through those at rest for good."""
+
+WAITING_WITHIN = 1.0
+"""A robot this near to where it should be by now waits, in radii of the largest one."""
+
+CAREFUL_FOR = 30
+"""Steps for which a robot that was stuck follows its path."""
+
+CATCHING_UP = 2.0
+"""Share of its lag that a robot makes good in a second [1/s]."""
+
+
+class StagnationMonitor:
+    """Watches an episode for robots that do not get on along their paths.
+
+    Args:
+        joint: Their first state.
+    """
+
+    def __init__(self, joint: JointState) -> None:
+        self._indices = np.zeros(len(joint.goals), int)
+        self._since = np.full(len(joint.goals), joint.steps)
+        self._careful_until = np.full(len(joint.goals), joint.steps)
+
+    def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[IntArray, BoolArray]:
+        """``(K,)`` steps without progress, and robots that are stuck, or were not long ago, and so follow their paths.
+
+        Args:
+            step: Time step.
+            indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
+            waiting: ``(K,)`` robots that are where they should be by now, or ahead of the team.
+        """
+        moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
+        self._indices[moved], self._since[moved] = indices[moved], step
+        idle = step - self._since
+        self._careful_until[idle > STUCK_AFTER] = step + CAREFUL_FOR
+        return idle, self._careful_until > step
+
+
+def keep_time(
+    problem: Problem, engine: Engine, joint: JointState, path: FloatArray, indices: IntArray, horizon: int
+) -> FloatArray:
+    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time, as if none docked.
+
+    Of ``path`` ``(H+1, K, d)``, which has a waypoint per time step of the problem [m], they should be at ``indices``
+    ``(K,)`` now; from elsewhere they catch up.
+    """
+    every, last, d = np.arange(len(indices)), len(path) - 1, path.shape[2]
+
+    def wanted(t: int, states: FloatArray) -> FloatArray:
+        now, after = (path[np.minimum(indices + step, last), every] for step in (t, t + 1))
+        velocities: FloatArray = (after - now) / problem.dt + CATCHING_UP * (now - states[:, :d])
+        return velocities
+
+    controls = track_team(problem.with_state(joint.states, joint.goals), engine, horizon, wanted, each_alone=True)
+    assert controls is not None
+    return controls

@@ -14,17 +14,21 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import (
+    BARRED_AFTER,
+    STUCK_AFTER,
+    WAITING_WITHIN,
     CoarsePlan,
     CoarseWaypoints,
+    StagnationMonitor,
     coarse_problem,
     interpolate,
+    keep_time,
     nearest_indices,
     rest_of,
     subgoal_indices,
+    visible_subgoals,
 )
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
-from d4orm_planners.d4orm_c2f.following import BARRED_AFTER, STUCK_AFTER, WAITING_WITHIN, StagnationMonitor, keep_time
-from d4orm_planners.d4orm_c2f.line_of_sight import visible_subgoals
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import SamplingEngine
 from d4orm_planners.mapf.relay import relay_paths
@@ -150,11 +154,7 @@ class CoarsePlanTracker:
         moving = ~docked
         held_up, lost = np.zeros_like(docked), False
         if self._config.replan:
-            idle, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
-            barred = self._barred(joint, docked, idle > BARRED_AFTER)
-            held_up = moving & (
-                np.minimum(idle, joint.steps - self._began) > np.where(barred, BARRED_AFTER, STUCK_AFTER)
-            )
+            held_up = moving & self._idle_for_long(joint, docked)
             lost = bool(moving.any()) and self._is_lost(joint, moving)
         if not moving.any():
             return False
@@ -182,6 +182,12 @@ class CoarsePlanTracker:
             return False
         self._follow(joint, guidance, anew)
         return True
+
+    def _idle_for_long(self, joint: JointState, docked: BoolArray) -> BoolArray:
+        """``(K,)`` robots that have got nowhere on this path for so long that they need another; notes the stuck."""
+        idle, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
+        barred = self._barred(joint, docked, idle > BARRED_AFTER)
+        return np.minimum(idle, joint.steps - self._began) > np.where(barred, BARRED_AFTER, STUCK_AFTER)
 
     def _relayed(self, joint: JointState, changed: BoolArray) -> CoarseWaypoints | None:
         """Paths on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""

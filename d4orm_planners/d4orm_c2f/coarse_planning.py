@@ -6,20 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.envs.joint_state import JointState
+from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
+from d4orm_planners.base.planner_registry import make_policy
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, coarse_problem, interpolate
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.d4orm_c2f.warm_start import episode_of
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.hybrid.planner import Hybrid
-from d4orm_planners.hybrid.settings import HybridConfig
+from d4orm_planners.hybrid.planner import Hybrid, HybridConfig
 from d4orm_planners.mapf.planner import RoadmapSolution
 
 
@@ -109,3 +109,28 @@ def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> Planner:
     if config.coarse_preset is None:
         return Hybrid(HybridConfig(**given, reroute=reroute, improver="denoising"))
     return D4ormD(D4ormDConfig(**{**D4ormD.presets[config.coarse_preset], **given}))
+
+
+def episode_of(policy: str, problem: Problem, seed: int) -> FloatArray:
+    """``(H, K, m)`` controls of an episode, zero once all have arrived.
+
+    Args:
+        policy: Name of a policy.
+        problem: Its problem.
+        seed: Of the policy.
+
+    Raises:
+        ValueError: If there is no such policy, or it cannot drive there.
+        ImportError: If it needs a library that is not installed.
+    """
+    env, driver = navigation_v0.parallel_env(problem=problem), make_policy(policy)
+    observations, _ = env.reset(seed=seed)
+    driver.reset(env, seed=seed)
+    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    for executed in controls:
+        if not env.agents:
+            break
+        observations, *_ = env.step(driver.act(observations, env.state()))
+        executed[:] = split_state(problem, env.state()).controls
+    env.close()
+    return controls

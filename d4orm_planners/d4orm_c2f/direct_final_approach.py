@@ -86,14 +86,7 @@ def come_again(
     being near do not do. Among drives by points all around, forwards or in reverse, that one is chosen which is home
     first and keeps clear of all at rest.
 
-    Args:
-        window: The robots from where they are to their goals, over the prediction horizon.
-        controls: ``(H_predict, K, m)``.
-        robots: Robots that look for one.
-        docked: ``(K,)`` robots at rest for good.
-
-    Returns:
-        ``(H_predict, K, m)`` controls, and ``(K,)`` robots that have found one.
+    The other arguments, and what is returned, are as for :func:`direct_final_approach`.
     """
     coming = np.zeros_like(docked)
     if not len(robots):

@@ -151,17 +151,9 @@ class Window:
     def _with_stop(
         self, window: Problem, controls: FloatArray, states: FloatArray, steps: int, docked: BoolArray
     ) -> FloatArray:
-        """The first ``steps`` controls, and after them those that bring everyone to rest as soon as can be.
-
-        Args:
-            window: The problem.
-            controls: ``(H_predict, K, m)``.
-            states: ``(H_predict + 1, K, n)`` that they lead to.
-            steps: Number of controls that are executed.
-            docked: ``(K,)`` robots that have docked by then.
-
-        Returns:
-            ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
+        """``(H_predict + S, K, m)`` the first ``steps`` controls, and then those that bring everyone but the ``docked``
+        ``(K,)`` to rest as soon as can be, in ``S`` steps at most; ``states`` ``(H_predict + 1, K, n)`` are what
+        ``controls`` lead to.
         """
         stopping = np.zeros((len(controls) + self._stop_steps, *controls.shape[1:]), np.float32)
         stopping[:steps] = controls[:steps]

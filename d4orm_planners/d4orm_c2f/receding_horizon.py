@@ -19,10 +19,10 @@ from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, CoarseWaypoints
 from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
 from d4orm_planners.d4orm_c2f.deviation import Deviation
+from d4orm_planners.d4orm_c2f.estimators import PROBE
 from d4orm_planners.d4orm_c2f.fine_plan import Prediction, Situation, Window
 from d4orm_planners.d4orm_c2f.settings import PAPER_CONTROL, D4ormC2FConfig
-from d4orm_planners.d4orm_c2f.stall_estimator import PROBE
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import drive_to_goal, present_velocities, track_velocities
 
 if TYPE_CHECKING:

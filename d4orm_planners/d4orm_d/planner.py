@@ -10,16 +10,14 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.base.conflict_groups import conflicts
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
-from d4orm_planners.d4orm_d.groups import Groups
-from d4orm_planners.d4orm_d.joint_run import JointRun
-from d4orm_planners.d4orm_d.repairs import Repairs
+from d4orm_planners.d4orm_d.group_runs import GroupRuns, JointRun
+from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.sampling.d4orm import AUTHORS_DEFORMATION, PAPER_DEFORMATION, DeformingPlanner
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
 
-State = Groups | JointRun | Repairs
+State = GroupRuns | JointRun | Repairs
 """State between iterations, by the kind of decoupling."""
 
 
@@ -53,14 +51,13 @@ class D4ormD(DeformingPlanner):
     config: D4ormDConfig
 
     def init(self, search: SolveRun) -> State:
-        """See :meth:`Planner.init`."""
         with search.watch.paused():
             prepare_drives(search.problem)
         num_robots, config = search.problem.num_robots, self.config
         if config.decoupling == "joint":
             resets = config.reset_after_probe and not search.current.controls.any()
             return JointRun.of(num_robots, config.penalty, resets)
-        return Groups() if config.decoupling == "groups" else Repairs.of(num_robots)
+        return GroupRuns() if config.decoupling == "groups" else Repairs.of(num_robots)
 
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
         """See :meth:`Planner.iterate`: the whole team at first and once none fails, the failed robots in between."""
@@ -74,7 +71,7 @@ class D4ormD(DeformingPlanner):
         team = DeformedPlan(self, search, search.current.trajectory, search.current.report)
         return state.repair(team, self.config), team.iteration()
 
-    def replan(self, search: SolveRun, state: Groups | JointRun) -> tuple[State, Iteration]:
+    def replan(self, search: SolveRun, state: GroupRuns | JointRun) -> tuple[State, Iteration]:
         """Replan the groups that fail, in turn or in one run, or once there was a solution the whole team."""
         if search.best.solved or not search.current.unsolved.any():
             return self.whole_team(search, state)
@@ -97,11 +94,9 @@ class D4ormD(DeformingPlanner):
         return self.config.big_team is not None and problem.num_robots > self.config.big_team
 
     def num_samples(self, search: SolveRun) -> int:
-        """See :meth:`SamplingPlanner.num_samples`."""
         return max(self.config.num_samples // 2, 2) if self.is_big(search.problem) else self.config.num_samples
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
-        """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
         # Only who starts from nothing is yet to find out who meets whom; a plan that is made better has to keep apart.
         from_zero = search.iteration == 0 and not base.any()

@@ -4,18 +4,96 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import IntArray
+from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.conflict_groups import components, independent_robots
-from d4orm_planners.base.final_approach import approach_goals
-from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
-from d4orm_planners.d4orm_d.settings import RULES, D4ormDConfig
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.base.working_plan import WorkingPlan, approach_goals
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.engine.sampling_types import SamplingTask, moving_robots
+from d4orm_planners.sampling.d4orm import DeformingPlanner
+
+NOISE_FACTORS = (1.0, 2.0)
+"""On the noise of successive repairs: what ordinary noise does not get around, wider noise may."""
+SLACK = 40
+"""Steps beyond the latest arrival of the robots repaired that their repair looks at. Farther on there is nothing to
+search, and what happens there would dilute the rewards."""
+RECENCY_GAIN, RECENCY_DECAY = 0.3, 0.7
+"""Increase of a robot's recency by a repair, for the least recently repaired go first, and share of it that is left
+after an iteration."""
+CROWDING = 0.2
+"""Priority of a robot for every robot that it meets: it blocks the most."""
+JOINT_INTERVAL, JOINT_FAILURES, JOINT_ROBOTS = 3, 2, 3
+"""Every so many iterations robots may be repaired jointly, each by their team's reward, if so many repairs in a row
+failed for each and they are so few: robots that only together can get out of each other's way."""
+SHORTENINGS = 2
+"""Number of times in turn that robots look for shorter final approaches."""
+
+
+class DeformedPlan(WorkingPlan):
+    """The team's plan, some robots' controls deformed around all others.
+
+    Args:
+        planner: Planner with the rules of deformations.
+        search: The search.
+        trajectory: The team's motion at first.
+        report: Report of :func:`~d4orm_env.verify` on that, if it was asked.
+    """
+
+    def __init__(
+        self,
+        planner: DeformingPlanner,
+        search: SolveRun,
+        trajectory: Trajectory,
+        report: VerificationReport | None = None,
+    ) -> None:
+        super().__init__(search, trajectory, report)
+        self.planner = planner
+        self._denoising_steps = self._excluded = self._runs = 0
+
+    def deformed(
+        self, robots: Sequence[int], horizon: int, num_samples: int, noise_scale: FloatArray, **scoring: Any
+    ) -> tuple[Problem, FloatArray, Trajectory]:
+        """Deform these robots' first ``horizon`` controls around all others.
+
+        Returns:
+            The problem of these robots alone, their new controls as planned, and the rollout of those in it.
+        """
+        planner, search, problem = self.planner, self.search, self.problem
+        part = problem.select(robots)
+        others = np.setdiff1d(np.arange(problem.num_robots), robots)
+        moving = None
+        if len(others):
+            moving = moving_robots(problem.team.select(others.tolist()), self.states[1 : horizon + 1, others])
+        base = np.ascontiguousarray(self.controls[:horizon, robots, : part.control_size])
+        task = SamplingTask(
+            part.with_state(part.start, part.goal, horizon=horizon), base, moving=moving,
+            penalty_per_pair=planner.config.penalty_per_pair, **scoring,
+        )  # fmt: skip
+        self._runs += 1
+        start, seed = (
+            planner.start(search, base, part.team, self._runs),
+            search.iteration_seed(Stream.REPAIR, self._runs),
+        )
+        result = search.denoise(task, planner.rules(), start, noise_scale, num_samples, seed)
+        self._denoising_steps += len(result.rewards)
+        self._excluded += result.excluded
+        controls = np.zeros((problem.horizon, len(robots), part.control_size), np.float32)
+        controls[:horizon] = base + result.mean
+        return part, controls, search.engine.rollout(part, controls)
+
+    def iteration(self) -> Iteration:
+        """Return the result."""
+        return Iteration(self.controls, self._denoising_steps, self._excluded)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +149,9 @@ class _Repair:
         problem = self.problem
         robots, credit = self.next_robots(failed)
         moving = (self.team.positions[1:, robots] != self.team.positions[:-1, robots]).any(axis=2)
-        horizon = min(int(moving.any(axis=1).nonzero()[0].max(initial=0)) + 1 + RULES.slack, problem.horizon)
+        horizon = min(int(moving.any(axis=1).nonzero()[0].max(initial=0)) + 1 + SLACK, problem.horizon)
         distance = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
-        wider = RULES.noise_factors[self.search.iteration % len(RULES.noise_factors)]
+        wider = NOISE_FACTORS[self.search.iteration % len(NOISE_FACTORS)]
         part, _, trajectory = self.team.deformed(
             robots,
             horizon,
@@ -88,7 +166,7 @@ class _Repair:
 
     def shorten(self) -> None:
         """Let all robots turn to their goals as soon as that is no worse."""
-        for _ in range(RULES.shortenings):
+        for _ in range(SHORTENINGS):
             if self.search.should_stop():
                 break
             trajectory = self.search.engine.rollout(self.problem, self.team.controls)
@@ -104,19 +182,19 @@ class _Repair:
         search, graph = self.search, self.team.conflicts()
         degree = np.array([len(neighbours) for neighbours in graph])
         random = np.random.default_rng(search.iteration_seed(Stream.REPAIR_ORDER)).random(len(self.recency))
-        order = np.argsort(self.recency + random - RULES.crowding * degree, kind="stable")
-        if search.iteration % RULES.joint_interval == 0:
+        order = np.argsort(self.recency + random - CROWDING * degree, kind="stable")
+        if search.iteration % JOINT_INTERVAL == 0:
             stuck = [
                 group
                 for group in components(graph)
-                if 1 < len(group) <= RULES.joint_robots and self.failures[list(group)].min() >= RULES.joint_failures
+                if 1 < len(group) <= JOINT_ROBOTS and self.failures[list(group)].min() >= JOINT_FAILURES
             ]
             if stuck:
-                return stuck[search.iteration // RULES.joint_interval % len(stuck)], "team"
+                return stuck[search.iteration // JOINT_INTERVAL % len(stuck)], "team"
         robots = independent_robots(order[np.isin(order, failed)].tolist(), graph)
         self.recency = self.recency.copy()
-        self.recency[list(robots)] += RULES.recency_gain
-        self.recency *= RULES.recency_decay
+        self.recency[list(robots)] += RECENCY_GAIN
+        self.recency *= RECENCY_DECAY
         return robots, "robot"
 
     def take_over(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:

@@ -1,4 +1,4 @@
-"""Settings of D4orm-D, and the numbers of its repairs that need no setting."""
+"""Settings of D4orm-D."""
 
 from __future__ import annotations
 
@@ -83,34 +83,3 @@ class D4ormDConfig(JointRunSettings, DeformationConfig):
                 "reset_after_probe is True, but the first iteration is no probe: it minds collisions; set "
                 "first_collisions=False, or start='straight'"
             )
-
-
-@dataclass(frozen=True)
-class RepairRules:
-    """The numbers of independent repairs.
-
-    Attributes:
-        noise_factors: On the noise of successive repairs: what ordinary noise does not get around, wider noise may.
-        slack: Steps beyond the latest arrival of the robots repaired that their repair looks at. Farther on there is
-            nothing to search, and what happens there would dilute the rewards.
-        recency_gain: Increase of a robot's recency by a repair. The least recently repaired go first.
-        recency_decay: Share of it that is left after an iteration.
-        crowding: Priority of a robot for every robot that it meets: it blocks the most.
-        joint_interval: Every so many iterations robots may be repaired jointly, each by their team's reward, ...
-        joint_failures: ... if so many repairs in a row failed for each of them ...
-        joint_robots: ... and they are so few: robots that only together can get out of each other's way.
-        shortenings: Number of times in turn that robots look for shorter final approaches.
-    """
-
-    noise_factors: tuple[float, ...] = (1.0, 2.0)
-    slack: int = 40
-    recency_gain: float = 0.3
-    recency_decay: float = 0.7
-    crowding: float = 0.2
-    joint_interval: int = 3
-    joint_failures: int = 2
-    joint_robots: int = 3
-    shortenings: int = 2
-
-
-RULES = RepairRules()

@@ -17,10 +17,8 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm.inbox import TOLERANCE, Evaluator, Inbox
-from d4orm_planners.d_d4orm.messages import Message, encode
-from d4orm_planners.d_d4orm.selection import choose
-from d4orm_planners.d_d4orm.transport import TrafficStats, Transport
+from d4orm_planners.d_d4orm.inbox import TOLERANCE, Evaluator, Inbox, choose
+from d4orm_planners.d_d4orm.transport import Message, TrafficStats, Transport, encode
 
 KINDS = ("computed", "sent", "received", "selected")
 """A node has made a candidate, sent it, got one, or chosen it to go on from."""
@@ -71,7 +69,7 @@ class PlanningTask:
         num_nodes: Number of nodes.
         seed: That of the whole solve.
         controls: ``(H, K, m)`` to start from; ``None`` for zeros.
-        selection: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.selection.choose`.
+        selection: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.inbox.choose`.
         k: Number of candidates that it draws from.
         links: ``(N, N)`` bool: which nodes each one hears; ``None`` for all.
     """
@@ -103,7 +101,6 @@ class Node:
         observer: Called with every :class:`~d4orm_planners.d_d4orm.node.Event`, in the node's own thread.
 
     Attributes:
-        number: From 0.
         search: Its own search.
         candidate: The candidate that it made last.
         transport: Transport of its messages, with a count.

@@ -9,6 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord
@@ -90,7 +91,13 @@ class NodePool(ABC):
         transports: All ends to close in the end.
         timeout: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
         evaluator: Evaluator of all nodes.
+
+    Attributes:
+        alive: Nodes that have not failed.
+        opened: What is to be closed after them.
     """
+
+    opened: ExitStack
 
     def __init__(
         self, nodes: Sequence[Node], transports: Sequence[Transport], timeout: float, evaluator: Evaluator

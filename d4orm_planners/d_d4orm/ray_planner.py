@@ -21,8 +21,8 @@ from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm.messages import Message, decode, encode
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.d_d4orm.transport import Message, decode, encode
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 
 TIMEOUT = 10.0
 """Seconds to wait for the head of a cluster to answer."""

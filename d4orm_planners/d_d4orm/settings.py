@@ -14,9 +14,9 @@ from d4orm_env.core.errors import unknown
 from d4orm_planners.base.planner import PlannerConfig
 from d4orm_planners.base.settings import NOTHING, Count, Positive, Seconds, Whole, one_of
 from d4orm_planners.d4orm_d.planner import D4ormD
+from d4orm_planners.d_d4orm.inbox import SELECTIONS, shares
 from d4orm_planners.d_d4orm.node_pool import MODES
 from d4orm_planners.d_d4orm.ray_planner import host_and_port
-from d4orm_planners.d_d4orm.selection import SELECTIONS, shares
 from d4orm_planners.d_d4orm.transport import TRANSPORTS
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 from d4orm_planners.hybrid.planner import Hybrid

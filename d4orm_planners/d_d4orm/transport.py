@@ -1,11 +1,137 @@
-"""Transport of messages: its protocol, and threads of one process as the simplest one."""
+"""The messages of D-D4orm, candidates as bytes, and their transport: its protocol, and threads as the simplest one.
+
+Layout, little-endian: magic, version, feasible, node, sequence, ``H``, ``K``, ``m``, reward (float64), the problem's
+SHA-256; then ``(H, K, m)`` controls as float32; then the CRC-32 of all before. Whatever else arrives is told apart by
+its fault, never unpickled.
+"""
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
+import zlib
 from collections import deque
+from dataclasses import dataclass
 from typing import Protocol
+
+import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.problem import Problem
+from d4orm_planners.base.candidate import PLAN_REACH
+
+MAGIC = b"D4DC"
+VERSION = 1
+MAX_BYTES = 16 * 2**20
+"""Longer messages are neither sent nor read."""
+
+KINDS = (
+    "garbage", "truncated", "too_large", "version", "checksum", "problem", "node", "shape", "not_finite", "limits",
+    "stale",
+)  # fmt: skip
+"""Faults of messages that are dropped. ``"stale"`` is not the codec's to see, but the inbox's."""
+
+_HEADER = struct.Struct("<4sHHIQIIId32s")
+_CHECKSUM = struct.Struct("<I")
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """A candidate as a node claims it to be.
+
+    Attributes:
+        node: Its sender, from 0.
+        sequence: Number of the candidate, from 1.
+        controls: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would.
+        reward: Mean reward.
+        feasible: Whether it is a solution.
+    """
+
+    node: int
+    sequence: int
+    controls: FloatArray
+    reward: float
+    feasible: bool
+
+
+class MessageError(ValueError):
+    """Bytes that are no usable message, with their kind of fault, one of :data:`KINDS`."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+def encode(message: Message, problem: Problem) -> bytes:
+    """A message as bytes.
+
+    Raises:
+        MessageError: If it would be longer than :data:`MAX_BYTES`.
+    """
+    digest = bytes.fromhex(problem.digest)
+    content = np.ascontiguousarray(message.controls, "<f4")
+    header = _HEADER.pack(
+        MAGIC, VERSION, message.feasible, message.node, message.sequence, *content.shape, message.reward, digest
+    )
+    data = header + content.tobytes()
+    data += _CHECKSUM.pack(zlib.crc32(data))
+    if len(data) > MAX_BYTES:
+        raise MessageError("too_large", f"a candidate takes {len(data)} bytes; at most {MAX_BYTES} are sent")
+    return data
+
+
+def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
+    """Read a message.
+
+    Args:
+        data: Anything.
+        problem: The problem that it must be about.
+        num_nodes: Nodes are numbered below it.
+
+    Raises:
+        MessageError: If it is anything but a message of this version with finite controls, none beyond
+            :data:`~d4orm_planners.base.candidate.PLAN_REACH`, for this problem from one of the nodes.
+    """
+    if len(data) > MAX_BYTES:
+        raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")
+    if data[: len(MAGIC)] != MAGIC[: len(data)] or not data:
+        raise MessageError("garbage", f"{len(data)} bytes that do not begin with {MAGIC!r}")
+    if len(data) < _HEADER.size:
+        raise MessageError("truncated", f"{len(data)} bytes; the header alone takes {_HEADER.size}")
+    _, version, feasible, node, sequence, *shape, reward, digest = _HEADER.unpack_from(data)
+    if version != VERSION:
+        raise MessageError("version", f"version {version}; this is version {VERSION}")
+    _check_length(data, shape)
+    if _CHECKSUM.unpack_from(data, len(data) - _CHECKSUM.size)[0] != zlib.crc32(data[: -_CHECKSUM.size]):
+        raise MessageError("checksum", "the checksum does not fit the content")
+    if digest.hex() != problem.digest:
+        raise MessageError("problem", f"about problem {digest.hex()[:8]}; this is {problem.digest[:8]}")
+    if node >= num_nodes:
+        raise MessageError("node", f"from node {node}; there are {num_nodes}, from 0")
+    controls = np.frombuffer(data[_HEADER.size : -_CHECKSUM.size], "<f4").astype(np.float32)
+    return Message(node, sequence, _checked(controls, tuple(shape), reward, problem), reward, bool(feasible))
+
+
+def _check_length(data: bytes, shape: list[int]) -> None:
+    steps, robots, size = shape
+    length = _HEADER.size + 4 * steps * robots * size + _CHECKSUM.size
+    if len(data) != length:
+        kind = "truncated" if len(data) < length else "too_large"
+        raise MessageError(kind, f"{len(data)} bytes; the header announces {length}")
+
+
+def _checked(controls: FloatArray, shape: tuple[int, ...], reward: float, problem: Problem) -> FloatArray:
+    expected = (problem.horizon, problem.num_robots, problem.control_size)
+    if shape != expected:
+        raise MessageError("shape", f"controls of shape {shape}; expected (H, K, m) = {expected}")
+    if not (np.isfinite(controls).all() and np.isfinite(reward)):
+        raise MessageError("not_finite", "a control or the reward is not finite")
+    controls = controls.reshape(shape)
+    if (np.abs(controls) > PLAN_REACH * problem.team.control_limits).any():
+        raise MessageError("limits", f"a control is more than {PLAN_REACH:g} times its limit")
+    return controls
+
 
 TRANSPORTS = ("local", "ray", "zenoh")
 

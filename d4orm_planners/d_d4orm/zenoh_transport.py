@@ -19,8 +19,7 @@ from d4orm_env.core.arrays import duration
 from d4orm_env.core.errors import no_setting
 from d4orm_env.core.files import require_file
 from d4orm_env.core.lazy import LazyModule, load
-from d4orm_planners.d_d4orm.messages import MAX_BYTES
-from d4orm_planners.d_d4orm.transport import WAITING, Mailbox
+from d4orm_planners.d_d4orm.transport import MAX_BYTES, WAITING, Mailbox
 
 _zenoh: Any = LazyModule("zenoh", "transport 'zenoh'", "zenoh")
 

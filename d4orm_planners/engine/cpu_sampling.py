@@ -15,7 +15,7 @@ from d4orm_env.engine.sample_noise import Drawing
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.threads import Threads
 from d4orm_env.footprints import Disc
-from d4orm_planners.engine import average, score
+from d4orm_planners.engine import score, weighting
 from d4orm_planners.engine.proximity import bound_boxes, make_bodies
 from d4orm_planners.engine.sampling_types import (
     WATCHED_SAMPLES,
@@ -34,7 +34,7 @@ class CpuSamplingEngine(CpuEngine):
     def prepare(self, task: SamplingTask, rules: SamplingRules, noise_scale: FloatArray, num_samples: int) -> None:
         """See :meth:`SamplingEngine.prepare`; one compilation serves all teams of the same models."""
         del noise_scale, num_samples
-        if not (score.score_kernel(task.problem.team.models).signatures and average.average_noise.signatures):
+        if not (score.score_kernel(task.problem.team.models).signatures and weighting.average_noise.signatures):
             self.denoise(task, rules, task.base, np.ones(1, np.float32), TILE, 0)
 
     def denoise(
@@ -144,7 +144,7 @@ class Sampling:
         centre[:, :, : mean.shape[2]] = (self.base + mean) / scale
         centre = centre.reshape(num_steps, num_robots, pairs, 2)
         along, across = np.empty((2, num_robots, len(self.kept), DRAWS), np.float32)
-        average.project_noise(self.kept, centre, along, across)
+        weighting.project_noise(self.kept, centre, along, across)
         turns = np.stack([along, -along, across, -across], axis=2)
         samples = turns.reshape(num_robots, -1)[:, : self.rewards.shape[1]]
         return -(samples.sum(axis=0, keepdims=True) if self.task.credit == "team" else samples)
@@ -162,7 +162,7 @@ class Sampling:
         odd, even = _by_counter(np.asarray(weights, np.float32))
         first = np.empty_like(self.base)
         second = np.empty_like(self.base) if with_second else np.empty((0, 0, 0), np.float32)
-        self.threads.over(num_steps, lambda part: average.average_noise(self.kept, odd, even, part, first, second))
+        self.threads.over(num_steps, lambda part: weighting.average_noise(self.kept, odd, even, part, first, second))
         return first, second
 
 

@@ -1,19 +1,27 @@
-"""Sampling engines: what a denoising run is asked for, and what it answers."""
+"""Sampling engines by name: what a denoising run is asked for, and what it answers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.bodies import FootprintArrays
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.team import Team
+from d4orm_env.engine.choice import resolve_engine
 from d4orm_env.engine.types import Engine
+
+if TYPE_CHECKING:
+    from d4orm_planners.engine import cpu_sampling, jax_sampling
+else:
+    cpu_sampling = LazyModule("d4orm_planners.engine.cpu_sampling")
+    jax_sampling = LazyModule("d4orm_planners.engine.jax_sampling")
 
 
 class MovingObstacles(NamedTuple):
@@ -186,3 +194,10 @@ class SamplingEngine(Engine, Protocol):
             ValueError: If there is a watcher and the engine cannot look into its run.
         """
         ...
+
+
+def get_sampling_engine(name: str = "auto", num_threads: int | None = None) -> SamplingEngine:
+    """Return the sampling engine of that name; arguments and errors as :func:`d4orm_env.engine.choice.get_engine`."""
+    if resolve_engine(name) == "jax":
+        return jax_sampling.JaxSamplingEngine()
+    return cpu_sampling.CpuSamplingEngine(num_threads)

@@ -13,8 +13,7 @@ from pathlib import Path
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.evaluation.pool import Pool, run_here, run_jobs
-from d4orm_planners.evaluation.process_pool import ProcessPool, RayPool
+from d4orm_planners.evaluation.pool import ProcessWorker, run_here, run_jobs, run_on_ray
 from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
 from d4orm_planners.evaluation.study import DisturbanceLevels, Policies, Scenarios, Study
@@ -217,8 +216,10 @@ def _run(
         check_sendable(policy.source, f"policy {policy.label!r}")
     for condition in jobs[0].conditions if jobs else ():
         check_sendable(condition.disturbances, f"disturbance {condition.name!r}")
-    pool: Pool = ProcessPool(size, threads=cores if size == 1 else 1) if ray is None else RayPool(ray, workers)
-    return run_jobs(jobs, pool, trial_timeout)
+    if ray is not None:
+        return run_on_ray(jobs, ray, workers, trial_timeout)
+    threads = cores if size == 1 else 1
+    return run_jobs(jobs, [ProcessWorker(threads) for _ in range(size)], trial_timeout)
 
 
 def _complete(

@@ -1,18 +1,36 @@
-"""Handing jobs to processes, of this machine or others, and what happens when one dies or a part takes too long.
+"""Jobs in processes, of this machine or on Ray, and what happens when one dies or a part takes too long.
 
-Trials and recorded episodes are such jobs: their results come one by one, so that what is done is not lost.
+Trials and recorded episodes are such jobs: their results come one by one, so that what is done is not lost. A thread of
+an executor waits for each process, for executors of processes cannot end a single one.
 """
 
 from __future__ import annotations
 
-import time
+import multiprocessing
+import os
+import signal
+import threading
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
-from dataclasses import dataclass, field
-from enum import Enum
-from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from queue import SimpleQueue
+from typing import Any, Protocol, Self, TypeVar
+
+from d4orm_env.core.errors import describe
+from d4orm_planners.d_d4orm.ray_planner import RayConnection
 
 Result = TypeVar("Result")
+
+BEGUN = "begun"
+"""Word of a process that it has begun a job; the results follow it."""
+QUEUED = 2
+"""Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
+ENDING = 0.1
+"""Seconds between looks at whether processes that were stopped have ended."""
 
 
 class Work(Protocol[Result]):
@@ -28,138 +46,98 @@ class Work(Protocol[Result]):
         """Results of the parts that fail with their process, after so many are done, and the job that is left."""
 
 
-class JobEvent(Enum):
-    """Event of a job, apart from its results."""
-
-    BEGUN = "begun"
-    ENDED = "ended"
-
-
-@dataclass(frozen=True)
-class WorkerLost:
+class WorkerLost(Exception):
     """The process that ran a job is gone."""
 
-    reason: str
+
+class JobWorker(Protocol):
+    """A process that does one job at a time, for one thread."""
+
+    def start(self, job: Work[Any]) -> None:
+        """Hand a job over."""
+
+    def receive(self, timeout: float | None) -> Any:
+        """What comes next of the job: :data:`BEGUN`, then each result.
+
+        Raises:
+            TimeoutError: If it does not come within so many seconds.
+            WorkerLost: If the process is gone; the next job begins another one.
+        """
+
+    def stop(self) -> None:
+        """End the process; other threads may."""
 
 
-class WorkerMessage(NamedTuple):
-    """News of a job.
-
-    Attributes:
-        ticket: Of the job.
-        content: The result of a part, an event, or that the job is lost.
-    """
-
-    ticket: int
-    content: Any
-
-
-class Pool(Protocol):
-    """Processes that run jobs."""
-
-    def free(self) -> bool:
-        """True if it takes another job now."""
-
-    def start(self, job: Work[Any]) -> int:
-        """Hand a job over; returns a ticket for it."""
-
-    def wait(self, timeout: float | None) -> list[WorkerMessage]:
-        """Wait for news, at most so long [s]."""
-
-    def stop(self, ticket: int) -> None:
-        """End the process that runs this job; no more news of it come."""
-
-    def close(self) -> None:
-        """End all processes."""
-
-
-@dataclass
-class _RunningJob:
-    """A job under way: how many of its parts are done, and since when the present one runs."""
-
-    job: Work[Any]
-    done: int = 0
-    since: float | None = None
-
-
-@dataclass
-class _Schedule(Generic[Result]):
-    pool: Pool
-    timeout: float | None
-    waiting: deque[Work[Result]]
-    running: dict[int, _RunningJob] = field(default_factory=dict)
-
-    def hand_out(self) -> None:
-        while self.waiting and self.pool.free():
-            job = self.waiting.popleft()
-            self.running[self.pool.start(job)] = _RunningJob(job)
-
-    def collect(self) -> list[Result]:
-        """Wait for news; the results that there are now."""
-        results = []
-        for ticket, content in self.pool.wait(self._patience()):
-            run = self.running[ticket]
-            if isinstance(content, WorkerLost):
-                results += self._give_up(ticket, content.reason)
-            elif content is JobEvent.ENDED:
-                del self.running[ticket]
-            else:
-                run.since = time.monotonic()
-                if content is not JobEvent.BEGUN:
-                    run.done += 1
-                    results.append(content)
-        for ticket in [ticket for ticket, run in self.running.items() if self._left(run) <= 0]:
-            self.pool.stop(ticket)
-            results += self._give_up(ticket, f"TimeoutError: took longer than {self.timeout:g} s")
-        return results
-
-    def _give_up(self, ticket: int, reason: str) -> list[Result]:
-        """The results of a job that has lost its process; what is left of it is put back."""
-        run = self.running.pop(ticket)
-        results, left = run.job.lost(run.done, reason)
-        if left is not None:
-            self.waiting.appendleft(left)
-        return results
-
-    def _left(self, run: _RunningJob) -> float:
-        if self.timeout is None or run.since is None or run.done == run.job.num_parts:
-            return float("inf")
-        return run.since + self.timeout - time.monotonic()
-
-    def _patience(self) -> float | None:
-        shortest = min(map(self._left, self.running.values()), default=float("inf"))
-        return None if shortest == float("inf") else max(shortest, 0.0)
-
-
-def run_jobs(jobs: Iterable[Work[Result]], pool: Pool, timeout: float | None = None) -> Generator[list[Result]]:
+def run_jobs(
+    jobs: Iterable[Work[Result]], workers: Sequence[JobWorker], timeout: float | None = None
+) -> Generator[list[Result]]:
     """Run jobs and yield results as they come, :meth:`Work.lost` where a process dies or a part takes too long.
 
     Args:
         jobs: Jobs to run.
-        pool: Pool that runs them; closed at the end, also when the iteration is broken off.
+        workers: Workers that share them; stopped at the end, also when the iteration is broken off.
         timeout: Seconds that a part may take; ``None`` is no limit.
 
     Raises:
         OSError: If no process can be started.
     """
-    schedule = _Schedule(pool, timeout, deque(jobs))
-    ended: list[Result] = []
+    waiting, found = deque(jobs), SimpleQueue[list[Result] | Exception | None]()
+    over = threading.Event()
+
+    def serve(worker: JobWorker) -> None:
+        try:
+            while not over.is_set() and (job := _next(waiting)) is not None:
+                _finish(job, worker, timeout, waiting, found)
+        except Exception as error:
+            found.put(error)
+        found.put(None)
+
+    threads = ThreadPoolExecutor(len(workers), initializer=_block_interrupts)
+    serving = [threads.submit(serve, worker) for worker in workers]
+    ended = 0
     try:
-        while schedule.waiting or schedule.running or ended:
-            # Nobody waits for work while somebody writes down what is done.
-            schedule.hand_out()
-            if ended:
-                yield ended
-            ended = schedule.collect() if schedule.running else []
+        while ended < len(workers):
+            news = [found.get(), *(found.get() for _ in range(found.qsize()))]
+            for error in (one for one in news if isinstance(one, Exception)):
+                raise error
+            if results := [result for one in news if isinstance(one, list) for result in one]:
+                yield results
+            ended += news.count(None)
     finally:
-        pool.close()
+        over.set()
+        while wait(serving, 0).not_done:
+            for worker in workers:
+                worker.stop()
+            wait(serving, ENDING)
+        for worker in workers:
+            worker.stop()
+        threads.shutdown()
 
 
-def events(job: Work[Any]) -> Iterator[Any]:
-    """Do a job, and yield what a worker says of it: that it has begun, each result, and that it has ended."""
-    yield JobEvent.BEGUN
-    yield from job.run()
-    yield JobEvent.ENDED
+def _next(waiting: deque[Work[Result]]) -> Work[Result] | None:
+    with suppress(IndexError):  # there are no more
+        return waiting.popleft()
+    return None
+
+
+def _finish(
+    job: Work[Result], worker: JobWorker, timeout: float | None, waiting: deque[Work[Result]], found: SimpleQueue[Any]
+) -> None:
+    """Have a worker do a job; what is left of one that has lost its process is put back."""
+    done = 0
+    try:
+        worker.start(job)
+        worker.receive(None)
+        while done < job.num_parts:
+            found.put([worker.receive(timeout)])
+            done += 1
+    except (TimeoutError, WorkerLost) as error:
+        worker.stop()
+        late = isinstance(error, TimeoutError)
+        results, left = job.lost(done, f"TimeoutError: took longer than {timeout:g} s" if late else str(error))
+        found.put(results)
+        if left is not None:
+            waiting.appendleft(left)
 
 
 def run_here(jobs: Iterable[Work[Result]]) -> Generator[list[Result]]:
@@ -167,3 +145,142 @@ def run_here(jobs: Iterable[Work[Result]]) -> Generator[list[Result]]:
     for job in jobs:
         for result in job.run():
             yield [result]
+
+
+def _block_interrupts() -> None:
+    """Keep Ctrl-C from the present thread and from processes that it starts, which would print a traceback."""
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        resource_tracker.ensure_running()  # whose start would let it through again
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+
+class ProcessWorker:
+    """A process of this machine, begun with its first job. It ends when this one dies.
+
+    Args:
+        threads: That its kernels run on.
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        self._threads = threads
+        self._process: BaseProcess | None = None
+        self._proven = False
+
+    def start(self, job: Work[Any]) -> None:
+        if self._process is None or not self._process.is_alive():
+            context = multiprocessing.get_context("spawn")
+            self._pipe, theirs = context.Pipe()
+            process = context.Process(target=_work, args=(theirs, self._threads), daemon=True)
+            process.start()
+            theirs.close()  # or a dead worker would not close the pipe
+            self._process, self._proven = process, False
+        with suppress(OSError):  # it has just died; receive() says so
+            self._pipe.send(job)
+
+    def receive(self, timeout: float | None) -> Any:
+        try:
+            arrived = self._pipe.poll(timeout)
+            content = self._pipe.recv() if arrived else None
+        except (EOFError, OSError):
+            raise self._lost() from None
+        if not arrived:
+            raise TimeoutError
+        self._proven = True
+        return content
+
+    def stop(self) -> None:
+        if (process := self._process) is not None:
+            process.kill()
+            process.join()
+
+    def _lost(self) -> Exception:
+        """What to raise where a process has died: of its first job's beginning all others would die too."""
+        assert self._process is not None
+        self._process.join()
+        code = self._process.exitcode or 0
+        how = f"exit status {code}" if code >= 0 else f"{signal.Signals(-code).name}, perhaps for lack of memory"
+        if self._proven:
+            return WorkerLost(f"ChildProcessError: the worker process died ({how})")
+        return ChildProcessError(
+            f"a worker process died at its start ({how}); a program that evaluates must do so under "
+            '`if __name__ == "__main__":`, because workers import it; or run with one worker'
+        )
+
+
+def _work(pipe: Connection, threads: int) -> None:
+    """Run jobs until the parent is gone; Ctrl-C is for the parent, which decides."""
+    os.environ.update(D4ORM_NUM_THREADS=str(threads), OMP_NUM_THREADS=str(threads))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def follow_parent() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow_parent, daemon=True).start()
+    with suppress(EOFError, BrokenPipeError):  # the parent is gone
+        while True:
+            for content in _contents(pipe.recv()):
+                pipe.send(content)
+
+
+def _contents(job: Work[Any]) -> Iterator[Any]:
+    yield BEGUN
+    yield from job.run()
+
+
+def run_on_ray(
+    jobs: Sequence[Work[Result]], address: str, size: int | None, timeout: float | None = None
+) -> Generator[list[Result]]:
+    """:func:`run_jobs` by tasks on a Ray cluster, one per job and core, never tried again by Ray itself.
+
+    Args:
+        jobs: Jobs to run.
+        address: ``"auto"`` for the cluster that this machine belongs to, an address, or ``"local"`` for a new one on
+            this machine.
+        size: Jobs under way at most; by default twice as many as the cluster has cores.
+        timeout: Seconds that a part may take.
+
+    Raises:
+        ValueError: If the address is none.
+        ImportError: If Ray is not installed.
+        ConnectionError: If there is no cluster.
+    """
+    connection = RayConnection(address, "running on a cluster")
+    try:
+        cores = int(connection.ray.cluster_resources().get("CPU", 1))
+        count = min(size or QUEUED * max(cores, 1), max(len(jobs), 1))
+        yield from run_jobs(jobs, [_RayWorker(connection.ray) for _ in range(count)], timeout)
+    finally:
+        connection.close()
+
+
+class _RayWorker:
+    """A task on a Ray cluster. A generator's results come back one by one, so that they are not lost with it."""
+
+    def __init__(self, ray: Any) -> None:
+        self._ray = ray
+        self._results: Any = None
+        self._task = ray.remote(num_cpus=1, max_retries=0)(_work_remotely)
+
+    def start(self, job: Work[Any]) -> None:
+        self._results = self._task.remote(job)
+
+    def receive(self, timeout: float | None) -> Any:
+        if not self._ray.wait([self._results], timeout=timeout)[0]:
+            raise TimeoutError
+        try:
+            return self._ray.get(next(self._results))
+        except (self._ray.exceptions.RayError, StopIteration) as error:
+            raise WorkerLost(f"ChildProcessError: the worker was lost ({describe(error)})") from error
+
+    def stop(self) -> None:
+        if self._results is not None:
+            self._ray.cancel(self._results, force=True)
+
+
+def _work_remotely(job: Work[Any]) -> Iterator[Any]:
+    """Run a job on one core of some machine."""
+    os.environ.update(D4ORM_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    yield from _contents(job)

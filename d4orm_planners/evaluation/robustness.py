@@ -6,19 +6,12 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from d4orm_env.core.lazy import LazyModule
 from d4orm_env.render.style import own_style
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, draw_noise, quantity_of, write_figure
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.tables import markdown, panels, table, target, write_csv, write_rates
-
-if TYPE_CHECKING:
-    pass
-
-figures: Any = LazyModule("matplotlib.figure")
 
 THRESHOLD = 0.9
 """Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""

@@ -1,23 +1,23 @@
-"""The hybrid planner: an initialiser, a repairer and an improver, each of them a part of its own."""
+"""The hybrid planner and its settings: an initialiser, a repairer and an improver, each of them a part of its own."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.planner import Iteration, Planner
+from d4orm_planners.base.settings import Positive, one_of
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.d4orm_d.deformed_plan import DeformedPlan
 from d4orm_planners.d4orm_d.planner import D4ormD, straight_start
 from d4orm_planners.d4orm_d.planner import State as DecouplingState
-from d4orm_planners.d4orm_d.repairs import Repairs
+from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.hybrid.rerouting import reroute
-from d4orm_planners.hybrid.settings import HybridConfig
 from d4orm_planners.manoeuvres.planning import find_manoeuvres, improve_manoeuvres
 from d4orm_planners.manoeuvres.robots import can_plan
 from d4orm_planners.manoeuvres.team import TeamMotions
@@ -33,6 +33,31 @@ from d4orm_planners.mapf.planner import (
     needs_detour,
     roadmap_iteration,
 )
+from d4orm_planners.sampling.settings import Credit
+
+Start = Annotated[str, one_of(("auto", "team", "straight", "mapf"))]
+Improver = Annotated[str, one_of(("lns", "denoising"))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HybridConfig(D4ormDConfig):
+    """Settings of the hybrid planner: those of D4orm-D, whose repairs it makes, and of what it does besides.
+
+    Attributes:
+        start: First iteration without initial controls: as in D4orm-D, or ``"mapf"``, path finding on a
+            roadmap, whose solution becomes better from iteration to iteration (:mod:`d4orm_planners.mapf`). ``"auto"``
+            finds paths where obstacles lead somebody far round, or repairs have not helped for some time.
+        reroute: Whether robots that fail search for paths among all others' before they are deformed.
+        improver: Improver of a solution: ``"lns"``, large-neighbourhood search of groups of robots for faster
+            paths around all others, or ``"denoising"``, the whole team deformed again.
+    """
+
+    credit: Credit = "alternate"
+    penalty: Positive = 1.0
+    start: Start = "auto"
+    reroute: bool = True
+    improver: Improver = "lns"
+
 
 State = DecouplingState | RoadmapSolution | TeamMotions
 """State between iterations: the repairer's, or the roadmap solution or the team's manoeuvres once there are any."""
@@ -57,7 +82,6 @@ class Hybrid(Planner):
         self.denoiser = D4ormD(config)
 
     def init(self, search: SolveRun) -> State:
-        """See :meth:`Planner.init`."""
         state = self.denoiser.init(search)
         if isinstance(state, Repairs) and (self.config.reroute or self.improves_by_lns):
             with search.watch.paused():

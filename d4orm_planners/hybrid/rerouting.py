@@ -10,12 +10,34 @@ from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.conflict_groups import components
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
-from d4orm_planners.hybrid.settings import REROUTE_RULES
 from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
 from d4orm_planners.mapf.beams import find_paths
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import drives, standing
 
+SWEEPS, BATCH = 6, 16
+"""Times in turn that robots which fail look for a path in an iteration, and robots that do so at the same time, not
+minding each other's paths: so that all cores have work."""
+WIDTH = 32
+"""Paths that a search keeps after each block of steps."""
+CONTACT, CONTACT_GROWTH = 1.25, 2.0
+"""Cost of being near another robot for a block of steps in the first sweep [s]: waiting that long is cheaper; and times
+as much that it costs in the next: what cannot be had for little may be had for more."""
+DEDUP_DISTANCE = 1.0
+"""Least distance between paths that are kept, in radii of the largest robot, or else twice as much in speed [1/s]."""
+EARLIER = (2, 5)
+"""Blocks before a robot's first fault at which its new path begins: from one number to the other, which doubles with
+each sweep."""
+ANGLES, SWING = np.array([30.0, 60.0, 90.0, 135.0, 180.0]), 14.0
+"""By which a robot turns off from the path to its goal, in space up and down as well, and by how much all of them
+change at most from one sweep to the next [degrees]."""
+PACES = (1.0, 0.5, 0.0)
+"""Shares of its speed with which a robot heads for its goal: waiting has no direction."""
+STANDING = 4
+"""Blocks for which, of two robots that meet only each other, the second is taken to stay where it starts while the
+first looks for a path."""
+DETOURS = 32
+"""Random points by which a robot tries to drive if it has found no path."""
 AWAY = np.float32(1e6)
 """Position of a robot that is in nobody's way [m]."""
 SPREAD = 20 / 3
@@ -29,21 +51,21 @@ def reroute(team: WorkingPlan) -> None:
     that cannot get past all of them gets past most (MAPF-LNS2, Li et al., AAAI 2022).
     """
     everybody = np.arange(team.problem.num_robots)
-    for sweep in range(REROUTE_RULES.sweeps):
+    for sweep in range(SWEEPS):
         random = np.random.default_rng(team.search.iteration_seed(Stream.DETOURS, sweep))
         faults, _ = team.faults(everybody)
         failed = np.lexsort((random.random(len(everybody)), -faults))[: np.count_nonzero(faults)]
-        swing = (2 * random.random() - 1) * REROUTE_RULES.swing
-        primitives = MotionPrimitives(tuple(np.array(REROUTE_RULES.angles) + swing), REROUTE_RULES.paces)
-        contact = REROUTE_RULES.contact * REROUTE_RULES.contact_growth**sweep
-        rules = BeamRules(REROUTE_RULES.width, contact, REROUTE_RULES.dedup_distance * team.problem.team.largest_radius)
-        for first in range(0, len(failed), REROUTE_RULES.batch):
+        swing = (2 * random.random() - 1) * SWING
+        primitives = MotionPrimitives(tuple(ANGLES + swing), PACES)
+        contact = CONTACT * CONTACT_GROWTH**sweep
+        rules = BeamRules(WIDTH, contact, DEDUP_DISTANCE * team.problem.team.largest_radius)
+        for first in range(0, len(failed), BATCH):
             if team.search.should_stop():
                 return
-            robots = failed[first : first + REROUTE_RULES.batch]
+            robots = failed[first : first + BATCH]
             # Some may have been helped by others before them.
             faults, begin = team.faults(robots)
-            least, most = REROUTE_RULES.earlier
+            least, most = EARLIER
             earlier = random.integers(least, most << sweep, len(robots), endpoint=True)
             blocks = np.maximum((begin - 1) // BLOCK - earlier, 0)
             robots, blocks = robots[faults > 0], blocks[faults > 0]
@@ -71,7 +93,7 @@ def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitive
     for first, second in (pair, pair[::-1]):
         # Who goes second stays where it is as long as the first may need to get away.
         beside = np.full((1, 1, problem.horizon + 1, problem.dimension), AWAY, np.float32)
-        beside[:, :, : REROUTE_RULES.standing * BLOCK + 1] = problem.start[second, : problem.dimension]
+        beside[:, :, : STANDING * BLOCK + 1] = problem.start[second, : problem.dimension]
         paths = []
         for robot, other in ((first, second), (second, first)):
             others = OtherAgents(pair[None], beside, radius[[[other]]])
@@ -89,7 +111,7 @@ def _try_detours(team: WorkingPlan, robots: IntArray, random: np.random.Generato
     """Let robots ``(R,)`` drive by random points around their straight paths, if that is better."""
     part = team.problem.select(robots.tolist())
     start, goal = (places[:, None] for places in (part.start[:, : part.dimension], part.goal))
-    size = (len(robots), REROUTE_RULES.detours)
+    size = (len(robots), DETOURS)
     spread = 0.5 * np.linalg.norm(goal - start, axis=2, keepdims=True) + SPREAD * part.team.largest_radius
     vias = start + random.random((*size, 1)) * (goal - start)
     vias = vias + spread * portable.standard_normal(random, (*size, part.dimension))

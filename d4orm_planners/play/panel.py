@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
@@ -24,7 +24,9 @@ from d4orm_planners.play.origin_check import LARGEST_UPLOAD
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.sliders import Dials
-from d4orm_planners.play.view import View
+
+if TYPE_CHECKING:
+    from d4orm_planners.play.playground import View
 
 POLICIES = {
     "d4orm-c2f": "D4orm-C2F",

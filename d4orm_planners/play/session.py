@@ -21,8 +21,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render.replay import Replay
-from d4orm_planners.play.command_queue import MOST_WAITING, CommandQueue, queued
-from d4orm_planners.play.edits import Edit, followed
+from d4orm_planners.play.edits import MOST_WAITING, CommandQueue, Edit, followed, queued
 from d4orm_planners.play.scene_frame import Frame, Status
 from d4orm_planners.play.viewport import Drivers, EpisodeOptions, Viewport
 

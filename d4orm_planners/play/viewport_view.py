@@ -15,12 +15,17 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import robot_colors, view_limits
 from d4orm_planners.play import edits
-from d4orm_planners.play.bodies import BodyGroup, PathLines, body_groups, body_places, goal_poses, heading_lines
 from d4orm_planners.play.meshes import (
     NO_LINES,
+    BodyGroup,
+    PathLines,
     Points,
     ball,
+    body_groups,
+    body_places,
     edges,
+    goal_poses,
+    heading_lines,
     in_space,
     linear,
     polylines,

@@ -14,9 +14,7 @@ from d4orm_planners.base.settings import Positive, Share
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingRules
 from d4orm_planners.sampling.loop import NextStep, SamplingPlanner
-from d4orm_planners.sampling.schedule import constant
-from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig
-from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.settings import PAPER, TUNED, ContinuationSettings, SamplingConfig, constant
 from d4orm_planners.sampling.weights import Array, EliteWeights
 
 
@@ -78,17 +76,14 @@ class CEM(SamplingPlanner):
     config: CEMConfig
 
     def noise_scale(self) -> FloatArray:
-        """See :meth:`SamplingPlanner.noise_scale`."""
         return constant(self.config.num_steps, self.config.sigma)
 
     def rules(self) -> SamplingRules:
-        """See :meth:`SamplingPlanner.rules`."""
         config = self.config
         adapt = EliteDeviation(config.sigma, config.sigma_floor) if config.adapt_variance else None
         return SamplingRules(weights=EliteWeights(config.elite_fraction), adapt=adapt)
 
     def iterate(self, search: SolveRun, state: NextStep | None) -> tuple[NextStep, Iteration]:
-        """See :meth:`Planner.iterate`."""
         base, mean = self.initial(search)
         task = self.task(search, base)
         if self.config.carry_variance and state is not None:
@@ -97,6 +92,5 @@ class CEM(SamplingPlanner):
         return following, iteration
 
     def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
-        """See :meth:`SamplingPlanner.initial`."""
         base = self.config.continued(search.current)
         return base, np.zeros_like(base)

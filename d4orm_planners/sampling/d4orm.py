@@ -13,8 +13,7 @@ from d4orm_planners.base.settings import Positive, Samples, Share, ShareOrNone, 
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
-from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, Credit, DenoisingConfig
-from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.settings import PAPER, TUNED, ContinuationSettings, Credit, DenoisingConfig
 
 FALLBACK_PERIOD, FALLBACK_SAMPLE_FACTOR = 8, 4
 """Iterations without a solution after which ``"alternate"`` weights by the team's reward for as many, in turn; and how
@@ -60,7 +59,6 @@ class DeformingPlanner(DenoisingPlanner):
     config: DeformationConfig
 
     def stages(self, search: SolveRun) -> list[tuple[FloatArray, int]]:
-        """See :meth:`SamplingPlanner.stages`."""
         noise_scale, num_samples = self.noise_scale(), self.num_samples(search)
         early = len(noise_scale) - round(self.config.late_steps * len(noise_scale))
         fewer = max(2, round(self.config.late_samples * num_samples))
@@ -70,7 +68,6 @@ class DeformingPlanner(DenoisingPlanner):
         return [(scale, samples) for scale, samples in parts if len(scale)]
 
     def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
-        """See :meth:`SamplingPlanner.initial`."""
         base = self.config.continued(search.current)
         return base, self.start(search, base, search.problem.team)
 
@@ -102,17 +99,14 @@ class D4orm(DeformingPlanner):
     config: D4ormConfig
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
-        """See :meth:`SamplingPlanner.task`."""
         task = super().task(search, base)
         return replace(task, credit="team") if self.in_fallback(search) else task
 
     def num_samples(self, search: SolveRun) -> int:
-        """See :meth:`SamplingPlanner.num_samples`."""
         samples = self.config.num_samples
         return FALLBACK_SAMPLE_FACTOR * samples if self.in_fallback(search) else samples
 
     def stages(self, search: SolveRun) -> list[tuple[FloatArray, int]]:
-        """See :meth:`SamplingPlanner.stages`."""
         if self.in_fallback(search):
             return [(self.noise_scale(), self.num_samples(search))]
         return super().stages(search)

@@ -12,15 +12,13 @@ from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.settings import Count, Steps
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
-from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, DenoisingConfig
-from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.settings import PAPER, TUNED, ContinuationSettings, DenoisingConfig
 
 
 class ControlDenoiser(DenoisingPlanner):
     """A planner that denoises the controls themselves, not a deformation."""
 
     def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
-        """See :meth:`SamplingPlanner.initial`."""
         return np.zeros_like(search.current.controls), self.first_mean(self.noisy_controls(search))
 
     def noisy_controls(self, search: SolveRun) -> FloatArray:

@@ -12,9 +12,14 @@ from d4orm_planners.base.settings import Positive, ShareOrNone
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import SamplingRules
 from d4orm_planners.sampling.loop import SamplingPlanner
-from d4orm_planners.sampling.schedule import constant
-from d4orm_planners.sampling.settings import PAPER, ContinuationSettings, SamplingConfig, SoftmaxSettings
-from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.settings import (
+    PAPER,
+    TUNED,
+    ContinuationSettings,
+    SamplingConfig,
+    SoftmaxSettings,
+    constant,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,14 +49,11 @@ class MPPI(SamplingPlanner):
     config: MPPIConfig
 
     def rules(self) -> SamplingRules:
-        """See :meth:`SamplingPlanner.rules`."""
         return SamplingRules(self.config.weights, importance=self.config.importance)
 
     def noise_scale(self) -> FloatArray:
-        """See :meth:`SamplingPlanner.noise_scale`."""
         return constant(self.config.num_steps, self.config.sigma)
 
     def initial(self, search: SolveRun) -> tuple[FloatArray, FloatArray]:
-        """See :meth:`SamplingPlanner.initial`."""
         base = self.config.continued(search.current)
         return base, np.zeros_like(base)

@@ -1,18 +1,69 @@
-"""Settings of the sampling planners, in the parts of which a planner takes those that mean something to it."""
+"""Settings and noise schedules of the sampling planners, of which each takes those that mean something to it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import PlannerConfig
 from d4orm_planners.base.settings import CheckedSettings, NotNegative, Positive, Samples, Steps, Variance, one_of
-from d4orm_planners.sampling.schedule import annealed
 from d4orm_planners.sampling.weights import SoftmaxWeights
+
+TUNED: Mapping[str, Mapping[str, object]] = MappingProxyType({
+    "mppi": {},
+    "cem": {"sigma": 0.352, "elite_fraction": 0.013, "adapt_variance": True, "sigma_floor": 0.0218, "num_steps": 50,
+            "clip_between_iterations": True},
+    "mbd": {"num_steps": 1000, "temperature": 0.323, "beta_start": 2.22e-4, "beta_end": 4.24e-2},
+    "i-mbd": {"temperature": 0.31, "beta_start": 8.38e-4, "beta_end": 2.7e-2, "num_steps": 50,
+              "clip_between_iterations": True},
+    "d4orm": {"temperature": 0.495, "beta_start": 1.55e-5, "beta_end": 2.03e-2, "num_steps": 50,
+              "clip_between_iterations": False},
+})  # fmt: skip
+"""Differences of the preset ``"tuned"`` from ``"paper"``, by planner.
+
+From ``python -m examples.studies tune_rivals --candidates 27 --seeds 4``: 27 settings each, the preset ``"paper"``
+among them, on four teams of 8 and 16 robots with seeds from 100 on. A third of the settings went on to twice the
+seeds, and a third of these to four times as many. The trials are in
+``examples/studies/data/tuning.parquet``, the table in ``docs/tables/tuning.md``. A method
+whose preset was best keeps it.
+"""
+
+
+REFERENCE_STEPS = 100
+
+
+def alpha_bar(num_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
+    """``(num_steps,)`` cumulative products of ``1 - beta``, for steps ``i = 1`` to ``num_steps``.
+
+    They are a property of the fraction of steps done: 100 variances ``beta`` rise linearly, and for another number of
+    steps the cumulative product is interpolated (paper, section III-B and appendix, "Noise Schedule").
+    """
+    cumulative = np.cumprod(1 - np.linspace(beta_start, beta_end, REFERENCE_STEPS))
+    values = np.concatenate([[1.0], cumulative, cumulative[-1:]])
+    # Not numpy.interp, in which compilers may fuse a multiplication with an addition.
+    whole, rest = np.divmod(np.arange(1, num_steps + 1) * REFERENCE_STEPS, num_steps)
+    return values[whole] + (values[whole + 1] - values[whole]) * (rest / num_steps)
+
+
+def annealed(num_steps: int, beta_start: float, beta_end: float) -> FloatArray:
+    """``(num_steps,)`` standard deviations ``sqrt(1 / alpha_bar - 1)``, from the first denoising step to the last.
+
+    Paper, Algorithm 1, line 3.
+    """
+    return np.sqrt(1 / alpha_bar(num_steps, beta_start, beta_end)[::-1] - 1).astype(np.float32)
+
+
+def constant(num_steps: int, sigma: float) -> FloatArray:
+    """``(num_steps,)`` equal standard deviations, as in MPPI."""
+    return np.full(num_steps, sigma, np.float32)
+
 
 Credit = Annotated[str, one_of(("team", "robot", "alternate", "group"))]
 Cutoff = Annotated[NotNegative, Field(lt=1)]
@@ -44,8 +95,8 @@ class SamplingConfig(PlannerConfig):
         penalty_per_pair: Whether it is taken for every robot that a robot is too close to, as in the authors' published
             code, rather than once, as in the paper. All obstacles together count once.
         short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
-            each other takes, by rewards that make up for the shortness (:mod:`d4orm_planners.sampling.short_paths`).
-            The paper always samples all steps.
+            each other takes, by rewards that make up for the shortness
+            (:func:`d4orm_planners.sampling.loop.on_short_paths`). The paper always samples all steps.
         final_approach: Whether robots that must slow down to dock
             (:attr:`~d4orm_env.core.problem.Problem.goal_speed`) turn straight to their goals after an iteration, and
             brake there, where that makes nothing worse. Samples hardly ever stop anywhere. The paper's robots need not.

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from d4orm_planners.engine.softmax import softmax_weights
+from d4orm_planners.engine.weighting import softmax_weights
 
 Array: TypeAlias = Any
 """An array of NumPy or JAX, whichever ``xp`` is; the two have no common type."""

@@ -13,17 +13,18 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller, ControlSetpoint
-from d4orm_planners.serve.team_messages import (
+from d4orm_planners.serve.wire import (
+    RosSession,
     diagnostics,
     full_state,
     heading_of,
+    messages,
     place_of,
     state_from,
     time_of,
     turned,
     twist,
 )
-from d4orm_planners.serve.wire import RosSession, messages
 
 NODE = "d4orm"
 DRIVING, PLANNING, WAITING, STOPPED = "driving", "planning", "waiting", "stopped"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,15 +19,16 @@ from d4orm_env.dynamics.robot_model import Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.engine.types import Engine
 
+Rows = TypeVar("Rows", FloatArray, Floats)
 Columns: TypeAlias = tuple[FloatArray, ...]
 """Components of the states, velocities, controls or limits of some robots."""
 
 if TYPE_CHECKING:
     from d4orm_env.engine import threads as thread_counts
-    from d4orm_planners.tracking import straight_drives as drive_kernels
+    from d4orm_planners.tracking import tracker as drive_kernels
 else:
     thread_counts = LazyModule("d4orm_env.engine.threads")
-    drive_kernels = LazyModule("d4orm_planners.tracking.straight_drives")
+    drive_kernels = LazyModule("d4orm_planners.tracking.tracker")
 
 CREEPING = np.float32(2.0**-20)
 """Share of its speed limit with which a robot at its goal heads for its goal heading: it turns in place."""
@@ -36,25 +37,13 @@ NEAR_VIA = 10 / 3
 
 
 def drive_to_goal(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
-    """``(K, m)`` controls inside each robot's limits.
-
-    Args:
-        problem: Problem of the robots.
-        states: ``(K, n)``.
-        goals: ``(K, d)`` [m].
-    """
+    """``(K, m)`` controls inside each robot's limits, from states ``(K, n)`` to goals ``(K, d)`` [m]."""
     return track_velocities(problem, states, preferred_velocities(problem, states, goals))
 
 
 def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray) -> FloatArray:
-    """``(K, d)`` velocities straight to the goals, from which every robot can still stop there [m/s].
-
-    At its goal a robot turns to its goal heading.
-
-    Args:
-        problem: Problem of the robots.
-        states: ``(K, n)``.
-        goals: ``(K, d)`` [m].
+    """``(K, d)`` velocities straight to goals ``(K, d)`` [m], from which robots in ``states`` ``(K, n)`` can still stop
+    there [m/s]. At its goal a robot turns to its goal heading.
     """
     h = TimeStep(*problem.arrays.time_step)
     wanted = _by_rows(
@@ -70,17 +59,11 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
 
 
 def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
-    """Return where robots without a plan should head: along their shortest paths, as far off as those are long.
+    """``(K, d)`` where robots without a plan should head from ``places`` ``(K, d)``: along their shortest paths, as far
+    off as those are long [m].
 
-    It is their goals where the world is empty, for robots with new goals, and for those without a path.
-
-    Args:
-        problem: The world, and the first goals, to which the paths lead.
-        places: ``(K, d)`` where the robots are [m].
-        goals: ``(K, d)`` present goals [m].
-
-    Returns:
-        ``(K, d)`` [m].
+    It is their present ``goals`` ``(K, d)`` where the world is empty, for robots with other goals than the problem's,
+    to which the paths lead, and for those without a path.
     """
     if not problem.world.num_obstacles:
         return goals
@@ -91,11 +74,9 @@ def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: Floa
 
 
 def along_paths(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
-    """Vectors along paths ``(N, d)``, as long as they are, and ``(N,)`` robots with one: neither at the goal nor lost.
+    """``(N, d)`` vectors along paths, as long as they are, and ``(N,)`` robots with one: neither at the goal nor lost.
 
-    Args:
-        direction: ``(N, d)`` unit vectors, zero at a goal.
-        length: ``(N,)`` [m], infinite without a path.
+    Of unit vectors ``direction`` ``(N, d)``, zero at a goal, and ``length`` ``(N,)`` [m], infinite without a path.
     """
     direction, length = np.asarray(direction, np.float64), np.asarray(length, np.float64)
     known = (direction != 0).any(axis=1) & np.isfinite(length)
@@ -103,12 +84,8 @@ def along_paths(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolAr
 
 
 def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArray) -> FloatArray:
-    """``(K, m)`` controls inside each robot's limits that bring the team to these velocities as soon as they allow.
-
-    Args:
-        problem: Problem of the robots.
-        states: ``(K, n)``.
-        velocities: ``(K, d)`` wanted [m/s].
+    """``(K, m)`` controls inside each robot's limits that bring the team from ``states`` ``(K, n)`` to ``velocities``
+    ``(K, d)`` [m/s] as soon as they allow.
     """
     h = TimeStep(*problem.arrays.time_step)
 
@@ -121,12 +98,7 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
 
 
 def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:
-    """Return controls ``(K, m)`` that a step executes as they are: inside each robot's own limits, zero on padding.
-
-    Args:
-        problem: Problem of the robots.
-        controls: ``(K, m)`` float32, finite.
-    """
+    """Return finite controls ``(K, m)`` as a step executes them: inside each robot's own limits, zero on padding."""
     limited = np.zeros_like(controls)
     for model, robots in by_model(problem):
         limits = tuple(problem.team.limits[robots].T)
@@ -139,13 +111,7 @@ def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:
 
 
 def present_velocities(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
-    """``(K, d)`` velocities [m/s]; that of a first-order robot is its last command.
-
-    Args:
-        problem: Problem of the robots.
-        states: ``(K, n)``.
-        controls: ``(K, m)`` executed last.
-    """
+    """``(K, d)`` velocities [m/s] in ``states`` ``(K, n)``; of a first-order robot that of its last ``controls``."""
     return _by_rows(
         problem, problem.dimension, (states, controls), lambda model, *rows: model.velocity(*rows, NUMPY_OPS)
     )
@@ -190,18 +156,22 @@ def track_team(
 
 
 def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals: FloatArray) -> BoolArray:
-    """``(K,)`` robots as near to their goals as they need for braking to dock, where they must slow down for that.
-
-    Args:
-        problem: Problem of the robots.
-        states: ``(K, n)``.
-        controls: ``(K, m)`` executed last.
-        goals: ``(K, d)`` [m].
+    """``(K,)`` robots as near to their goals ``(K, d)`` as they need for braking to dock, where they must slow down for
+    that; ``controls`` ``(K, m)`` are those executed last.
     """
     speed = np.linalg.norm(present_velocities(problem, states, controls), axis=1)
     gap = np.linalg.norm(goals - states[:, : problem.dimension], axis=1) - problem.goal_radius
     braking = speed * (speed / (2 * problem.team.max_acceleration) + np.float32(problem.dt))
     return np.isfinite(problem.goal_speed) & (gap <= braking)
+
+
+def short_way_round(problem: Problem, differences: Rows) -> Rows:
+    """Differences ``(K, n)`` of states, of headings the short way round; changed in place."""
+    for model, robots in by_model(problem):
+        if model.heading_index is not None:
+            angle = differences[robots, model.heading_index]
+            differences[robots, model.heading_index] = (angle + np.pi) % (2 * np.pi) - np.pi
+    return differences
 
 
 def by_model(problem: Problem) -> Iterator[tuple[Model, list[int]]]:

@@ -23,7 +23,7 @@ from d4orm_planners import make_planner
 from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
-from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.settings import TUNED
 
 Settings = Mapping[str, dict[str, Any]]
 """Settings of policies by their labels."""

@@ -66,9 +66,8 @@ def test_making_and_judging_a_problem_loads_nothing_heavy() -> None:
 
 
 def test_the_cpu_engine_does_without_jax() -> None:
-    code = (
-        "from d4orm_planners.engine.select import get_sampling_engine\nassert get_sampling_engine('cpu').name == 'cpu'"
-    )
+    made = "from d4orm_planners.engine.sampling_types import get_sampling_engine\nengine = get_sampling_engine('cpu')"
+    code = f"{made}\nassert engine.name == 'cpu'"
     assert loaded_by(code) == set()
 
 

@@ -19,12 +19,11 @@ from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths import lattice, looking, wavefront
 from d4orm_planners.baselines.amswarm.alternation import alternate
 from d4orm_planners.cli.warmup import sample_once
-from d4orm_planners.engine import average as averaging
-from d4orm_planners.engine import path_index, softmax
+from d4orm_planners.engine import path_index, weighting
 from d4orm_planners.engine import score as sampling
-from d4orm_planners.engine.softmax import softmax_weights
+from d4orm_planners.engine.weighting import softmax_weights
 from d4orm_planners.mapf.beam_search import search_kernel
-from d4orm_planners.tracking.straight_drives import straight_kernel
+from d4orm_planners.tracking.tracker import straight_kernel
 
 PORTABILITY = Path(__file__).parents[1] / "portability"
 sys.path.insert(0, str(PORTABILITY))
@@ -62,9 +61,9 @@ def kernels() -> Iterator[tuple[str, Any]]:
     softmax_weights(np.zeros((1, 4)), 1.0, 0.0)
     make_problem("four_obstacles").check_reachable()
     yield "score", sampling.score_kernel(("differential_drive",))
-    yield "average", averaging.average_noise
-    yield "project", averaging.project_noise
-    yield "softmax", softmax._softmax
+    yield "average", weighting.average_noise
+    yield "project", weighting.project_noise
+    yield "softmax", weighting._softmax
     yield "spread", wavefront._spread
     yield "look", looking.look
     yield "settle", lattice.settle_nodes

@@ -10,8 +10,7 @@ from engine_support import ENGINE_NAMES, NUMPY_BITS, SameWeights, engine_noise, 
 from scipy import stats
 
 from d4orm_env.engine import noise
-from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 
 NUM_DRAWS = 1_000_000
 

@@ -26,8 +26,7 @@ from d4orm_planners import IterationRecord, evaluate
 from d4orm_planners.evaluation import tables, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.pool import JobEvent
-from d4orm_planners.evaluation.process_pool import ProcessPool
+from d4orm_planners.evaluation.pool import ProcessWorker, run_jobs
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, solved_after, success_by, success_rate, wilson_interval
@@ -253,12 +252,14 @@ def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="needs signal masks")
 def test_ctrl_c_does_not_end_a_worker_that_starts() -> None:
-    pool = ProcessPool(1)
-    pool.start(SimpleNamespace(run=partial(iter, "ab")))
-    os.kill(pool._workers[0].process.pid or 0, signal.SIGINT)
-    said = [message.content for _ in range(4) for message in pool.wait(None)]
-    pool.close()
-    assert said == [JobEvent.BEGUN, "a", "b", JobEvent.ENDED]
+    class Interrupted(ProcessWorker):
+        def start(self, job: Any) -> None:
+            super().start(job)
+            assert self._process is not None
+            os.kill(self._process.pid or 0, signal.SIGINT)
+
+    said = list(run_jobs([SimpleNamespace(num_parts=2, run=partial(iter, "ab"))], [Interrupted()]))
+    assert [letter for letters in said for letter in letters] == ["a", "b"]
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 

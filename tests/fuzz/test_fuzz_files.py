@@ -22,8 +22,8 @@ from d4orm_env import load_map, load_problem, make_problem, verify
 from d4orm_env.core.problem import Problem
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.cli.node_command import load_node
-from d4orm_planners.d_d4orm.messages import Message, decode, encode
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.d_d4orm.transport import Message, decode, encode
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.evaluation.store import Trial, TrialStore
 
 PROBLEM = hop_problem(2, horizon=4)

@@ -18,8 +18,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.amswarm.alternation import Neighbourhood, alternate
 from d4orm_planners.baselines.amswarm.bernstein import Guess, first_coefficients, sample_basis
-from d4orm_planners.baselines.amswarm.planner import AMSwarmConfig
-from d4orm_planners.baselines.amswarm.swarm import make_method
+from d4orm_planners.baselines.amswarm.planner import AMSwarmConfig, make_method
 
 # The polynomials.
 

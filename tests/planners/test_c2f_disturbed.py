@@ -20,15 +20,12 @@ from d4orm_env.disturbances import Bias, Delay, Dropout, LimitMismatch, Push, St
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
-from d4orm_planners.d4orm_c2f.actuator_gain_estimator import Weakness
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
+from d4orm_planners.d4orm_c2f.deviation import StateFilter
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
-from d4orm_planners.d4orm_c2f.latency_estimator import MOST, Lateness
-from d4orm_planners.d4orm_c2f.packet_loss_estimator import Losses
+from d4orm_planners.d4orm_c2f.estimators import AFTER, BRAKING_AFTER, LATEST, Lateness, Losses, Standing, Weakness
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
-from d4orm_planners.d4orm_c2f.stall_estimator import AFTER, BRAKING_AFTER, Standing
-from d4orm_planners.d4orm_c2f.state_filter import StateFilter
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import track_velocities
 
 ALL = np.ones(3, bool)
@@ -46,7 +43,7 @@ def joint(problem: Any, states: Any, **parts: Any) -> JointState:
     return JointState(**{"states": np.asarray(states, np.float32), "goals": problem.goal, **given, **parts})
 
 
-@given(late=st.integers(0, MOST), noise=st.floats(0, 0.3), seed=st.integers(0, 1000))
+@given(late=st.integers(0, LATEST), noise=st.floats(0, 0.3), seed=st.integers(0, 1000))
 @settings(max_examples=25, deadline=None)
 def test_how_late_commands_are_is_found_out(late: int, noise: float, seed: int) -> None:
     random, lateness = np.random.default_rng(seed), Lateness(Team(("holonomic2d",) * 3), None)

@@ -16,18 +16,22 @@ from d4orm_planners.base.candidate import failed_robots
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.d4orm_c2f.coarse_plan import (
+    LEAST,
+    STUCK_AFTER,
+    STUCK_WITHIN,
     CoarsePlan,
+    StagnationMonitor,
     coarse_problem,
     interpolate,
+    keep_time,
     nearest_indices,
     rest_of,
     subgoal_indices,
+    visible_subgoals,
 )
-from d4orm_planners.d4orm_c2f.following import STUCK_AFTER, STUCK_WITHIN, StagnationMonitor, keep_time
-from d4orm_planners.d4orm_c2f.line_of_sight import LEAST, visible_subgoals
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 
 
 @pytest.mark.parametrize(

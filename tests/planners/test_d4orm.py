@@ -12,8 +12,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.engine.sampling_types import SamplingTask
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
 
 BUDGET = 25
 """Five times the iterations that any of some twenty seeds takes: other rounding makes another plan."""

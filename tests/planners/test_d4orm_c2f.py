@@ -28,7 +28,7 @@ from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [

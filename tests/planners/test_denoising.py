@@ -15,8 +15,7 @@ from d4orm_env import make_problem
 from d4orm_env.render.denoising_frames import Denoising, save_denoising
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import IterationRecord, Plan
-from d4orm_planners.engine.sampling_types import WATCHED_SAMPLES, DenoisingStep, SamplingTask
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import WATCHED_SAMPLES, DenoisingStep, SamplingTask, get_sampling_engine
 from d4orm_planners.sampling.denoising import DenoisingFilm
 
 QUICK = {"num_samples": 64, "num_steps": 8, "engine": "cpu"}

@@ -30,14 +30,13 @@ from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm import inbox as inbox_module
-from d4orm_planners.d_d4orm import messages, node
-from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox, Stopped
-from d4orm_planners.d_d4orm.messages import KINDS, MAGIC, Message, MessageError, decode, encode
+from d4orm_planners.d_d4orm import node
+from d4orm_planners.d_d4orm import transport as transport_module
+from d4orm_planners.d_d4orm.inbox import Evaluator, Inbox, Stopped, choose, diverse, k_means, merge, shares, top_k
 from d4orm_planners.d_d4orm.node import KINDS as KINDS_OF_EVENTS
 from d4orm_planners.d_d4orm.node import Event, Node, PlanningTask, node_seed
-from d4orm_planners.d_d4orm.selection import choose, diverse, k_means, merge, shares, top_k
-from d4orm_planners.d_d4orm.transport import WAITING, LocalNetwork
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.d_d4orm.transport import KINDS, MAGIC, WAITING, LocalNetwork, Message, MessageError, decode, encode
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.sampling.d4orm import D4orm, D4ormConfig
 
 PROBLEM = hop_problem(2, horizon=4)
@@ -205,7 +204,7 @@ def test_every_fault_has_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
         spoilt = controls.copy()
         spoilt[2, 1, 0] = value
         assert fault_of(encode(message(controls=spoilt), PROBLEM)) == kind
-    monkeypatch.setattr(messages, "MAX_BYTES", len(data) - 1)
+    monkeypatch.setattr(transport_module, "MAX_BYTES", len(data) - 1)
     assert fault_of(data) == "too_large"
     with pytest.raises(MessageError, match=f"takes {len(data)} bytes; at most {len(data) - 1}"):
         encode(message(), PROBLEM)
@@ -459,7 +458,7 @@ def test_nodes_search_by_themselves_and_then_go_on_from_a_common_base(clip: bool
     planner = distributed(nodes=3, selection="max", clip_between_iterations=clip, final_approach=False)
     search = SolveRun(planner, walled_in_problem(), 0, None)
     search.advance()
-    nodes = search.state.crew.alive
+    nodes = search.state.alive
     made = [one.candidate for one in nodes]
     best = max(made, key=lambda candidate: candidate.trajectory.rewards.mean())
     assert len({candidate.controls.tobytes() for candidate in made}) == 3
@@ -685,7 +684,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
     search = SolveRun(planner, walled_in_problem(), 5, None)
     try:
         search.advance()
-        fast, silent = search.state.crew.alive
+        fast, silent = search.state.alive
         # Waiting every time, the other node would not get so far in that time.
         while fast.search.iteration <= enough and search.watch.elapsed < enough * timeout:
             search.advance()
@@ -749,6 +748,6 @@ def test_the_paper_preset_is_algorithm_5_with_a_node_per_robot() -> None:
     assert inner.clip_between_iterations is False
     search = SolveRun(make_planner("d-d4orm", preset="paper", engine="cpu", num_steps=2), hop_problem(3), 0, None)
     search.advance()
-    assert [one.search.planner.config.num_samples for one in search.state.crew.alive] == [683, 683, 682]
+    assert [one.search.planner.config.num_samples for one in search.state.alive] == [683, 683, 682]
     with pytest.raises(ValueError, match="num_samples is 5 for 3 nodes together"):
         make_planner("d-d4orm", engine="cpu", nodes=None, num_samples=5).solve(hop_problem(3))

@@ -17,7 +17,7 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Episode, OpenLoop, make_policy, run_episode
 from d4orm_planners.base.policy import StatePolicy
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 
 
 class Script(StatePolicy):

@@ -8,8 +8,7 @@ import pytest
 from d4orm_env import Problem, make_problem, navigation_v0, rollout, verify
 from d4orm_env.footprints import Box, Capsule, Ellipsoid
 from d4orm_planners import make_planner, make_policy, run_episode
-from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, moving_robots
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine, moving_robots
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 

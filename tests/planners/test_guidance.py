@@ -15,7 +15,7 @@ from planner_support import walled_in_problem
 from d4orm_env import Problem, Team, World, make_problem, verify
 from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.mapf.lacam import TeamMoves, find_moves
 from d4orm_planners.mapf.lns import search_neighbourhoods
 from d4orm_planners.mapf.occupancy import Occupancy

@@ -19,7 +19,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.collocation import CollocatedMotion, TeamProgram
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 
 MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle", "car")
 

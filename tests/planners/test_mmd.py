@@ -34,6 +34,7 @@ from d4orm_planners.baselines.mmd.prior import (
     CLIP,
     LEVELS,
     SIZE,
+    Denoiser,
     condition,
     kept_signal,
     level_features,
@@ -42,7 +43,6 @@ from d4orm_planners.baselines.mmd.prior import (
     predict,
 )
 from d4orm_planners.baselines.mmd.prior_training import draw_examples, modes_of
-from d4orm_planners.baselines.mmd.reverse_process import Denoiser
 from d4orm_planners.baselines.mmd.tracking import drive_motions
 
 # The network.

@@ -29,9 +29,9 @@ from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.planner import Callback, Iteration
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm import messages as message_module
-from d4orm_planners.d_d4orm.messages import KINDS, Message, encode
+from d4orm_planners.d_d4orm import transport as message_module
 from d4orm_planners.d_d4orm.node import node_seed
+from d4orm_planners.d_d4orm.transport import KINDS, Message, encode
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 from d4orm_planners.sampling.d4orm import D4orm
 

@@ -14,8 +14,7 @@ from d4orm_env import make_problem
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_planners import reference as plain
-from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 RULES = SamplingRules(SoftmaxWeights(oracle.TEMPERATURE))

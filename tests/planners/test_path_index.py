@@ -15,8 +15,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.threads import Threads
 from d4orm_planners.engine import path_index
-from d4orm_planners.engine.path_checks import check_alone
-from d4orm_planners.engine.path_index import PathIndex
+from d4orm_planners.engine.path_index import PathIndex, check_alone
 
 RADIUS = np.array([0.125, 0.25, 0.5, 0.0, 0.25])
 

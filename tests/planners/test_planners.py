@@ -29,11 +29,9 @@ from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS, describe_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
-from d4orm_planners.engine.sampling_types import SamplingTask
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
 from d4orm_planners.sampling.loop import SamplingPlanner, standard_normal
-from d4orm_planners.sampling.schedule import alpha_bar, annealed
-from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.settings import TUNED, alpha_bar, annealed
 from d4orm_planners.tracking.steering import straight_drives
 
 ALL = pytest.mark.parametrize("name", list_planners())

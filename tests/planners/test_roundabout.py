@@ -8,7 +8,7 @@ import pytest
 from d4orm_env import Problem, Team, make_problem, rollout, verify
 from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.mapf.roundabout import drive_roundabout
 
 # Cars with trailers do not fit on the circle, and robots whose jerk is limited swing out of it.

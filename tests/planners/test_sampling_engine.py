@@ -20,10 +20,15 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.scenarios import list_scenarios, make_problem
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.jax_sampling import JaxSamplingEngine
-from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingResult, SamplingRules, SamplingTask
+from d4orm_planners.engine.sampling_types import (
+    MovingObstacles,
+    SamplingResult,
+    SamplingRules,
+    SamplingTask,
+    get_sampling_engine,
+)
 from d4orm_planners.engine.score import score_kernel
-from d4orm_planners.engine.select import get_sampling_engine
-from d4orm_planners.sampling.schedule import annealed
+from d4orm_planners.sampling.settings import annealed
 from d4orm_planners.sampling.weights import EliteWeights, SoftmaxWeights
 
 CPU, JAX = CpuSamplingEngine(), JaxSamplingEngine()

@@ -26,8 +26,11 @@ typesys = pytest.importorskip("rosbags.typesys")
 
 from d4orm_planners.serve import messages  # noqa: E402
 from d4orm_planners.serve.fleet_server import FleetRobot, FleetServer  # noqa: E402
-from d4orm_planners.serve.team_messages import state_from, twist  # noqa: E402
-from d4orm_planners.serve.wire import RosSession  # noqa: E402
+from d4orm_planners.serve.wire import (  # noqa: E402
+    RosSession,
+    state_from,
+    twist,
+)
 
 STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 DT, DEADLINE = 0.05, 0.3

@@ -17,7 +17,7 @@ from d4orm_env.disturbances import Dropout, LimitMismatch, Push, Stall, StateNoi
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import SolveRun, make_planner, make_policy, run_episode
 from d4orm_planners.base.names import PLANNERS, POLICIES
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 TESTS = Path(__file__).parent

@@ -12,7 +12,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners import SolveRun, make_planner
 from d4orm_planners.base.names import PLANNERS
 from d4orm_planners.engine.sampling_types import SamplingTask
-from d4orm_planners.sampling.short_paths import drive_times, on_short_paths
+from d4orm_planners.sampling.loop import drive_times, on_short_paths
 
 CLOSE = {
     "circle 0.6": ("circle", {"num_robots": 2, "diameter": 0.6}),

@@ -9,8 +9,7 @@ from d4orm_env import Problem, Team, make_problem
 from d4orm_env.footprints import Box, Capsule, Train
 
 pytest.importorskip("trimesh")
-from d4orm_planners.play.bodies import body_groups, body_places, goal_poses, heading_lines
-from d4orm_planners.play.meshes import in_space
+from d4orm_planners.play.meshes import body_groups, body_places, goal_poses, heading_lines, in_space
 
 TRAIN = Train(Box(0.5, 0.25, 0.1), [Box(0.4, 0.2)])
 TEAM = Team(("car_with_1_trailer", "unicycle", "unicycle"), footprint=[TRAIN, Capsule(0.4, 0.1), Capsule(0.4, 0.1)])

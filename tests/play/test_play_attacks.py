@@ -37,7 +37,7 @@ from websockets.sync.client import ClientConnection
 from d4orm_env import make_problem
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits, panel
-from d4orm_planners.play.command_queue import MOST_WAITING
+from d4orm_planners.play.edits import MOST_WAITING
 from d4orm_planners.play.origin_check import LARGEST_UPLOAD
 from d4orm_planners.play.playground import Playground
 from d4orm_planners.play.proxy import AuthenticatingProxy

@@ -24,7 +24,7 @@ from d4orm_env import make_problem
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners import Plan
 from d4orm_planners.evaluation.tables import read_parquet
-from d4orm_planners.sampling.tuned import TUNED
+from d4orm_planners.sampling.settings import TUNED
 
 pytestmark = pytest.mark.studies
 

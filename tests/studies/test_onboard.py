@@ -25,7 +25,7 @@ from test_examples import PNG, ROOT, run, table
 from d4orm_env import Problem, Team, World
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import evaluate_controls
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 pytestmark = pytest.mark.studies

@@ -140,20 +140,8 @@ def _project(
     guess: Guess,
     targets: Targets,
 ) -> float:
-    """The nearest places, velocities and accelerations that the constraints allow, summed over constraints.
-
-    Args:
-        method: :class:`Method`.
-        bodies: :class:`Neighbourhood`.
-        robot: Its number among them.
-        limits: ``(2,)``.
-        minded: ``(K + B,)`` bool.
-        here: ``(d,)`` where the robot is now.
-        guess: :class:`Guess`.
-        targets: :class:`Targets`, output.
-
-    Returns:
-        The largest violation.
+    """The nearest places, velocities and accelerations that limits and the bodies ``minded`` ``(K + B,)`` allow, summed
+    into ``targets``; the largest violation. The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`.
     """
     robots, (steps, d), radius = len(bodies.radius), guess.place.shape, bodies.radius[robot]
     worst = _stay_within(bodies.bounds, radius, limits, guess, targets)

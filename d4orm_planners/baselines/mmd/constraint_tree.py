@@ -16,7 +16,7 @@ from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths.spaces import Space
 from d4orm_planners.baselines.mmd.guiding import PathSurroundings
 from d4orm_planners.baselines.mmd.path_frame import PathFrame
-from d4orm_planners.baselines.mmd.reverse_process import Batch, Denoiser
+from d4orm_planners.baselines.mmd.prior import Batch, Denoiser
 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig

@@ -16,7 +16,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.baselines.mmd.constraint_tree import Planning, Tree
 from d4orm_planners.baselines.mmd.guiding import guide
 from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
-from d4orm_planners.baselines.mmd.reverse_process import Denoiser
+from d4orm_planners.baselines.mmd.prior import Denoiser
 from d4orm_planners.baselines.mmd.tracking import motion_kernel
 from d4orm_planners.mapf.planner import NoPaths
 

@@ -27,8 +27,7 @@ from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.envs.joint_env import ENV_ID, JointNavigationEnv
 from d4orm_planners.base.machine import commit, versions
-from d4orm_planners.evaluation.pool import run_here, run_jobs
-from d4orm_planners.evaluation.process_pool import ProcessPool
+from d4orm_planners.evaluation.pool import ProcessWorker, run_here, run_jobs
 from d4orm_planners.rl.dataset.demonstrations import Demonstrations, RecordedEpisode
 from d4orm_planners.rl.dataset.minari_files import DatasetFiles
 
@@ -147,7 +146,8 @@ def record_all(
     if size > 1:
         check_sendable(demonstrations, f"policy {demonstrations.policy_name!r}")
     failures: dict[int, str] = {}
-    with closing(run_jobs(tasks, ProcessPool(size)) if size > 1 else run_here(tasks)) as outcomes:
+    workers_of_one_thread = [ProcessWorker() for _ in range(size)]
+    with closing(run_jobs(tasks, workers_of_one_thread) if size > 1 else run_here(tasks)) as outcomes:
         for seed, failure in chain.from_iterable(outcomes):
             if failure:
                 failures[seed] = failure

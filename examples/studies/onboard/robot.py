@@ -21,7 +21,7 @@ from examples.studies.onboard.thinking import Agenda, Log, Round
 
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.d_d4orm.transport import Transport
-from d4orm_planners.engine.select import get_sampling_engine
+from d4orm_planners.engine.sampling_types import get_sampling_engine
 
 LOOK = 0.5
 """Longest time between two looks at the clock [s]."""

@@ -10,7 +10,7 @@ from typing import Any
 from examples.studies import AS_IN_THE_PAPER
 from examples.studies.paper.figure import Figure, Section
 
-from d4orm_planners.d_d4orm.selection import SELECTIONS
+from d4orm_planners.d_d4orm.inbox import SELECTIONS
 
 PAPER: Mapping[str, object] = {"preset": "paper"}
 C2F: dict[str, object] = {"policy": "d4orm-c2f", "refine": "sync"}

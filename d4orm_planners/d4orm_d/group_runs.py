@@ -1,4 +1,6 @@
-"""One run over all failed robots, weighted by groups, as in the code that the paper's authors published."""
+"""Robots that conflict are replanned together: group by group (paper, section V, Algorithm 3), or all that fail in one
+run, weighted by groups, as in the code that the paper's authors published.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +10,48 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
-from d4orm_planners.base.conflict_groups import Grouping, Groups
+from d4orm_planners.base.conflict_groups import Grouping, Groups, conflicts, failure_groups, regrouped
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d4orm_d.groups import grouping_of
+from d4orm_planners.d4orm_d.repairs import DeformedPlan
 from d4orm_planners.engine.sampling_types import SamplingTask
 from d4orm_planners.sampling.weights import GroupWeights
 
 if TYPE_CHECKING:
     from d4orm_planners.d4orm_d.planner import D4ormD
+
+
+@dataclass(frozen=True, eq=False)
+class GroupRuns:
+    """The state of the search by groups.
+
+    Attributes:
+        grouping: Groups of the last iteration by groups, or ``None`` before the first.
+    """
+
+    grouping: Grouping | None = None
+
+    def replan(self, team: DeformedPlan) -> GroupRuns:
+        """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
+        planner, search, problem = team.planner, team.search, team.problem
+        grouping = grouping_of(search, self.grouping)
+        team.controls = planner.config.continued(search.current).copy()
+        for group in failure_groups(search.current.unsolved, grouping.groups):
+            if search.should_stop():
+                break
+            robots = list(group)
+            _, controls, trajectory = team.deformed(
+                robots, problem.horizon, planner.config.num_samples, planner.noise_scale(), credit="team"
+            )
+            team.move(robots, controls, trajectory.states, trajectory.arrived[-1])
+        return GroupRuns(grouping)
+
+
+def grouping_of(search: SolveRun, previous: Grouping | None) -> Grouping:
+    """Return the groups of the present candidate, at the steps that are checked."""
+    problem, positions = search.problem, search.current.trajectory.positions
+    graph = conflicts(positions[:: search.check_interval], problem.team.radius, problem.margin)
+    return regrouped(graph, previous)
 
 
 @dataclass(frozen=True, eq=False)
