@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence, Set
 from functools import partial
 from importlib.util import find_spec
-from typing import TypeAlias, get_args
+from typing import Any, TypeAlias, get_args
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from d4orm_planners.benchmark.env_steps import (
     measure_worlds,
 )
 from d4orm_planners.benchmark.probes import (
+    BOXES,
     Where,
     measure_big_loops,
     measure_big_team,
@@ -107,10 +108,15 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
 
 
 def _big_team_parts(settings: BenchmarkSettings) -> Iterator[Part]:
-    for scenario, sizes in (("random", settings.big_random), ("warehouse", settings.big_warehouse)):
+    teams: tuple[tuple[str, tuple[int, ...], dict[str, Any]], ...] = (
+        ("random", settings.big_random, {}),
+        ("warehouse", settings.big_warehouse, {}),
+        ("warehouse", settings.big_boxes, BOXES),
+    )
+    for scenario, sizes, robots in teams:
         for size in sizes:
-            plan = partial(measure_big_team, scenario, size, settings.big_seeds, settings.big_time_limit)
-            yield "big teams", f"first plans of {size} robots, {scenario}", plan
+            plan = partial(measure_big_team, scenario, size, settings.big_seeds, settings.big_time_limit, **robots)
+            yield "big teams", f"first plans of {size} {'boxes' if robots else 'robots'}, {scenario}", plan
     for size in settings.improved_robots:
         work = partial(measure_improvement, "random", size, settings.big_seeds, settings.improving_limit)
         yield "improvement", f"improving plans of {size} robots", work

@@ -9,13 +9,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 
 from d4orm_env import navigation_v0, verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
+from d4orm_env.footprints import Box
 from d4orm_env.geometry.world_index import build_index
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
@@ -176,16 +178,18 @@ COMPILING = 12
 """Robots of a problem that is solved first, so that compiling does not count."""
 
 
-def measure_big_team(scenario: str, num_robots: int, seeds: int, time_limit: float) -> Measurement:
-    """Seconds of the recommended planner to its first plan, over so many seeds."""
-    planner = make_planner()
-    planner.solve(make_problem(scenario, num_robots=COMPILING, seed=seeds), seed=0, time_limit=time_limit)
-    plans = [
-        planner.solve(make_problem(scenario, num_robots=num_robots, seed=seed), seed=seed, time_limit=time_limit)
-        for seed in range(seeds)
-    ]
+BOXES: dict[str, Any] = {"model": "differential_drive", "footprint": Box(0.36, 0.24), "goal_heading": 0.0}
+"""Robots whose manoeuvres are planned: rectangles with goal headings."""
+
+
+def measure_big_team(scenario: str, num_robots: int, seeds: int, time_limit: float, **robots: Any) -> Measurement:
+    """Seconds of the recommended planner to its first plan, over so many seeds, for such robots."""
+    planner, make = make_planner(), partial(make_problem, scenario, **robots)
+    planner.solve(make(num_robots=COMPILING, seed=seeds), seed=0, time_limit=time_limit)
+    problems = [make(num_robots=num_robots, seed=seed) for seed in range(seeds)]
+    plans = [planner.solve(problem, seed=seed, time_limit=time_limit) for seed, problem in enumerate(problems)]
     return {
-        "scenario": scenario,
+        "scenario": f"{scenario}, boxes" if robots else scenario,
         "num_robots": num_robots,
         "seeds": seeds,
         "solved": sum(plan.solved for plan in plans),

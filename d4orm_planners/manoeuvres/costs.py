@@ -51,7 +51,7 @@ def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal,
     layers = SECTORS if kind.model.heading_index is not None else 1
     modes, cells = primitives_of(kind)[2], np.clip(TEAM_CELLS / team_size, LEAST_CELLS, MOST_CELLS)
     size = np.prod(area.high - area.low) * len(modes) * layers
-    cell = max(area.cell, round(float(np.sqrt(size / cells)), 3))
+    cell = max(area.cell, float(np.sqrt(size / cells)))
     lattice = area.lattice(cell, 0.0 if np.isnan(goal.heading) else goal.heading, layers, len(modes))
     back, pace = primitives_of(replace(kind, cell=cell))[1], 1 / (kind.limits[SPEED] * kind.dt)
     steps, far = _spread(body, back, lattice, goal, start, modes.index(kind.start), pace)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 from numba import types
@@ -44,6 +45,10 @@ LATER = 30
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
 """Distances beyond radii and margin that a path is planned to keep, where starts and goals allow it, and keeps; and
 what starts and goals themselves must be apart less, for rounding."""
+
+
+Drive: TypeAlias = tuple[FloatArray, Floats, int]
+"""Controls ``(T, m)``, places ``(T + 1, 3)`` and step of arrival of a robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,20 +211,28 @@ class Replanning:
         haste, others = 1 - random.random() * LEISURE, occupancy.around(self.separation(robot, KEEP))
         if minded is not None:
             others = others._replace(need=np.where(minded, others.need, 0.0))
+        close, usual = None, min(TOUCH * self.size, float(self.own_room[robot] - self.bodies.reach[robot]))
         for cruise, cut in SPEED_PROFILES:
-            drive = self.find_and_drive(others, robot, latest, cruise * haste, cut)
-            if drive is not None:
-                driven.controls[:, robot], places, driven.arrivals[robot] = drive
-                occupancy.put(robot, places)
-                if self.dwell is not None:
-                    driven.places[self.leaves(drive[2]) :, robot] = FAR
-                return True
-        return False
+            for drive in self.drives(others, robot, latest, cruise * haste, cut):
+                room = self.room_at_walls(others, robot, drive, latest)
+                if room > usual:
+                    self.take(driven, occupancy, robot, drive)
+                    return True
+                if close is None and room > self.problem.rounding:
+                    close = drive
+        if close is not None:
+            self.take(driven, occupancy, robot, close)
+        return close is not None
 
-    def find_and_drive(
-        self, others: Others, robot: int, latest: int, cruise: float, cut: float
-    ) -> tuple[FloatArray, Floats, int] | None:
-        """Controls, places and arrival of a robot in one of the :data:`SPEED_PROFILES`, if that succeeds."""
+    def take(self, driven: TeamRollout, occupancy: Occupancy, robot: int, drive: Drive) -> None:
+        """Let a robot drive so in ``driven``."""
+        driven.controls[:, robot], places, driven.arrivals[robot] = drive
+        occupancy.put(robot, places)
+        if self.dwell is not None:
+            driven.places[self.leaves(drive[2]) :, robot] = FAR
+
+    def drives(self, others: Others, robot: int, latest: int, cruise: float, cut: float) -> Iterator[Drive]:
+        """Rollouts of a robot along its path, if it has one, in one of the :data:`SPEED_PROFILES`."""
         roadmap, bodies, steps = self.roadmap, self.bodies, len(others.positions) - 1
         dwell = -1 if self.dwell is None else self.dwell
         # Looked for among the sooner ones at first, because that is where it mostly is.
@@ -229,7 +242,7 @@ class Replanning:
             if len(path):
                 break
         else:
-            return None
+            return
         reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
         left = straighten(roadmap, bodies, self.space, others, robot, reach, path)
         nodes, departs, arrives = path[:left].T
@@ -237,24 +250,21 @@ class Replanning:
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
         # As soon as it can, or else by the clock of its path.
         for backs_up, hurrying in product(self.turns[robot], (True, False)):
-            drive = drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
-            if self.fits(others, robot, drive, latest):
-                return drive
-        return None
+            yield drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
 
-    def fits(self, others: Others, robot: int, drive: tuple[FloatArray, Floats, int], latest: int) -> bool:
-        """Check whether a robot's rollout ends in time, clear of all others and of obstacles."""
+    def room_at_walls(self, others: Others, robot: int, drive: Drive, latest: int) -> float:
+        """Room that a robot's rollout leaves at obstacles beyond its margin [m]; -inf if late or too near to others."""
         _, places, arrival = drive
         if arrival > latest:
-            return False
+            return -np.inf
         touch, met = np.minimum(self.separation(robot, TOUCH), others.need), np.empty(len(others.need), bool)
         find_meetings(others._replace(need=touch), places[: self.leaves(arrival)], met)
         if met.any():
-            return False
+            return -np.inf
         if self.space is None:
-            return True
+            return np.inf
         room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
-        return bool(room.min() > min(self.bodies.reach[robot] + TOUCH * self.size, self.own_room[robot]))
+        return float(room.min() - self.bodies.reach[robot])
 
 
 def is_compiled(problem: Problem) -> bool:

@@ -311,6 +311,17 @@ def test_paths_one_by_one_displace_those_in_the_way() -> None:
     assert verify(problem, driven.until(problem.horizon)).ok
 
 
+@pytest.mark.parametrize(("room", "planned"), [(2.0, True), (0.5, False), (-np.inf, False)])
+def test_robots_may_pass_walls_closer_than_usual_if_that_is_all_they_find(
+    room: float, planned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = corridor_with_bay(right=1.0)
+    replanning = Replanning(problem, lay_roadmap(problem))
+    monkeypatch.setattr(replanning, "room_at_walls", lambda *_: room * problem.rounding)
+    driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+    assert (driven is not None) == planned
+
+
 # What users get.
 
 
