@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import split_state
+from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner_registry import make_policy
 
 
@@ -23,7 +23,8 @@ def episode_of(policy: str, problem: Problem, seed: int) -> FloatArray:
         ValueError: If there is no such policy, or it cannot drive there.
         ImportError: If it needs a library that is not installed.
     """
-    env, driver = navigation_v0.parallel_env(problem=problem), make_policy(policy)
+    driver = make_policy(policy)
+    env = open_env(problem, policy=driver)
     observations, _ = env.reset(seed=seed)
     driver.reset(env, seed=seed)
     controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)

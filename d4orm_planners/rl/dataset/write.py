@@ -21,7 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.errors import describe
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import claim_folder
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
@@ -59,21 +59,7 @@ class Recording:
             OSError: If it cannot be made.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        path, identity = self.folder / IDENTITY, demonstrations.identity
-        if not path.exists():
-            with replaced_when_done(path) as temporary:
-                temporary.write_text(json.dumps(identity, indent=1) + "\n", encoding="utf-8")
-            return
-        try:
-            before = dict(json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, TypeError, RecursionError):
-            raise ValueError(f"{path} cannot be read; remove the folder, or choose another") from None
-        for name, value in identity.items():
-            if before.get(name) != value:
-                raise ValueError(
-                    f"folder {self.folder.parent} holds a dataset with {name} {before.get(name)!r}, not {value!r}; go "
-                    "on with the same, or choose another folder"
-                )
+        claim_folder(self.folder / IDENTITY, demonstrations.identity, "a dataset")
 
     def seeds(self) -> set[int]:
         """Seeds of the episodes that are there."""
