@@ -9,7 +9,7 @@ import copy
 import importlib.metadata
 import json
 import os
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import chain
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 IDENTITY = "demonstrations.json"
-
+_WHOLE, _DROPPED = "npz", "dropped"
+"""Kinds of files of episodes: recorded, and left out."""
 
 minari: Any = LazyModule("minari", "a dataset", "dataset")
 minari_dataset: Any = LazyModule("minari.dataset.minari_dataset", "a dataset", "dataset")
@@ -61,13 +62,9 @@ class Recording:
         self.folder.mkdir(parents=True, exist_ok=True)
         claim_folder(self.folder / IDENTITY, demonstrations.identity, "a dataset")
 
-    def seeds(self) -> set[int]:
-        """Seeds of the episodes that are there."""
-        return self._numbers("npz")
-
-    def dropped(self) -> set[int]:
-        """Seeds of the episodes that have been left out."""
-        return self._numbers("dropped")
+    def seeds(self, kind: str = _WHOLE) -> set[int]:
+        """Seeds of the episodes that are there, or of those that have been left out."""
+        return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
 
     def load(self, seed: int) -> RecordedEpisode:
         """The episode of a seed.
@@ -75,24 +72,21 @@ class Recording:
         Raises:
             ValueError: If the file is damaged.
         """
-        return RecordedEpisode.load(self._path(seed, "npz"))
+        return RecordedEpisode.load(self._path(seed))
 
     def forget(self, seed: int) -> None:
         """Remove the episode of a seed."""
-        self._path(seed, "npz").unlink(missing_ok=True)
+        self._path(seed).unlink(missing_ok=True)
 
     def keep(self, seed: int, episode: RecordedEpisode | None) -> None:
         """Write down an episode, or that it is left out."""
         if episode is None:
-            self._path(seed, "dropped").touch()
+            self._path(seed, _DROPPED).touch()
         else:
-            episode.save(self._path(seed, "npz"))
+            episode.save(self._path(seed))
 
-    def _path(self, seed: int, kind: str) -> Path:
+    def _path(self, seed: int, kind: str = _WHOLE) -> Path:
         return self.folder / f"{seed}.{kind}"
-
-    def _numbers(self, kind: str) -> set[int]:
-        return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
 
 
 @dataclass(frozen=True)
@@ -117,34 +111,6 @@ class _Task:
 
     def lost(self, done: int, reason: str) -> tuple[list[tuple[int, str]], None]:
         return [] if done else [(self.seed, reason)], None
-
-
-def record_all(
-    demonstrations: Demonstrations, recording: Recording, seeds: list[int], workers: int | None
-) -> Generator[int]:
-    """Record episodes of these seeds by so many workers, see :func:`write_dataset`; yields a seed when it is on disk.
-
-    Raises:
-        ValueError: At the end if episodes have failed, or if the policy cannot be handed to worker processes.
-        ChildProcessError: If processes do not start.
-    """
-    tasks = [_Task(demonstrations, recording, seed) for seed in seeds]
-    size = min(workers or available_cores(), len(tasks))
-    if size > 1:
-        check_sendable(demonstrations, f"policy {demonstrations.policy_name!r}")
-    failures: dict[int, str] = {}
-    with closing(run_jobs(tasks, ProcessPool(size)) if size > 1 else run_here(tasks)) as outcomes:
-        for seed, failure in chain.from_iterable(outcomes):
-            if failure:
-                failures[seed] = failure
-            else:
-                yield seed
-    if failures:
-        seed, failure = min(failures.items())
-        raise ValueError(
-            f"the episode of seed {seed} failed ({failure}), {len(failures)} of {len(tasks)} in all; leave such seeds "
-            "out, or change the policy; the others are kept"
-        )
 
 
 def write_dataset(
@@ -187,7 +153,7 @@ def write_dataset(
     recording.claim(demonstrations)
     _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
     _pack(recording, files, shard_size)
-    files.write_main(_metadata(demonstrations, name, len(recording.dropped())))
+    files.write_main(_metadata(demonstrations, name, len(recording.seeds(_DROPPED))))
 
     return minari.MinariDataset(folder / "data")
 
@@ -241,17 +207,29 @@ def _spec(environment: Mapping[str, object]) -> EnvSpec | None:
 def _record(
     demonstrations: Demonstrations, recording: Recording, packed: set[int], workers: int | None, progress: Progress
 ) -> None:
-    """Record what is missing."""
+    """Record what is missing, by so many workers; at the end failed episodes are an error."""
     for seed in packed & recording.seeds():  # packed just before it was broken off
         recording.forget(seed)
-    there, wanted = packed | recording.seeds() | recording.dropped(), list(demonstrations.seeds)
-    missing = [seed for seed in wanted if seed not in there]
-    done = len(wanted) - len(missing)
+    there, wanted = packed | recording.seeds() | recording.seeds(_DROPPED), list(demonstrations.seeds)
+    tasks = [_Task(demonstrations, recording, seed) for seed in wanted if seed not in there]
+    done, size = len(wanted) - len(tasks), min(workers or available_cores(), len(tasks))
     progress("starting", done, len(wanted))
-    with closing(record_all(demonstrations, recording, missing, workers)) as recorded:
-        for seed in recorded:
+    if size > 1:
+        check_sendable(demonstrations, f"policy {demonstrations.policy_name!r}")
+    failures: dict[int, str] = {}
+    with closing(run_jobs(tasks, ProcessPool(size)) if size > 1 else run_here(tasks)) as outcomes:
+        for seed, failure in chain.from_iterable(outcomes):
+            if failure:
+                failures[seed] = failure
+                continue
             done += 1
             progress(f"{demonstrations.policy_name}, seed {seed}", done, len(wanted))
+    if failures:
+        seed, failure = min(failures.items())
+        raise ValueError(
+            f"the episode of seed {seed} failed ({failure}), {len(failures)} of {len(tasks)} in all; leave such seeds "
+            "out, or change the policy; the others are kept"
+        )
 
 
 def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
