@@ -8,11 +8,12 @@ into a large one, and no more values than files of this kind need.
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import time
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -92,6 +93,35 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def claim_folder(path: Path, identity: Mapping[str, object], kind: str) -> None:
+    """Write down what a folder is for, or find out whether it is one for the same.
+
+    Args:
+        path: The JSON file in it that says so.
+        identity: All that must be the same.
+        kind: What the folder holds, as ``"a training"``.
+
+    Raises:
+        ValueError: If it is for something else, or does not say.
+        OSError: If it cannot be written to.
+    """
+    wanted = json.loads(json.dumps(identity))
+    if not path.exists():
+        with replaced_when_done(path) as temporary:
+            temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+        return
+    try:
+        before = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError, RecursionError):
+        raise ValueError(f"{path} cannot be read; remove it, or choose another folder") from None
+    for name, value in wanted.items():
+        if before.get(name) != value:
+            raise ValueError(
+                f"folder {path.parent} holds {kind} with {name} {before.get(name)!r}, not {value!r}; go on with the "
+                "same, or choose another folder"
+            )
 
 
 HEADER_BYTES = 16_384

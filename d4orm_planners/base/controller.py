@@ -10,12 +10,12 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, shown
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
+from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Actions, Policy
 from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round, track_velocities
@@ -193,13 +193,12 @@ class Controller:
 
     def _open(self, problem: Problem, seed: int) -> None:
         self.problem = problem
-        self._env = navigation_v0.parallel_env(problem=problem)
+        self._env = open_env(problem, policy=self.policy)
         self._observations, _ = self._env.reset(seed=seed)
 
     def _completed(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """``(K, n)`` measured states where they are known, the reference's elsewhere, and ``(K,)`` where."""
-        joint = self._joint
-        reference, measured = joint.states, as_float32(states)
+        reference, measured = self._joint.states, as_float32(states)
         if measured.shape != reference.shape:
             raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
         known: BoolArray = np.all(np.isfinite(measured), axis=1)
@@ -236,9 +235,8 @@ class Controller:
                 actions = dict(zip(self._env.possible_agents, brakes))
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
-        follows = known if self._leads else known & parked
-        controls = self._observer.compensated(self._with_feedback(measured, follows, controls), self.arrived)
-        return self._described(before, controls, held)
+        controls = self._with_feedback(measured, known if self._leads else known & parked, controls)
+        return self._described(before, self._observer.compensated(controls, self.arrived), held)
 
     def _shift(self, measured: FloatArray, known: BoolArray) -> None:
         """Shift setpoints against what keeps robots beside the reference, by as much as the margin."""
@@ -287,8 +285,7 @@ class Controller:
         return present_velocities(self.problem, joint.states, joint.controls).astype(np.float64)
 
     def _described(self, before: JointState, controls: FloatArray, held: bool) -> ControlSetpoint:
-        joint = self._joint
-        heading = np.zeros(self.problem.num_robots)
+        joint, heading = self._joint, np.zeros(self.problem.num_robots)
         for model, robots in by_model(self.problem):
             if model.heading_index is not None:
                 heading[robots] = joint.states[robots, model.heading_index]

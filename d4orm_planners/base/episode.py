@@ -23,6 +23,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
+from d4orm_planners.base.policy import Policy
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -106,12 +107,13 @@ def physics_module(physics: str) -> Any:
     return navigation_v0 if physics == "model" else import_module(f"d4orm_env.{physics}")
 
 
-def open_env(problem: Problem, physics: str = "model", **options: Any) -> ParallelEnv:
+def open_env(problem: Problem, physics: str = "model", policy: Policy | None = None, **options: Any) -> ParallelEnv:
     """An environment of a problem.
 
     Args:
         problem: The problem.
         physics: Physics of the robots, one of :data:`PHYSICS`.
+        policy: Policy that is to act in it: where ``options`` say nothing, robots observe what it wants them to.
         **options: Further arguments of :class:`d4orm_env.navigation_v0.parallel_env`.
 
     Raises:
@@ -119,6 +121,8 @@ def open_env(problem: Problem, physics: str = "model", **options: Any) -> Parall
         ImportError: If the physics needs a library that is not installed.
     """
     check_physics(problem, physics)
+    if isinstance(policy, Policy):  # a user's own may have no more than reset and act
+        options = {**policy.observation_options(problem), **options}
     return physics_module(physics).parallel_env(problem=problem, **options)
 
 

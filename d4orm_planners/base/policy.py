@@ -82,6 +82,10 @@ class Policy(ABC):
             RuntimeError: Before the first reset, if the policy needs one, or if another thread uses the policy.
         """
 
+    def observation_options(self, problem: Problem) -> Mapping[str, object]:
+        """Arguments of an environment of this problem on what robots observe; by default it stays as it is."""
+        return {}
+
     def identity(self) -> dict[str, object]:
         """Identity that a store of trials tells this instance by from others of its class, as JSON has it.
 
@@ -161,8 +165,8 @@ def within_limits(problem: Problem, actions: Actions) -> Actions:
         if agent not in robots or control.shape != size or not usable(control).all():
             return actions
         controls[robots[agent]] = control
-    limited = limit_controls(problem, controls)
-    return {agent: limited[robots[agent]] for agent in actions}
+    controls = limit_controls(problem, controls)
+    return {agent: controls[robots[agent]] for agent in actions}
 
 
 class TeamFunction(Policy):
@@ -203,9 +207,7 @@ class OpenLoop(StatePolicy):
     ) -> None:
         if (planner is None) == (plan is None):
             raise ValueError("an open-loop policy needs either a planner or a plan")
-        self.planner = planner
-        self.plan = plan
-        self.time_limit = time_limit
+        self.planner, self.plan, self.time_limit = planner, plan, time_limit
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         if self.planner is not None:

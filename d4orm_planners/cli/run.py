@@ -74,7 +74,7 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
     def execute(self, problem: Problem, policy: Policy, disturbances: Sequence[AnyDisturbance]) -> Episode:
         """An episode of a policy on a problem."""
         wrong = {"control_noise_std": self.control_noise_std, "disturbances": disturbances}
-        env = open_env(problem, self.physics, **wrong, **self.observation)
+        env = open_env(problem, self.physics, policy, **wrong, **self.observation)
         episode = run_episode(env, policy, seed=self.seed)
         env.close()
         return episode

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.candidate import Candidate
+from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.planner_registry import make_policy
 from d4orm_planners.base.solve import SolveRun
@@ -123,7 +123,8 @@ def episode_of(policy: str, problem: Problem, seed: int) -> FloatArray:
         ValueError: If there is no such policy, or it cannot drive there.
         ImportError: If it needs a library that is not installed.
     """
-    env, driver = navigation_v0.parallel_env(problem=problem), make_policy(policy)
+    driver = make_policy(policy)
+    env = open_env(problem, policy=driver)
     observations, _ = env.reset(seed=seed)
     driver.reset(env, seed=seed)
     controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)

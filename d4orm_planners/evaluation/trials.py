@@ -187,7 +187,7 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
     """Columns of a trial that runs to its end."""
     problem = job.problem
     wrong = {"control_noise_std": condition.control_noise_std, "disturbances": condition.disturbances}
-    env = open_env(problem, condition.physics, **wrong, **job.policy.observation)
+    env = open_env(problem, condition.physics, policy.actor, **wrong, **job.policy.observation)
     episode = run_episode(env, policy, seed=job.seed)
     env.close()
     metrics, plan = episode.metrics, policy.plan
@@ -234,7 +234,7 @@ class _TimedPolicy(Policy):
     """A policy with a stopwatch. It keeps the plan of an open-loop policy from one episode to the next."""
 
     def __init__(self, policy: Policy) -> None:
-        self._policy = copy.copy(policy)  # a user's own, which trials must not change
+        self.actor = copy.copy(policy)  # a user's own, which trials must not change
         self.wall_time = 0.0
         self.preparation = 0.0
         self.plan: Plan | None = None
@@ -242,23 +242,23 @@ class _TimedPolicy(Policy):
     @property
     def training_time(self) -> float | None:
         """Training time of what acts, see :attr:`Trial.training_time`."""
-        time: float | None = getattr(self._policy, "training_time", None)
+        time: float | None = getattr(self.actor, "training_time", None)
         return time
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         begin = time.perf_counter()
-        self._policy.reset(env, seed)
+        self.actor.reset(env, seed)
         self.wall_time = self.preparation = time.perf_counter() - begin
-        if isinstance(self._policy, OpenLoop) and (plan := self._policy.plan) is not None:
+        if isinstance(self.actor, OpenLoop) and (plan := self.actor.plan) is not None:
             if plan.status == "interrupted":
                 raise KeyboardInterrupt  # half a solve says nothing about the planner
-            self._policy.planner = None  # from now on it executes this plan
+            self.actor.planner = None  # from now on it executes this plan
             self.plan, self.wall_time = plan, plan.wall_time
             self.preparation = plan.wall_time
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         begin = time.perf_counter()
-        actions = self._policy.act(observations, state)
+        actions = self.actor.act(observations, state)
         if self.plan is None:
             self.wall_time += time.perf_counter() - begin
         return actions

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -20,6 +19,7 @@ from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.robot_faults import pushed
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.render.replay import ReplayMotion, motion
+from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.edits import check_robot
@@ -124,7 +124,7 @@ class Viewport:
         options: dict[str, Any] = {
             "lifelong": terms.lifelong, "disturbances": terms.disturbances, **terms.observation
         }  # fmt: skip
-        self._env = navigation_v0.parallel_env(problem=scene, max_cycles=scene.horizon, **options)
+        self._env = open_env(scene, policy=policy, max_cycles=scene.horizon, **options)
         self._observations, _ = self._env.reset(seed=terms.seed)
         self._env.max_cycles = MOST_CYCLES
         begin = time.perf_counter()

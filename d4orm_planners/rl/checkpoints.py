@@ -16,7 +16,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_set
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import ArrayArchive, replaced_when_done
+from d4orm_env.core.files import ArrayArchive, claim_folder
 from d4orm_planners.rl.curve import Evaluation, write_curve
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 
@@ -37,25 +37,7 @@ class Checkpoints:
         self.policy_path = out / f"policy{SUFFIX}"
         self._folder = out / "checkpoints"
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._check_settings(out / "settings.json", json.loads(json.dumps(settings)))
-
-    @staticmethod
-    def _check_settings(path: Path, settings: dict[str, object]) -> None:
-        if not path.exists():
-            with replaced_when_done(path) as temporary:
-                temporary.write_text(json.dumps(settings, indent=2) + "\n")
-            return
-        try:
-            before = json.loads(path.read_text())
-        except ValueError:
-            raise ValueError(f"{path} cannot be read; remove it, or train into another folder") from None
-        for name in settings:
-            if not isinstance(before, dict) or before.get(name) != settings[name]:
-                was = before.get(name) if isinstance(before, dict) else before
-                raise ValueError(
-                    f"folder {path.parent} holds a training with {name} {was!r}, not {settings[name]!r}; go on with "
-                    "the same settings, or train into another folder"
-                )
+        claim_folder(out / "settings.json", settings, "a training")
 
     def policy(self) -> Network:
         """The policy that did best so far."""

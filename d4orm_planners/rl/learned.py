@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -13,6 +14,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
+from d4orm_planners.rl.detours import Detours
 from d4orm_planners.rl.network import SUFFIX, Network, load_network, range_sensors
 from d4orm_planners.tracking.steering import drive_to_goal, goals_along_paths, must_brake
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
     from d4orm_env.core.problem import Problem
+    from d4orm_env.core.world import World
 
 SHIPPED = Path(__file__).parent / "policies"
 SEEN_OBSTACLES = 4
@@ -36,12 +39,16 @@ class LearnedConfig(CheckedSettings):
             joint Gymnasium environment. A zip holds pickled Python, which can
             run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
             comes with the package for the robots' model, and for open ground or a world with walls or many obstacles.
+        detours: Whether a robot that has learned to head straight for its goal heads along the shortest path round
+            robots that have docked where these are in the way. That is a law beside the network, which goes by the
+            joint state; not with a communication range or a line of sight, which hide robots.
 
     Raises:
         ValueError: If the path ends in something else.
     """
 
     path: PathText | None = None
+    detours: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,18 +90,19 @@ class LearnedPolicy(Policy):
             return [Path(config.path)]
         return [SHIPPED / f"{cls.name}{SUFFIX}", *sorted(SHIPPED.glob(f"{cls.name}-*{SUFFIX}"))]
 
-    def _file(self) -> Path:
-        """Return the file for robots of the team's model in a world like this, or else the nearest."""
-        files, model = self._files(self.config), self.problem.team.models[0]
-        walls = "-walls" if self._walled else ""
-        stems = (f"{self.name}-{model}{walls}", f"{self.name}-{model}", f"{self.name}{walls}")
-        return next((path for stem in stems if (path := SHIPPED / f"{stem}{SUFFIX}") in files), files[0])
+    def observation_options(self, problem: Problem) -> Mapping[str, object]:
+        """As in training, where the policy is a file of this package."""
+        self._choose(problem)
+        return self._actor.network.header.observation_options if isinstance(self._actor, _NetworkActor) else {}
 
-    @property
-    def _walled(self) -> bool:
-        """True if paths matter: round a few round obstacles, all of which it sees, a robot finds by what it sees."""
-        world = self.problem.world
-        return len(world.boxes) + len(world.polygons) > 0 or world.num_obstacles > SEEN_OBSTACLES
+    def _choose(self, problem: Problem) -> None:
+        """Act by the file for robots of the team's model in a world like this, or else by the nearest."""
+        files, model = self._files(self.config), problem.team.models[0]
+        walls = "-walls" if _paths_matter(problem.world) else ""
+        stems = (f"{self.name}-{model}{walls}", f"{self.name}-{model}", f"{self.name}{walls}")
+        path = next((path for stem in stems if (path := SHIPPED / f"{stem}{SUFFIX}") in files), files[0])
+        if path != self._actor.path:
+            self._use(path)
 
     def _use(self, path: Path) -> None:
         kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
@@ -103,24 +111,23 @@ class LearnedPolicy(Policy):
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
-        # Team and world may be others at every reset.
-        if (path := self._file()) != self._actor.path:
-            self._use(path)
+        self._choose(self.problem)
         agent, self._env = env.possible_agents[0], env
+        options = env.unwrapped.options
         if isinstance(self._actor, _NetworkActor):
-            options = env.unwrapped.options
             self._actor.check_rays(range_sensors(options.observed_rays, options.ray_range))
         self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
+        hiding = options.communication_range is not None or options.line_of_sight
+        self._detours = Detours(self.problem) if self.config.detours and not hiding else None
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         require_reset(self)
         if not observations:
             return {}
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
-        robots = robot_indices(observations)
-        among_obstacles = self.problem.world.num_obstacles > 0
-        if among_obstacles and isinstance(self._actor, _NetworkActor) and self._actor.network.header.shortest_paths:
-            self._look_along_paths(self._actor.network, robots, seen, state)
+        robots, joint = robot_indices(observations), split_state(self.problem, state)
+        if isinstance(self._actor, _NetworkActor):
+            self._look_along_paths(self._actor.network, robots, seen, joint)
         if isinstance(self._actor, _ZipActor) and self._actor.is_joint:
             # It wants to see those too that have left.
             everybody = self._env.unwrapped.last_step.observations.copy()
@@ -130,7 +137,7 @@ class LearnedPolicy(Policy):
         else:
             controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
         if isinstance(self._actor, _NetworkActor) and not self._actor.network.header.brakes:
-            controls = self._braking(robots, controls, split_state(self.problem, state))
+            controls = self._braking(robots, controls, joint)
         return within_limits(self.problem, dict(zip(observations, controls)))
 
     def _braking(self, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
@@ -138,16 +145,28 @@ class LearnedPolicy(Policy):
         braking = must_brake(self.problem, joint.states, joint.controls, joint.goals)[robots, None]
         return np.where(braking, drive_to_goal(self.problem, joint.states, joint.goals)[robots], controls)
 
-    def _look_along_paths(self, network: Network, robots: list[int], seen: FloatArray, state: FloatArray) -> None:
-        """Change the goals in ``seen`` ``(N, D)`` as in training, by the map that all have.
+    def _look_along_paths(self, network: Network, robots: list[int], seen: FloatArray, joint: JointState) -> None:
+        """Change the goals in ``seen`` ``(N, D)``: as in training, by the map that all have, or round docked robots.
 
         Where a robot is follows from its goal and where it sees that.
         """
-        features, goals = network.features_for(seen.shape[1]), split_state(self.problem, state).goals
+        features = network.features_for(seen.shape[1])
         assert features is not None, "reset has checked the observations"
-        places, own = goals.copy(), features.slices.own.goal
+        places, own = joint.goals.copy(), features.slices.own.goal
         places[robots] -= seen[:, own]
-        seen[:, own] = (goals_along_paths(self.problem, places, goals) - places)[robots]
+        if network.header.shortest_paths:
+            heads = goals_along_paths(self.problem, places, joint.goals)
+        elif self._detours is not None and joint.arrived.any():
+            heads = self._detours.goals(joint, places)
+        else:
+            return
+        elsewhere = (heads != joint.goals).any(axis=1)[robots]
+        seen[elsewhere, own] = (heads - places)[robots][elsewhere]
+
+
+def _paths_matter(world: World) -> bool:
+    """Tell a world with more than a few round obstacles, all of which a robot sees: round those it finds by that."""
+    return len(world.boxes) + len(world.polygons) > 0 or world.num_obstacles > SEEN_OBSTACLES
 
 
 class PPO(LearnedPolicy):

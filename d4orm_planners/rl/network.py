@@ -85,6 +85,12 @@ class Header(BaseModel):
         """The range sensors that it reads, as :func:`range_sensors` says it."""
         return range_sensors(self.num_rays or 0, self.ray_range or 0.0)
 
+    @property
+    def observation_options(self) -> dict[str, object]:
+        """Arguments of environments whose robots observe as in training."""
+        rays = {"observed_rays": self.num_rays, "ray_range": self.ray_range} if self.num_rays else {}
+        return {"observed_robots": self.num_neighbors, "observed_obstacles": self.num_obstacles, **rays}
+
     def text(self) -> str:
         """Return it as JSON, which earlier versions read where it says nothing that they do not know."""
         optional = ("num_rays", "ray_range", "encoder", "frame", "shortest_paths", "brakes")
@@ -223,15 +229,14 @@ def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[
     width: int | None
     shapes: dict[str, tuple[int | None, ...]] = {"reward_variance": ()}
     if header.encoder == "sets":
-        shapes |= array_shapes(features, arrays)
-        width = encoded_size(features, arrays)
+        sets, width = _set_shapes(features, arrays)
+        shapes |= sets
     else:
         width = features.size
         shapes |= {"observation_mean": (width,), "observation_variance": (width,)}
     for layer in range(header.layers):
-        weight = arrays.get(f"weight_{layer}")
         shapes[f"weight_{layer}"] = (None, width)
-        width = len(weight) if weight is not None and weight.ndim == 2 else None
+        width = _width(arrays.get(f"weight_{layer}"))
         if layer == header.layers - 1:
             width = get_model(header.model).control_size
             shapes[f"weight_{layer}"] = (width, *shapes[f"weight_{layer}"][1:])
@@ -250,9 +255,15 @@ def _checked(path: Path, header: Header, arrays: dict[str, np.ndarray]) -> dict[
     return arrays
 
 
-def array_shapes(features: Features, arrays: Mapping[str, FloatArray]) -> dict[str, tuple[int | None, ...]]:
-    """Shapes of the arrays that the sets of a network are made of; hidden widths are those of ``arrays``."""
+def _set_shapes(
+    features: Features, arrays: Mapping[str, FloatArray]
+) -> tuple[dict[str, tuple[int | None, ...]], int | None]:
+    """Shapes of the arrays of sets, hidden widths being those of ``arrays``, and the width of :func:`encode`'s result.
+
+    The width is ``None`` if the arrays do not say.
+    """
     shapes: dict[str, tuple[int | None, ...]] = {}
+    width: int | None = features.own_size
     for kind, row in zip(KINDS, (features.neighbor_size, features.obstacle_size), strict=True):
         first, second = (_width(arrays.get(f"{kind}_weight_{layer}")) for layer in (0, 1))
         shapes |= {
@@ -262,13 +273,8 @@ def array_shapes(features: Features, arrays: Mapping[str, FloatArray]) -> dict[s
             f"{kind}_weight_1": (second, first),
             f"{kind}_bias_1": (second,),
         }
-    return shapes
-
-
-def encoded_size(features: Features, arrays: Mapping[str, FloatArray]) -> int | None:
-    """Width of what :func:`encode` returns; ``None`` if the arrays do not say."""
-    widths = [_width(arrays.get(f"{kind}_weight_1")) for kind in KINDS]
-    return features.own_size + 2 * sum(width or 0 for width in widths) if None not in widths else None
+        width = None if width is None or second is None else width + 2 * second
+    return shapes, width
 
 
 def encode(features: Features, arrays: Mapping[str, FloatArray], seen: FloatArray) -> FloatArray:

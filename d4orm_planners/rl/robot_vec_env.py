@@ -18,6 +18,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.envs.rewards import RewardFunction
 from d4orm_env.envs.team_step import Info
 from d4orm_env.envs.vector_env import NavigationVectorEnv
+from d4orm_env.scenarios.problems import ScenarioLike
 from d4orm_planners.rl.features import Features
 
 
@@ -84,7 +85,7 @@ class RobotVecEnv(SharedVecEnv):
         self,
         num_worlds: int,
         num_robots: int,
-        scenario: str = "random",
+        scenario: ScenarioLike = "random",
         *,
         seed: int = 0,
         reward: str | RewardFunction = "training",

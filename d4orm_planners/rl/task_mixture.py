@@ -14,6 +14,7 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import goal_speeds
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.envs.team_step import Info
 from d4orm_env.scenarios import make_problem
@@ -151,8 +152,14 @@ class TrainTask:
         return cls(scenario, int(rest[0]), settings, max_observed, disturbances)
 
     def problem(self, seed: int, model: str | None = None) -> Problem:
-        """An instance with robots of that model; ``None`` is the scenario's own."""
-        return make_problem(self.scenario, self.num_robots, seed, model=model, **self.settings)
+        """An instance with robots of that model; ``None`` is the scenario's own. Robots dock at any speed by default.
+
+        Who explores hardly ever comes to rest at a goal, and a policy that has not learned to brake is braked.
+        """
+        problem = make_problem(self.scenario, self.num_robots, seed, model=model, **self.settings)
+        usual = goal_speeds(problem.team, problem.dt, None)
+        said = "goal_speed" in self.settings or (problem.goal_speed != usual).any()
+        return problem if said else problem.replace(goal_speed=np.inf)
 
     def draws(self, model: str | None = None) -> bool:
         """Check whether its instances differ."""
@@ -175,21 +182,18 @@ class TrainTask:
             model: Robot model; ``None`` is the scenario's own.
             **options: Further arguments of the environment.
         """
-        arguments: dict[str, Any] = {"scenario": self.scenario, "model": model, **self.settings}
-        if self.draws(model):
-            arguments = {"scenario": instances, "randomize_instance": True}
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
         return RobotVecEnv(
-            len(max_observed), self.num_robots, seed=seed, max_observed=max_observed, **arguments, **options
-        )
+            len(max_observed), self.num_robots, instances, seed=seed, max_observed=max_observed,
+            randomize_instance=self.draws(model), **options,
+        )  # fmt: skip
 
     def validation(self, count: int, seed: int, model: str | None = None, **options: Any) -> RobotVecEnv:
         """Worlds to judge by, a new instance for each; one is enough where nothing differs. Arguments as above."""
-        # Every validation asks for the same again.
+        shown = [self.max_observed] * (count if self.disturbances or self.draws(model) else 1)
         instances = Instances(partial(self.problem, model=model), None, {})
-        count = count if self.disturbances or self.draws(model) else 1
-        return self.worlds([self.max_observed] * count, seed, instances, model, **options)
+        return self.worlds(shown, seed, instances, model, **options)
 
 
 class Instances:
@@ -218,8 +222,7 @@ def parse_mixture(texts: Sequence[str]) -> tuple[TrainTask, ...]:
     Raises:
         ValueError: If one is neither.
     """
-    named = [part for text in texts for part in MIXTURES.get(text.strip(), (text,))]
-    return tuple(TrainTask.parse(text) for text in named)
+    return tuple(TrainTask.parse(part) for text in texts for part in MIXTURES.get(text.strip(), (text,)))
 
 
 def gather_parts(tasks: Sequence[TrainTask], counts: Sequence[int]) -> list[tuple[TrainTask, list[int | None]]]:

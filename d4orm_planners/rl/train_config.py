@@ -82,8 +82,8 @@ class TrainConfig(CheckedSettings):
         """Arguments of environments of the scenario to be learned, or of ``random`` with robots like its own, but for
         their number.
         """
-        settings = self.task(scenario, self.num_robots).settings
-        return {"scenario": scenario, "model": self.model_in(scenario), **settings, **self.sensors}
+        draw = partial(self.task(scenario, self.num_robots).problem, model=self.model_in(scenario))
+        return {"scenario": Instances(draw, None, {}), **self.sensors}
 
     @property
     def sensors(self) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
+from d4orm_planners.base.episode import open_env
 from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
@@ -449,7 +450,8 @@ def test_the_first_coarse_plan_may_begin_with_what_a_policy_does() -> None:
     policy = make_policy("d4orm-c2f", warm_start="ppo", refine="off")
     policy.reset(env, seed=0)
     coarse = coarse_problem(problem, policy.config.coarse_factor)
-    episode = run_episode(navigation_v0.parallel_env(problem=coarse), "ppo", seed=0)
+    driver = make_policy("ppo")
+    episode = run_episode(open_env(coarse, policy=driver), driver, seed=0)
     assert episode.metrics["success"], "so that there is nothing left to plan"
     guided = policy.guidance.controls
     np.testing.assert_array_equal(guided[: len(episode.controls)], episode.controls)

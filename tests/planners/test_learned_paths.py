@@ -11,8 +11,11 @@ import pytest
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.envs.joint_state import JointState
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_planners import make_policy, run_episode
+from d4orm_planners.base.episode import open_env
+from d4orm_planners.rl.detours import Detours
 from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.learned import SEEN_OBSTACLES, SHIPPED
 from d4orm_planners.rl.network import Header, Network, load_network
@@ -102,6 +105,44 @@ def test_the_policy_of_the_package_is_that_for_the_world() -> None:
         policy.reset(env)
         assert bool(policy._actor.network.header.shortest_paths) == along
         assert policy._actor.network.header.num_obstacles == SEEN_OBSTACLES
+
+
+def test_programs_that_make_the_environment_have_robots_observe_what_the_policy_was_trained_with() -> None:
+    policy = make_policy("ppo")
+    for scenario, file in (("random", "ppo"), ("rooms", "ppo-walls")):
+        problem, header = make_problem(scenario, num_robots=12), load_network(SHIPPED / f"{file}.safetensors").header
+        assert open_env(problem, policy=policy).unwrapped.options.observed_robots == header.num_neighbors != 4
+        assert open_env(problem, policy=policy, observed_robots=4).unwrapped.options.observed_robots == 4
+    assert open_env(problem, policy=make_policy("go-to-goal")).unwrapped.options.observed_robots == 4
+
+
+def test_robots_head_round_docked_ones_that_are_in_the_way_and_straight_otherwise() -> None:
+    """Robots 2 to 4 have docked in a row across the way of robot 0, not of robot 1."""
+    row = [[0, 0], [0, 0.5], [0, -0.5]]
+    start = np.pad([[-2, 0], [-2, 2], *row], ((0, 0), (0, 2)))
+    problem = make_problem("circle", num_robots=5).replace(start=start, goal=[[3, 0], [3, 2], *row])
+    places = problem.start[:, :2].copy()
+    joint = JointState(problem.start, problem.goal, np.zeros((5, 2), np.float32), np.arange(5) >= 2, 1)
+    detours = Detours(problem)
+    none = detours.goals(joint._replace(arrived=np.zeros(5, bool)), places)
+    np.testing.assert_array_equal(none, problem.goal)
+    heads = detours.goals(joint, places)
+    np.testing.assert_array_equal(heads[1:], problem.goal[1:])
+    beside, length = np.abs(heads[0, 1]), np.linalg.norm(heads[0] - places[0])
+    assert beside > 0.5, "past the end of the row"
+    assert 5 < length < 6, "the length of the way, on its first stretch"
+    parts = places + 0.1 * (heads - places)
+    np.testing.assert_allclose(detours.goals(joint, parts)[0] - places[0], heads[0] - places[0], rtol=0.02)
+
+
+def test_a_learned_policy_takes_no_detours_where_it_is_told_or_robots_are_hidden() -> None:
+    env = navigation_v0.parallel_env("random", num_robots=2)
+    hiding = navigation_v0.parallel_env("random", num_robots=2, communication_range=2.0)
+    for own, world, expected in (({}, env, True), ({"detours": False}, env, False), ({}, hiding, False)):
+        policy = make_policy("ppo", **own)
+        world.reset(seed=0)
+        policy.reset(world)
+        assert (policy._detours is not None) == expected
 
 
 def test_the_policy_of_the_package_goes_through_doors() -> None:

@@ -75,7 +75,9 @@ def test_commands_give_robots_rays(policy_file: Path, tmp_path: Path, capsys: py
     rays = {"observed_rays": 6, "ray_range": 3.0}
     (row,) = evaluate({"mine": settings}, observation=rays, **study)
     assert row.errors == 0
-    (row,) = evaluate({"mine": settings}, **study)  # other trials than those with rays
+    (row,) = evaluate({"mine": settings}, **study)  # the policy's own rays, unless others are asked for
+    assert row.errors == 0
+    (row,) = evaluate({"mine": settings}, observation={"observed_rays": 8}, **study)
     assert row.errors == 1
     with pytest.raises(ValueError, match="observation 'lifelong' is unknown"):
         evaluate({"mine": settings}, observation={"lifelong": True}, **study)

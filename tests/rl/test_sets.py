@@ -178,6 +178,17 @@ TINY = TrainingSettings(
 )  # fmt: skip
 
 
+def test_robots_learn_to_reach_goals_at_any_speed_unless_something_says_otherwise() -> None:
+    """Whoever explores comes to rest at a goal too seldom to learn from it."""
+    for scenario in ("random", "circle", f"{perturbed.__module__}:perturbed"):
+        (task,) = parse_mixture([f"{scenario} 2"])
+        assert np.isinf(task.validation(1, 0).problem.goal_speed).all()
+        (slow,) = parse_mixture([f"{scenario} 2 goal_speed=0.1"])
+        np.testing.assert_array_equal(slow.validation(1, 0).problem.goal_speed, np.float32([0.1, 0.1]))
+    given = make_problem("random", num_robots=2, goal_speed=0.3)
+    assert TrainTask(lambda seed, num_robots: given, 2, {}).problem(0).goal_speed.tolist() == given.goal_speed.tolist()
+
+
 @pytest.fixture(scope="module", params=sorted(ALGORITHMS))
 def practised(request: pytest.FixtureRequest) -> TrainingSettings:
     return replace(TINY, algorithm=request.param)

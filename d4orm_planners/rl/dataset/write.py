@@ -9,7 +9,7 @@ import copy
 import importlib.metadata
 import json
 import os
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import chain
@@ -21,7 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.errors import describe
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import claim_folder
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from minari import MinariDataset
 
 IDENTITY = "demonstrations.json"
-
+_WHOLE, _DROPPED = "npz", "dropped"
+"""Kinds of files of episodes: recorded, and left out."""
 
 minari: Any = LazyModule("minari", "a dataset", "dataset")
 minari_dataset: Any = LazyModule("minari.dataset.minari_dataset", "a dataset", "dataset")
@@ -58,29 +59,11 @@ class Recording:
             OSError: If it cannot be made.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        path, identity = self.folder / IDENTITY, demonstrations.identity
-        if not path.exists():
-            with replaced_when_done(path) as temporary:
-                temporary.write_text(json.dumps(identity, indent=1) + "\n", encoding="utf-8")
-            return
-        try:
-            before = dict(json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, TypeError, RecursionError):
-            raise ValueError(f"{path} cannot be read; remove the folder, or choose another") from None
-        for name, value in identity.items():
-            if before.get(name) != value:
-                raise ValueError(
-                    f"folder {self.folder.parent} holds a dataset with {name} {before.get(name)!r}, not {value!r}; go "
-                    "on with the same, or choose another folder"
-                )
+        claim_folder(self.folder / IDENTITY, demonstrations.identity, "a dataset")
 
-    def seeds(self) -> set[int]:
-        """Seeds of the episodes that are there."""
-        return self._numbers("npz")
-
-    def dropped(self) -> set[int]:
-        """Seeds of the episodes that have been left out."""
-        return self._numbers("dropped")
+    def seeds(self, kind: str = _WHOLE) -> set[int]:
+        """Seeds of the episodes that are there, or of those that have been left out."""
+        return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
 
     def load(self, seed: int) -> RecordedEpisode:
         """The episode of a seed.
@@ -88,24 +71,21 @@ class Recording:
         Raises:
             ValueError: If the file is damaged.
         """
-        return RecordedEpisode.load(self._path(seed, "npz"))
+        return RecordedEpisode.load(self._path(seed))
 
     def forget(self, seed: int) -> None:
         """Remove the episode of a seed."""
-        self._path(seed, "npz").unlink(missing_ok=True)
+        self._path(seed).unlink(missing_ok=True)
 
     def keep(self, seed: int, episode: RecordedEpisode | None) -> None:
         """Write down an episode, or that it is left out."""
         if episode is None:
-            self._path(seed, "dropped").touch()
+            self._path(seed, _DROPPED).touch()
         else:
-            episode.save(self._path(seed, "npz"))
+            episode.save(self._path(seed))
 
-    def _path(self, seed: int, kind: str) -> Path:
+    def _path(self, seed: int, kind: str = _WHOLE) -> Path:
         return self.folder / f"{seed}.{kind}"
-
-    def _numbers(self, kind: str) -> set[int]:
-        return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
 
 
 @dataclass(frozen=True)
@@ -130,35 +110,6 @@ class _Task:
 
     def lost(self, done: int, reason: str) -> tuple[list[tuple[int, str]], None]:
         return [] if done else [(self.seed, reason)], None
-
-
-def record_all(
-    demonstrations: Demonstrations, recording: Recording, seeds: list[int], workers: int | None
-) -> Generator[int]:
-    """Record episodes of these seeds by so many workers, see :func:`write_dataset`; yields a seed when it is on disk.
-
-    Raises:
-        ValueError: At the end if episodes have failed, or if the policy cannot be handed to worker processes.
-        ChildProcessError: If processes do not start.
-    """
-    tasks = [_Task(demonstrations, recording, seed) for seed in seeds]
-    size = min(workers or available_cores(), len(tasks))
-    if size > 1:
-        check_sendable(demonstrations, f"policy {demonstrations.policy_name!r}")
-    failures: dict[int, str] = {}
-    workers_of_one_thread = [ProcessWorker() for _ in range(size)]
-    with closing(run_jobs(tasks, workers_of_one_thread) if size > 1 else run_here(tasks)) as outcomes:
-        for seed, failure in chain.from_iterable(outcomes):
-            if failure:
-                failures[seed] = failure
-            else:
-                yield seed
-    if failures:
-        seed, failure = min(failures.items())
-        raise ValueError(
-            f"the episode of seed {seed} failed ({failure}), {len(failures)} of {len(tasks)} in all; leave such seeds "
-            "out, or change the policy; the others are kept"
-        )
 
 
 def write_dataset(
@@ -201,7 +152,7 @@ def write_dataset(
     recording.claim(demonstrations)
     _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
     _pack(recording, files, shard_size)
-    files.write_main(_metadata(demonstrations, name, len(recording.dropped())))
+    files.write_main(_metadata(demonstrations, name, len(recording.seeds(_DROPPED))))
 
     return minari.MinariDataset(folder / "data")
 
@@ -255,17 +206,30 @@ def _spec(environment: Mapping[str, object]) -> EnvSpec | None:
 def _record(
     demonstrations: Demonstrations, recording: Recording, packed: set[int], workers: int | None, progress: Progress
 ) -> None:
-    """Record what is missing."""
+    """Record what is missing, by so many workers; at the end failed episodes are an error."""
     for seed in packed & recording.seeds():  # packed just before it was broken off
         recording.forget(seed)
-    there, wanted = packed | recording.seeds() | recording.dropped(), list(demonstrations.seeds)
-    missing = [seed for seed in wanted if seed not in there]
-    done = len(wanted) - len(missing)
+    there, wanted = packed | recording.seeds() | recording.seeds(_DROPPED), list(demonstrations.seeds)
+    tasks = [_Task(demonstrations, recording, seed) for seed in wanted if seed not in there]
+    done, size = len(wanted) - len(tasks), min(workers or available_cores(), len(tasks))
     progress("starting", done, len(wanted))
-    with closing(record_all(demonstrations, recording, missing, workers)) as recorded:
-        for seed in recorded:
+    if size > 1:
+        check_sendable(demonstrations, f"policy {demonstrations.policy_name!r}")
+    failures: dict[int, str] = {}
+    one_thread_each = [ProcessWorker() for _ in range(size)]
+    with closing(run_jobs(tasks, one_thread_each) if size > 1 else run_here(tasks)) as outcomes:
+        for seed, failure in chain.from_iterable(outcomes):
+            if failure:
+                failures[seed] = failure
+                continue
             done += 1
             progress(f"{demonstrations.policy_name}, seed {seed}", done, len(wanted))
+    if failures:
+        seed, failure = min(failures.items())
+        raise ValueError(
+            f"the episode of seed {seed} failed ({failure}), {len(failures)} of {len(tasks)} in all; leave such seeds "
+            "out, or change the policy; the others are kept"
+        )
 
 
 def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
