@@ -23,6 +23,15 @@ PAGES = {
     for folder in (DOCS, DOCS / "planners")
     for page in sorted(folder.glob("*.md"))
 }
+OTHERS = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "examples/README.md",
+    "examples/studies/REPORT.md",
+    "examples/studies/data/README.md",
+)
+"""What else links to pages, or is linked to."""
 FENCE = re.compile(r"^ *```(\w+)( notest)?\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
 TREE = re.compile(r"^```{toctree}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 PATH = re.compile(r"`((?:examples|d4orm_env|d4orm_planners|tests|docs)/[\w./-]+)`")
@@ -30,9 +39,13 @@ EXTRA = re.compile(
     r"pip install 'd4orm-env\[\w+\]'|No module named '(stable_baselines3|supersuit|torch|torchrl|jaxmarl|minari)'"
 )
 """Complaints that an extra is not installed."""
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+GENERATED = ("reference/settings.md", "reference/d4orm_env/modules.rst", "reference/d4orm_planners/modules.rst")
+"""Pages that the build makes."""
 PRINTS = {
     "own_policy": "3.0 0.0\nin turn 1.0\nat once 0.0\ngently 0.0\ngo-to-goal 0.0\n",
-    "own_planner": "True solved True\n",
+    "own_planner": "True solved True\nsolved\n",
     "own_robot": "solved True\n",
 }
 """What the programs of some pages print."""
@@ -87,6 +100,25 @@ def test_files_that_a_page_names_exist(page: str) -> None:
     named = PATH.findall(PAGES[page])
     missing = [path for path in named if "output" not in path and not (ROOT / path).exists()]
     assert not missing
+
+
+def anchors(page: Path) -> set[str]:
+    """What a code host calls the headings of a page."""
+    headings = HEADING.findall(FENCE.sub("", page.read_text(encoding="utf-8")))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", [*(f"docs/{page}.md" for page in PAGES), *OTHERS])
+def test_links_lead_somewhere(page: str) -> None:
+    for link in LINK.findall(FENCE.sub("", (ROOT / page).read_text(encoding="utf-8"))):
+        path, _, anchor = link.partition("#")
+        if path.startswith(("http://", "https://")):
+            continue
+        target = (ROOT / page).parent.joinpath(path).resolve() if path else ROOT / page
+        if target.is_relative_to(DOCS) and target.relative_to(DOCS).as_posix() in GENERATED:
+            continue
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
 
 
 def test_every_page_is_in_a_table_of_contents() -> None:

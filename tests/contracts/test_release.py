@@ -102,9 +102,5 @@ def test_the_packages_are_in_the_policy() -> None:
     assert {"d4orm_env", "d4orm_planners"} < PUBLIC.keys()
 
 
-def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(readme.splitlines()) <= 80
-    links = [link for link in re.findall(r"\]\((.+?)\)", readme) if not link.startswith("https://")]
-    assert links
-    assert [link for link in links if not (ROOT / link.partition("#")[0]).exists()] == []
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 80
