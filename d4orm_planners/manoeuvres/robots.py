@@ -12,7 +12,7 @@ from d4orm_env.core.footprint_gaps import pair_gap, world_gap
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
-from d4orm_env.dynamics.unicycles import MAX_TURN_ACCELERATION, UNICYCLE2
+from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION, UNICYCLE2
 from d4orm_planners.manoeuvres.costs import Area, Costs, costs_of
 from d4orm_planners.manoeuvres.curves import NO_CURVES, Curves, curves_of
 from d4orm_planners.manoeuvres.kinds import SECTORS, Kind
