@@ -27,9 +27,11 @@ from d4orm_planners.serve.wire import (
 )
 
 NODE = "d4orm"
-DRIVING, PLANNING, WAITING, STOPPED = "driving", "planning", "waiting", "stopped"
-"""States of the server. It drives; stands and plans; stands as robots are silent; stands after an emergency stop."""
-LEVELS = {DRIVING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
+DRIVING, BRAKING, PLANNING, WAITING, STOPPED = "driving", "braking", "planning", "waiting", "stopped"
+"""States of the server. It drives; brakes to plan again; stands and plans; stands as robots are silent; stands after an
+emergency stop.
+"""
+LEVELS = {DRIVING: 0, BRAKING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
 """Levels of diagnostics: well, warning, error."""
 BASE = 0.5
 """Share of a period over which velocities are taken from poses."""
@@ -46,7 +48,8 @@ class FleetRobot:
         heard: When it was last heard, by this process's clock [s].
         state: ``(n,)`` as last heard; not a number before.
         heading: As last heard [rad].
-        stand: ``(d,)`` where it is to stand, while all do [m].
+        stand: ``(d,)`` where it is to stand, or is on its way to that, while nobody drives [m].
+        command: ``geometry_msgs/Twist`` that it was given last.
         velocity: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s].
         posed: Time by the robot's clock [s] and ``(3,)`` position of the later one [m].
     """
@@ -56,6 +59,7 @@ class FleetRobot:
     heard: float = -np.inf
     heading: float = 0.0
     stand: Floats | None = None
+    command: Any = None
     velocity: Floats = field(default_factory=lambda: np.zeros(3))
     posed: tuple[float, Floats] | None = None
 
@@ -78,8 +82,9 @@ class FleetServer:
     ``/diagnostics``.
 
     Nobody moves before all have been heard, nor while one has been silent for longer than the deadline, nor after an
-    emergency stop until that is taken back. When that is over the controller begins anew from where robots are, and so
-    it does for a new goal.
+    emergency stop until that is taken back. When that is over the controller begins anew from where robots are. So it
+    does for a new goal, after all have braked: each goes on along its arc, slower by the same share as all others, so
+    that who would have passed whom still does, and a command that is lost changes little.
 
     Args:
         session: The network.
@@ -121,6 +126,8 @@ class FleetServer:
         self._diagnostics = session.publisher("diagnostics", messages.DiagnosticArray)
         self._planner = ThreadPoolExecutor(1, thread_name_prefix="serve")
         self._begun: Future[None] | None = None
+        self._setpoint: ControlSetpoint | None = None
+        self._pace, self._braking = 1.0, _braking(problem)
         self._emergency = self._replan = False
         self.state, self._told, self.loops, self.refusal = WAITING, -np.inf, [0.0], ""
 
@@ -147,9 +154,12 @@ class FleetServer:
             if before != DRIVING:
                 for robot in self._robots:
                     robot.stand = None
-            self._drive(self._controller.step(self._states(now), now))
+            self._setpoint, self._pace = self._controller.step(self._states(now), now), 1.0
+            self._drive(self._setpoint)
             # The horizon is over, and somebody has not arrived.
             self._replan |= self._controller.over and not self._controller.arrived.all()
+        elif self.state == BRAKING:
+            self._brake()
         else:
             self._stand()
         if self.state != before or now - self._told >= TELL:
@@ -166,6 +176,8 @@ class FleetServer:
             # Somebody may have been pushed, and goals may have changed, while it was planned.
             return PLANNING if self._replan else DRIVING
         if self._begun is None and (self._replan or self.state != DRIVING):
+            if self.state in (DRIVING, BRAKING) and self._pace > 0:
+                return BRAKING
             self._replan = False
             states = np.stack([robot.state for robot in self._robots])
             self._begun = self._planner.submit(self._controller.begin, self._problem, states, now, self._seed)
@@ -217,8 +229,24 @@ class FleetServer:
         reference = zip(setpoint.position, setpoint.velocity, setpoint.acceleration, setpoint.heading)
         for number, (robot, (position, velocity, acceleration, heading)) in enumerate(zip(self._robots, reference)):
             self._setpoints[number].publish(full_state(robot.name, position, velocity, acceleration, heading))
-            control = setpoint.control[number]
-            self._commands[number].publish(twist(self._problem, number, robot.state, control, robot.heading))
+            robot.command = twist(self._problem, number, robot.state, setpoint.control[number], robot.heading)
+            self._commands[number].publish(robot.command)
+
+    def _brake(self) -> None:
+        """Have everybody go on as it last did, slower by the same share than a period ago."""
+        last, before, dt = self._setpoint, self._pace, self._problem.dt
+        assert last is not None  # nobody brakes who has not driven
+        self._pace = max(before - self._braking, 0.0)
+        for number, robot in enumerate(self._robots):
+            velocity = self._pace * last.velocity[number]
+            stand = last.position[number] if robot.stand is None else robot.stand
+            robot.stand = stand + dt * velocity
+            deceleration = (self._pace - before) / dt * last.velocity[number]
+            point = full_state(robot.name, robot.stand, velocity, deceleration, float(last.heading[number]))
+            self._setpoints[number].publish(point)
+            linear, turn = robot.command.linear, robot.command.angular.z
+            slower = messages.Vector3(*(self._pace * part for part in (linear.x, linear.y, linear.z)))
+            self._commands[number].publish(messages.Twist(slower, messages.Vector3(z=self._pace * turn)))
 
     def _stand(self) -> None:
         """Have everybody stand where it was when that began."""
@@ -240,3 +268,10 @@ class FleetServer:
             "refused": self.refusal,
         }
         return diagnostics(NODE, LEVELS[self.state], self.state, values)
+
+
+def _braking(problem: Problem) -> float:
+    """The share of its largest speed that the weakest robot brakes away in a step; all, where nobody has inertia."""
+    team, inertia = problem.team, [not model.first_order for model in problem.team.robot_models]
+    shares = team.max_acceleration[inertia] / team.max_speed[inertia] * problem.dt
+    return float(min(shares, default=1.0))

@@ -47,9 +47,14 @@ def key(topic: str, ros_type: str) -> str:
 
 
 class Fleet:
-    """Robots that do as ``cmd_vel`` says, and tell where they are; each may be off, and messages may be lost."""
+    """Robots that do as ``cmd_vel`` says, and tell where they are.
 
-    def __init__(self, endpoint: str, start: np.ndarray, loss: float = 0.0, poses: bool = False) -> None:
+    Each may be off, messages may be lost, and a watchdog stops who has heard nothing for that long [s].
+    """
+
+    def __init__(
+        self, endpoint: str, start: np.ndarray, loss: float = 0.0, poses: bool = False, watchdog: float = math.inf
+    ) -> None:
         config = zenoh.Config()
         config.insert_json5("connect/endpoints", f'["{endpoint}"]')
         config.insert_json5("scouting/multicast/enabled", "false")
@@ -57,6 +62,7 @@ class Fleet:
         self.velocity, self.on = np.zeros_like(start), [True] * len(start)
         self.heard, self.diagnosis, self.setpoints = [0.0] * len(start), [""], [None] * len(start)
         self.poses, self.loss, self.random, self.moved_at = poses, loss, np.random.default_rng(0), 0.0
+        self.watchdog, self.speeds = watchdog, [0.0]  # the last robot's, as it was told
         self._over, self._subscribers = threading.Event(), [
             self.session.declare_subscriber(key("*/cmd_vel", "geometry_msgs/msg/Twist"), self._command),
             self.session.declare_subscriber(
@@ -90,6 +96,8 @@ class Fleet:
         command = STORE.deserialize_cdr(sample.payload.to_bytes(), "geometry_msgs/msg/Twist")
         cos, sin = math.cos(self.heading[number]), math.sin(self.heading[number])
         x, y = command.linear.x, command.linear.y
+        if number == len(self.on) - 1:
+            self.speeds.append(math.hypot(x, y))
         if self.random.random() >= self.loss:
             self.velocity[number], self.heard[number] = (cos * x - sin * y, sin * x + cos * y), time.monotonic()
 
@@ -105,6 +113,7 @@ class Fleet:
         odometry = STORE.deserialize_cdr(messages.Odometry().serialize(), "nav_msgs/msg/Odometry")
         stamped = STORE.deserialize_cdr(messages.PoseStamped().serialize(), "geometry_msgs/msg/PoseStamped")
         while not self._over.wait(DT / 5):
+            self.velocity[time.monotonic() - np.array(self.heard) > self.watchdog] = 0
             self.position += DT / 5 * self.velocity
             if (np.abs(self.velocity) > 1e-6).any():
                 self.moved_at = time.monotonic()
@@ -203,6 +212,26 @@ def test_emergency_stop_silence_and_restart(endpoint: str) -> None:
             until(lambda: bool((np.linalg.norm(fleet.position - problem().goal, axis=1) < 0.1).all()))
         finally:
             fleet.close()
+
+
+def test_for_a_new_goal_robots_brake_as_they_can_and_stand(endpoint: str) -> None:
+    with served(endpoint):
+        fleet = Fleet(endpoint, problem().start[:, :2].astype(float))
+        try:
+            until(lambda: fleet.speeds[-1] > 0.4)
+            fleet.goal(0, [0.3, 0.2])
+            until(lambda: "planning" in fleet.diagnosis[fleet.diagnosis.index("driving") :])
+            began = fleet.diagnosis[fleet.diagnosis.index("driving") :]
+            speeds = np.array(fleet.speeds)
+            until(lambda: fleet.diagnosis[-1] == "driving")
+        finally:
+            fleet.close()
+    assert [state for state in began if state != "driving"][:2] == ["braking", "planning"]
+    assert speeds[-1] == 0
+    # A tenth is lost in a period of 0.05 s: at 2 m/s² that of the largest speed, 1 m/s.
+    lost = -np.diff(speeds[np.argmax(speeds) :])
+    assert lost.min() >= -1e-6
+    assert lost.max() < 0.15 * speeds.max()
 
 
 def test_velocities_are_taken_from_poses() -> None:
