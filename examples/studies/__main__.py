@@ -29,9 +29,9 @@ SHARED = ("comparisons",)
 NAMES = tuple(sorted({*COMPARISONS, "paper", *(path.stem for path in FOLDER.glob("[a-z]*.py"))} - {*SHARED}))
 WITH_TRIALS = (
     "ablation", "amswarm_gaps", "arrivals", "contact_penalty", "credit_by_update", "disturbance_study", "dynobench",
-    "fewer_samples", "gradient_dilution", "head_to_head", "imitate_expert", "jerk_limits", "lifelong", "multimodality",
-    "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners", "tuned_rivals", "warm_start",
-    "zero_shot",
+    "fewer_samples", "gradient_dilution", "head_to_head", "imitate_expert", "independent_noise", "jerk_limits",
+    "lifelong", "multimodality", "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners",
+    "tuned_rivals", "warm_start", "zero_shot",
 )  # fmt: skip
 """Studies whose trials are in a file of their name."""
 TIMED = ("big-teams", "coarseness", "ipopt")

@@ -263,6 +263,13 @@ def test_arrivals_are_counted_by_iterations(tmp_path: Path) -> None:
     assert (row["robots"], row["iterations until all arrive"], row["solved"]) == ("2", "1", "1 of 1")
 
 
+def test_turned_samples_are_compared_with_others(tmp_path: Path) -> None:
+    completed("independent_noise", tmp_path / "out")
+    (row,) = table(tmp_path / "out" / "independent_noise.csv")
+    assert (row["robots"], row["samples"], row["p"]) == ("2", "64", "1")
+    assert row["reward, turned"] != row["reward, apart"]
+
+
 def test_jerk_is_smaller_where_it_is_limited(tmp_path: Path) -> None:
     completed("jerk_limits", tmp_path / "out")
     free, limited = (float(row["jerk [m²/s⁶]"]) for row in table(tmp_path / "out" / "jerk_limits.csv"))
