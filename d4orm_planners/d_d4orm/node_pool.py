@@ -9,7 +9,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord
@@ -94,10 +93,7 @@ class NodePool(ABC):
 
     Attributes:
         alive: Nodes that have not failed.
-        opened: What is to be closed after them.
     """
-
-    opened: ExitStack
 
     def __init__(
         self, nodes: Sequence[Node], transports: Sequence[Transport], timeout: float, evaluator: Evaluator

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from d4orm_env.core.arrays import BoolArray
@@ -23,6 +23,14 @@ from d4orm_planners.d_d4orm.settings import DD4ormConfig
 from d4orm_planners.d_d4orm.transport import LocalNetwork
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 from d4orm_planners.engine.sampling_types import get_sampling_engine
+
+
+@dataclass(frozen=True)
+class RunningNodes:
+    """The state of a solve: its nodes live from one iteration to the next."""
+
+    crew: NodePool
+    opened: ExitStack
 
 
 class DD4orm(Planner):
@@ -50,7 +58,7 @@ class DD4orm(Planner):
         if config.transport == "ray":
             import_ray("transport 'ray' of d-d4orm")
 
-    def init(self, search: SolveRun) -> NodePool:
+    def init(self, search: SolveRun) -> RunningNodes:
         """See :meth:`Planner.init`: the nodes, ready to begin."""
         with ExitStack() as opened:
             number = self.config.nodes or search.problem.num_robots
@@ -58,8 +66,7 @@ class DD4orm(Planner):
             task = PlanningTask(number, search.seed, search.current.planned, *selection, self._links(search.problem))
             zenoh = self.config.zenoh
             crew = self._local_crew(search, task, opened) if zenoh is None else self._network_crew(search, task, zenoh)
-            crew.opened = opened.pop_all()
-            return crew
+            return RunningNodes(crew, opened.pop_all())
 
     def within(self, communication_range: float) -> DD4orm:
         """See :meth:`Planner.within`: where the robots are the nodes they hear each other within the range only."""
@@ -73,16 +80,16 @@ class DD4orm(Planner):
         starts = problem.start[:, : problem.dimension]
         return None if reach is None else communication_links(problem, starts, reach, line_of_sight=False)
 
-    def iterate(self, search: SolveRun, state: NodePool) -> tuple[NodePool, Iteration]:
+    def iterate(self, search: SolveRun, state: RunningNodes) -> tuple[RunningNodes, Iteration]:
         """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""
-        return state, state.iterate(search)
+        return state, state.crew.iterate(search)
 
-    def finish(self, search: SolveRun, state: NodePool) -> None:
+    def finish(self, search: SolveRun, state: RunningNodes) -> None:
         with state.opened:
-            best = state.close()
+            best = state.crew.close()
             if best.rank > search.best.rank:
                 search.best = best
-            search.metrics |= state.metrics()
+            search.metrics |= state.crew.metrics()
 
     def _network_crew(self, search: SolveRun, task: PlanningTask, zenoh: ZenohSettings) -> NodePool:
         """The one node of a network that this process is."""

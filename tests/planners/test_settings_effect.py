@@ -9,10 +9,12 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Dropout, LimitMismatch, Push, Stall, StateNoise
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import SolveRun, make_planner, make_policy, run_episode
@@ -202,6 +204,16 @@ def lone() -> Problem:
     return make_problem("circle", num_robots=1, diameter=2.0, horizon=60)
 
 
+def past_a_docked_robot(seed: int, num_robots: int, **settings: Any) -> Problem:
+    """One that another stands in the way of, and others far away."""
+    start = np.zeros((num_robots, 4))
+    start[:, 0], start[0, :2] = np.arange(num_robots) * 3, [-1.5, 0.02]
+    start[1, 0] = 0
+    goal = start[:, :2].copy()
+    goal[0, 0] = 1.5
+    return Problem(Team(("holonomic2d",) * num_robots), start, goal, **settings)
+
+
 CONTROLLER: dict[str, Any] = {
     "engine": "cpu", "refine": "off", "num_samples": 16, "num_steps": 4, "predict_horizon": 6, "coarse_samples": 16,
     "coarse_steps": 4, "coarse_repair_steps": 4, "coarse_iterations": 3, "subgoal_offset": 5,
@@ -218,7 +230,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "warm_start": ("go-to-goal", {}),
         "coarse_iterations": (1, {}),
         "max_lag": (0, {}),
-        "line_of_sight": (False, {"scenario": "maze", "max_cycles": 60}),
+        "line_of_sight": (False, {"scenario": past_a_docked_robot, "subgoal_offset": 15}),
         "normalise_distance": (True, {}),
         "safe_mix": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Push(3.0, 0.5)]}),
         "direct_final_approach": (False, {"scenario": "circle", "max_cycles": 80}),
@@ -260,6 +272,8 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "shortest_paths": (False, {"scenario": "rooms"}),
         "deviation": (0.4, {}),
     },
+    "ppo": {"detours": (False, {"scenario": past_a_docked_robot})},
+    "sac": {"detours": (False, {"scenario": past_a_docked_robot})},
 }
 
 
