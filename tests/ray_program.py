@@ -49,7 +49,7 @@ def kill(restarts: int, mode: str) -> tuple[list[int], list[int], list[str], boo
     notes: list[str] = []
     try:
         notes.append(search.advance().note)
-        crew = search.state
+        crew = search.state.crew
         before = [node.search.planner.process for node in crew.alive]
         # Into an iteration, or nearly.
         timer = threading.Timer(0.1, os.kill, (before[1], signal.SIGKILL))
