@@ -87,7 +87,7 @@ class _Writer(NamedTuple):
         return mask
 
     def at_most(self, values: Value, bound: Value) -> Value:
-        """Where that is so; not a number is not at most anything."""
+        """The mask of values up to the bound, which what is not a number never is."""
         return self.builder.fcmp_ordered("<=", values, bound)
 
 

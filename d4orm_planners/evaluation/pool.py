@@ -57,7 +57,7 @@ class JobWorker(Protocol):
         """Hand a job over."""
 
     def receive(self, timeout: float | None) -> Any:
-        """What comes next of the job: :data:`BEGUN`, then each result.
+        """Return the job's next message: :data:`BEGUN`, then each result.
 
         Raises:
             TimeoutError: If it does not come within so many seconds.
@@ -194,7 +194,7 @@ class ProcessWorker:
             process.join()
 
     def _lost(self) -> Exception:
-        """What to raise where a process has died: of its first job's beginning all others would die too."""
+        """The error of a process that has died: as its first job began, and all others would die too, or later."""
         assert self._process is not None
         self._process.join()
         code = self._process.exitcode or 0

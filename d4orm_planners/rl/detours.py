@@ -1,4 +1,4 @@
-"""Ways round robots that have docked, for policies that have learned to head straight for their goals."""
+"""Paths round robots that have docked, for policies that have learned to head straight for their goals."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ class Detours:
         """Numbers of the robots that a docked one is in the way of."""
         docked, ahead = self._docked, joint.goals - places
         beside = joint.states[docked, : self._problem.dimension] - places[:, None]
-        along = np.einsum("kd,knd->kn", ahead, beside) / np.maximum((ahead * ahead).sum(axis=1), 1e-12)[:, None]
+        along = (
+            np.einsum("kd,knd->kn", ahead, beside)
+            / np.maximum((ahead * ahead).sum(axis=1), np.finfo(np.float32).tiny)[:, None]
+        )
         gaps = np.linalg.norm(beside - np.clip(along, 0, 1)[..., None] * ahead[:, None], axis=2)
         reach = self._radius[:, None] + self._radius[docked] + self._problem.margin
         return np.flatnonzero((gaps < reach).any(axis=1) & ~docked)

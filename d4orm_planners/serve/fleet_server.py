@@ -238,15 +238,14 @@ class FleetServer:
         assert last is not None  # nobody brakes who has not driven
         self._pace = max(before - self._braking, 0.0)
         for number, robot in enumerate(self._robots):
-            velocity = self._pace * last.velocity[number]
+            own, turn_rate = robot.command.linear, robot.command.angular.z
+            velocity = turned(np.array([own.x, own.y, own.z]), robot.heading)[: self._problem.dimension]
             stand = last.position[number] if robot.stand is None else robot.stand
-            robot.stand = stand + dt * velocity
-            deceleration = (self._pace - before) / dt * last.velocity[number]
-            point = full_state(robot.name, robot.stand, velocity, deceleration, float(last.heading[number]))
-            self._setpoints[number].publish(point)
-            linear, turn = robot.command.linear, robot.command.angular.z
-            slower = messages.Vector3(*(self._pace * part for part in (linear.x, linear.y, linear.z)))
-            self._commands[number].publish(messages.Twist(slower, messages.Vector3(z=self._pace * turn)))
+            robot.stand = stand + self._pace * dt * velocity
+            point = (robot.stand, self._pace * velocity, (self._pace - before) / dt * velocity, robot.heading)
+            self._setpoints[number].publish(full_state(robot.name, *point))
+            linear = messages.Vector3(*(self._pace * part for part in (own.x, own.y, own.z)))
+            self._commands[number].publish(messages.Twist(linear, messages.Vector3(z=self._pace * turn_rate)))
 
     def _stand(self) -> None:
         """Have everybody stand where it was when that began."""

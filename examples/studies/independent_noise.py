@@ -18,43 +18,38 @@ from scipy.stats import mannwhitneyu
 
 from d4orm_env import Problem, make_problem, rollout
 from d4orm_env.core.arrays import FloatArray
-from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
+from d4orm_planners import make_planner
+from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
 from d4orm_planners.evaluation.summary import mean_interval
 from d4orm_planners.reference import denoise_around_rest
-from d4orm_planners.sampling.settings import annealed
-from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.sampling.loop import SamplingPlanner
 
 Rows = list[dict[str, Any]]
 
 TEAMS = ((8, 128), (8, 1024), (16, 128))
 """Robots and samples."""
-NUM_STEPS, TEMPERATURE = 100, 0.3
 
 
-def turned(problem: Problem, noise_scale: FloatArray, num_samples: int, seed: int) -> FloatArray:
+def turned(problem: Problem, planner: SamplingPlanner, num_samples: int, seed: int) -> FloatArray:
     """Denoise with three of four samples turned."""
     zero = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
-    rules = SamplingRules(weights=SoftmaxWeights(TEMPERATURE))
-    return (
-        get_sampling_engine("cpu")
-        .denoise(SamplingTask(problem, zero, credit="team"), rules, zero, noise_scale, num_samples, seed)
-        .mean
-    )
+    task, noise_scale = SamplingTask(problem, zero, credit="team"), planner.noise_scale()
+    return get_sampling_engine("cpu").denoise(task, planner.rules(), zero, noise_scale, num_samples, seed).mean
 
 
-def apart(problem: Problem, noise_scale: FloatArray, num_samples: int, seed: int) -> FloatArray:
+def apart(problem: Problem, planner: SamplingPlanner, num_samples: int, seed: int) -> FloatArray:
     """Denoise with every sample drawn by itself."""
-    return denoise_around_rest(problem, noise_scale, num_samples, TEMPERATURE, seed)
+    return denoise_around_rest(problem, planner.noise_scale(), num_samples, planner.config.temperature, seed)
 
 
-def measure(teams: Any, seeds: int, num_steps: int) -> Rows:
+def measure(teams: Any, seeds: int, **settings: Any) -> Rows:
     """A row of every team, noise and seed."""
-    rows = []
+    rows, planner = [], make_planner("d4orm", preset="paper", **settings)
     for robots, samples in teams:
-        problem, noise_scale = make_problem("paper_circle", num_robots=robots), annealed(num_steps, 1e-4, 2e-2)
+        problem = make_problem("paper_circle", num_robots=robots)
         for draw in (turned, apart):
             for seed in range(seeds):
-                result = rollout(problem, draw(problem, noise_scale, samples, seed), engine="cpu")
+                result = rollout(problem, draw(problem, planner, samples, seed), engine="cpu")
                 rows.append(
                     {"robots": robots, "samples": samples, "noise": draw.__name__, "seed": seed,
                      "reward": float(result.rewards.mean()), "arrived": float(result.arrived[-1].mean())}
@@ -82,8 +77,8 @@ def summary(rows: Rows) -> Rows:
 def main() -> None:
     """Run every team, noise and seed, and write the table."""
     arguments = study_parser(__doc__, seeds=20).parse_args()
-    measured = partial(measure, TEAMS, arguments.seeds, NUM_STEPS)
+    measured = partial(measure, TEAMS, arguments.seeds)
     if arguments.quick:
-        measured = partial(measure, ((2, 64),), 1, 5)
+        measured = partial(measure, ((2, 64),), 1, num_steps=5)
     rows = study_rows(arguments, "independent_noise", measured)
     save_table(summary(rows), arguments.out / "independent_noise.csv")
