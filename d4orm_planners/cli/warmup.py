@@ -45,6 +45,7 @@ from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.weights import SoftmaxWeights
+from d4orm_planners.tracking.reference_drives import follow_reference, reference_kernel
 from d4orm_planners.tracking.steering import prepare_drives, standing
 from d4orm_planners.tracking.tracker import straight_kernel
 
@@ -126,6 +127,8 @@ def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
     """Look for drives as a planner begins with, in the smallest problem of a team of these models."""
     planner, problem = make_planner(driver, engine="cpu"), _smallest_problem(models)
     prepare_drives(problem)
+    at_rest = np.zeros((1, *problem.goal.shape), np.float32)
+    follow_reference(problem, problem.start, at_rest, at_rest, 0.0)
     _index_paths(problem)
     # Last, because this rolls out, which another process compiles meanwhile.
     planner.init(SolveRun(planner, problem, seed=0))
@@ -254,6 +257,7 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
         *worlds,
         *map(score_kernel, TEAMS),
         *map(straight_kernel, COMMON),
+        *map(reference_kernel, COMMON),
     ]
     kernels += map(search_kernel, COMMON)
     return [kernel for kernel in kernels if isinstance(kernel, Dispatcher) and kernel.stats.cache_path is not None]

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
 Result = TypeVar("Result")
@@ -38,13 +38,6 @@ class Background(Generic[Result]):
             return False, None
         job, self._job = self._job, None
         return True, job.result()
-
-    def answer(self, work: Callable[[], Result], timeout: float) -> Result | None:
-        """Return the result of the work if there is one within the time [s]; else it is the next :meth:`result`."""
-        self.start(work)
-        assert self._job is not None
-        wait([self._job], timeout)
-        return self.result()[1]
 
     def run(self, work: Callable[[], Result], timeout: float) -> Result | None:
         """Return the result of the work within the time [s], or ``None``. What is late goes on, and is thrown away."""

@@ -8,9 +8,8 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.tracking.steering import track_team
+from d4orm_planners.tracking.reference_drives import follow_reference
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -179,21 +178,11 @@ class StagnationMonitor:
         return idle, self._careful_until > step
 
 
-def keep_time(
-    problem: Problem, engine: Engine, joint: JointState, path: FloatArray, indices: IntArray, horizon: int
-) -> FloatArray:
+def keep_time(problem: Problem, joint: JointState, path: FloatArray, indices: IntArray, horizon: int) -> FloatArray:
     """``(horizon, K, m)`` controls that take every robot along its path in the path's own time, as if none docked.
 
     Of ``path`` ``(H+1, K, d)``, which has a waypoint per time step of the problem [m], they should be at ``indices``
     ``(K,)`` now; from elsewhere they catch up.
     """
-    every, last, d = np.arange(len(indices)), len(path) - 1, path.shape[2]
-
-    def wanted(t: int, states: FloatArray) -> FloatArray:
-        now, after = (path[np.minimum(indices + step, last), every] for step in (t, t + 1))
-        velocities: FloatArray = (after - now) / problem.dt + CATCHING_UP * (now - states[:, :d])
-        return velocities
-
-    controls = track_team(problem.with_state(joint.states, joint.goals), engine, horizon, wanted, each_alone=True)
-    assert controls is not None
-    return controls
+    due = path[np.minimum(indices + np.arange(horizon + 1)[:, None], len(path) - 1), np.arange(len(indices))]
+    return follow_reference(problem, joint.states, due[:-1], np.diff(due, axis=0) / problem.dt, CATCHING_UP)

@@ -38,10 +38,6 @@ NEARER = 1 / 3
 """Least progress towards the goals, all robots together, in radii of the largest one."""
 
 
-WAITING = 0.5
-"""Share of the deadline that a loop waits for a new plan."""
-
-
 class CoarsePlanTracker:
     """Leads a team through an episode.
 
@@ -117,13 +113,13 @@ class CoarsePlanTracker:
         walls = self.guidance.ordered
         return visible_subgoals(self.problem, positions, path, self._indices, targets, docked, walls)
 
-    def followed(self, joint: JointState, engine: SamplingEngine, horizon: int) -> FloatArray:
+    def followed(self, joint: JointState, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path, from where on it it is."""
-        return keep_time(self.problem, engine, joint, self.guidance.path, self._indices, horizon)
+        return keep_time(self.problem, joint, self.guidance.path, self._indices, horizon)
 
-    def timed(self, joint: JointState, engine: SamplingEngine, horizon: int) -> FloatArray:
+    def timed(self, joint: JointState, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path in the team's time."""
-        return keep_time(self.problem, engine, joint, self.guidance.path, self._clock(), horizon)
+        return keep_time(self.problem, joint, self.guidance.path, self._clock(), horizon)
 
     def _clock(self) -> IntArray:
         """``(K,)`` waypoints at which the robots should be now: the team's, or not far from where they are."""
@@ -142,7 +138,7 @@ class CoarsePlanTracker:
     def replan_if_needed(self, joint: JointState, docked: BoolArray) -> bool:
         """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end.
 
-        With a deadline a plan may be late: the team goes on with the old one until it is there.
+        With a deadline that is done beside the control loops: the team goes on with the old plan until then.
         """
         if self._late is not None:
             done, late = self._replanning.result()
@@ -176,12 +172,9 @@ class CoarsePlanTracker:
         if self._config.deadline is None:
             self._follow(joint, work(), anew)
             return True
-        guidance = self._replanning.answer(work, WAITING * self._config.deadline)
-        if guidance is None:
-            self._late = joint, anew
-            return False
-        self._follow(joint, guidance, anew)
-        return True
+        self._replanning.start(work)
+        self._late = joint, anew
+        return False
 
     def _idle_for_long(self, joint: JointState, docked: BoolArray) -> BoolArray:
         """``(K,)`` robots that have got nowhere on this path for so long that they need another; notes the stuck."""
@@ -210,7 +203,7 @@ class CoarsePlanTracker:
         initial = straight_drives(present).controls[:, :, 0]
         if keep.any():
             paths = self.guidance.path[::factor]
-            along = keep_time(present, self._refiner, joint, paths, self._clock() // factor, present.horizon)
+            along = keep_time(present, joint, paths, self._clock() // factor, present.horizon)
             initial[:, keep] = along[:, keep]
         return initial
 

@@ -13,7 +13,7 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach, docking_radius
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine, SamplingRules, SamplingTask
-from d4orm_planners.tracking.steering import track_velocities
+from d4orm_planners.tracking.reference_drives import follow_reference
 
 SHORTER = 3
 """Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise."""
@@ -84,6 +84,7 @@ class Window:
         window = self.problem.with_state(joint.states, joint.goals, horizon=self._config.predict_horizon)
         task = SamplingTask(window, self.no_controls(), arrived=joint.arrived)
         self._engine.prepare(task, self._rules, self._noise_scale, self._config.num_samples)
+        self.stop(joint)
 
     def no_controls(self) -> FloatArray:
         """``(H_predict, K, m)`` zeros."""
@@ -148,30 +149,25 @@ class Window:
         times = self.problem.dt * np.arange(1, horizon + 1, dtype=np.float32)[:, None, None]
         return MovingObstacles(seen[:, :d] + times * seen[:, d : 2 * d], seen[:, -1])
 
-    def _with_stop(
-        self, window: Problem, controls: FloatArray, states: FloatArray, steps: int, docked: BoolArray
-    ) -> FloatArray:
-        """``(H_predict + S, K, m)`` the first ``steps`` controls, and then those that bring everyone but the ``docked``
-        ``(K,)`` to rest as soon as can be, in ``S`` steps at most; ``states`` ``(H_predict + 1, K, n)`` are what
-        ``controls`` lead to.
+    def _with_stop(self, window: Problem, controls: FloatArray, states: FloatArray, steps: int) -> FloatArray:
+        """``(H_predict + S, K, m)`` the first ``steps`` controls, and then those that bring everyone to rest as soon as
+        can be, in ``S`` steps at most; ``states`` ``(H_predict + 1, K, n)`` are what ``controls`` lead to.
         """
         stopping = np.zeros((len(controls) + self._stop_steps, *controls.shape[1:]), np.float32)
         stopping[:steps] = controls[:steps]
-        present, still = states[steps], np.zeros(window.goal.shape, np.float32)
-        for t in range(steps, steps + self._stop_steps):
-            stopping[t] = track_velocities(window, present, still)
-            present = self._engine.move(window.arrays, present, docked, stopping[t : t + 1])[1]
+        at_rest = np.zeros((self._stop_steps, *window.goal.shape), np.float32)
+        stopping[steps : steps + self._stop_steps] = follow_reference(window, states[steps], at_rest, at_rest, 0.0)
         return stopping
 
     def _states(self, window: Problem, controls: FloatArray) -> FloatArray:
         """``(T+1, K, n)`` states that controls ``(T, K, m)`` lead to."""
         return self._engine.move(window.arrays, window.start, np.zeros(window.num_robots, bool), controls)
 
-    def stop(self, joint: JointState, docked: BoolArray) -> FloatArray:
+    def stop(self, joint: JointState) -> FloatArray:
         """``(H_predict + S, K, m)`` controls that bring everyone to rest now."""
         nothing = self.no_controls()
         present = self.problem.with_state(joint.states, joint.goals, horizon=len(nothing))
-        return self._with_stop(present, nothing, present.start[None], 0, docked)
+        return self._with_stop(present, nothing, present.start[None], 0)
 
     def _safe_mix(
         self, window: Problem, fresh: FloatArray, special: BoolArray, sampled: FloatArray, now: Situation
@@ -187,7 +183,7 @@ class Window:
         before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
         before[: len(now.left)] = now.left
         states = self._states(window, fresh)
-        controls = self._with_stop(window, fresh, states, horizon, now.docked)
+        controls = self._with_stop(window, fresh, states, horizon)
         window_to_rest = window.with_state(window.start, window.goal, horizon=len(controls))
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
@@ -195,13 +191,13 @@ class Window:
         if (held := violated & special).any():
             fresh = np.where(held[:, None], sampled, fresh)
             states = self._states(window, fresh)
-            controls[:, held] = self._with_stop(window, fresh, states, horizon, now.docked)[:, held]
+            controls[:, held] = self._with_stop(window, fresh, states, horizon)[:, held]
             trajectory, violated = self._violations(window_to_rest, controls, now)
         while (violating := violated & (steps > 0)).any():
             steps[violating] //= SHORTER
             steps[steps < self._config.execute_horizon] = 0
             for number in np.unique(steps[violating]):
-                fewer = self._with_stop(window, fresh, states, int(number), now.docked) if number else before
+                fewer = self._with_stop(window, fresh, states, int(number)) if number else before
                 chosen = violating & (steps == number)
                 controls[:, chosen] = fewer[:, chosen]
             trajectory, violated = self._violations(window_to_rest, controls, now)

@@ -153,7 +153,7 @@ class D4ormC2F(StatePolicy):
         if touching.any():
             # A late loop may still be reading the plan.
             self._plan = self._plan.copy()
-            self._plan[now:, touching] = self._window.stop(joint, docked)[: len(self._plan) - now, touching]
+            self._plan[now:, touching] = self._window.stop(joint)[: len(self._plan) - now, touching]
         # Now they are told all that they may be able to do, whatever they are believed to be.
         braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
         controls = np.where(touching[:, None], braking, controls)
@@ -193,7 +193,7 @@ class D4ormC2F(StatePolicy):
         left, base = self._plan[self._next :], self._base(joint)
         seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
         stuck = guide.stuck & ~docked
-        careful = guide.followed(joint, self._engine, len(base)) if stuck.any() else None
+        careful = guide.followed(joint, len(base)) if stuck.any() else None
         room = self._deviation.room(self.config.reaction_time)
         now = Situation(joint, docked, subgoals, base, left, careful, stuck, room)
 
@@ -219,7 +219,7 @@ class D4ormC2F(StatePolicy):
         """
         horizon = self.config.predict_horizon
         if self._guide.guidance.ordered:
-            return self._guide.timed(joint, self._engine, horizon)
+            return self._guide.timed(joint, horizon)
         base = self._window.no_controls()
         ahead = self._plan[self._next : horizon]
         base[: len(ahead)] = ahead

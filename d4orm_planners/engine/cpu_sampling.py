@@ -27,6 +27,9 @@ from d4orm_planners.engine.sampling_types import (
     StepWatcher,
 )
 
+WORTH_A_THREAD = 2**16
+"""Samples' steps of a robot; fewer are scored before another thread has woken up."""
+
 
 class CpuSamplingEngine(CpuEngine):
     """The CPU engine that samples as well. Stateless: all instances are alike."""
@@ -93,7 +96,8 @@ class Sampling:
 
     def __init__(self, task: SamplingTask, rules: SamplingRules, num_samples: int, seed: int, threads: Threads) -> None:
         problem = task.problem
-        self.task, self.threads = task, threads
+        worth = task.base.shape[0] * problem.num_robots * num_samples // WORTH_A_THREAD
+        self.task, self.threads = task, Threads(min(threads.num_threads, max(worth, 1)))
         self.arrays, moving = typed(task.arrays), task.moving or _nobody(task)
         self.kernel = score.score_kernel(problem.team.models)
         self.spaces: dict[int, score.Workspace] = {}

@@ -18,7 +18,7 @@ from d4orm_env.core.portable import arctan2, cos, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
-from d4orm_planners.tracking.steering import track_team
+from d4orm_planners.tracking.steering import track_velocities
 
 SLACK = 1 / 75
 """Added to the distance that robots keep from each other in it, in radii of the largest robot."""
@@ -83,7 +83,15 @@ def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray 
         _, direction = bends.at(_driven(then, speed, acceleration))
         return direction * np.minimum(speed, acceleration * then)[:, None] + CORRECTION * (due - states[:, :2])
 
-    return track_team(problem, engine, problem.horizon, wanted, each_alone=False)
+    states, arrived = problem.start, np.zeros(problem.num_robots, bool)
+    controls = np.empty((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    for t in range(problem.horizon):
+        controls[t] = track_velocities(problem, states, wanted(t, states).astype(np.float32))
+        after = engine.step(problem.arrays, states, arrived, controls[t])
+        if after.margin_violated.any():
+            return None
+        states, arrived = after.states, after.arrived & problem.docks
+    return controls
 
 
 def _driven(time: float | Floats, speed: Floats, acceleration: Floats) -> Floats:

@@ -136,7 +136,7 @@ def steering(name: str) -> Steering:
     """
     robot = MODELS[name]
     approach = inlined(robot.functions.approach)
-    scaled, length, between = _vectors(robot.dimension)
+    scaled, length, between = vectors(robot.dimension)
     turned = _turning(robot, length)
 
     @inlined
@@ -159,7 +159,7 @@ def steering(name: str) -> Steering:
     return steer
 
 
-def _vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Length, Callable[[Row, Row], Row]]:
+def vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Length, Callable[[Row, Row], Row]]:
     """``origin + step * factor``, the length of a step, and the step from a state to a place."""
     squared_norm = SQUARED_NORM[dimension]
 

@@ -17,7 +17,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep
-from d4orm_env.engine.types import Engine
 
 Rows = TypeVar("Rows", FloatArray, Floats)
 Columns: TypeAlias = tuple[FloatArray, ...]
@@ -125,34 +124,6 @@ def _by_rows(problem: Problem, width: int, rows: tuple[FloatArray, ...], law: Ca
         result = np.stack(law(model.functions, *columns), axis=1)
         results[robots, : result.shape[1]] = result
     return results
-
-
-def track_team(
-    problem: Problem, engine: Engine, steps: int, wanted: Callable[[int, FloatArray], ArrayLike], *, each_alone: bool
-) -> FloatArray | None:
-    """Drive the team from its start at velocities that depend on where it is.
-
-    Args:
-        problem: The team.
-        engine: Engine for the steps.
-        steps: ``T``.
-        wanted: ``(step, states (K, n)) -> (K, d)`` velocities [m/s].
-        each_alone: Whether none arrives and none is in the way of another.
-
-    Returns:
-        ``(T, K, m)`` controls; ``None`` if a robot comes within the margin of anything.
-    """
-    states, arrived = problem.start, np.zeros(problem.num_robots, bool)
-    controls = np.empty((steps, problem.num_robots, problem.control_size), np.float32)
-    for t in range(steps):
-        controls[t] = track_velocities(problem, states, np.asarray(wanted(t, states), np.float32))
-        after = engine.step(problem.arrays, states, arrived, controls[t])
-        states = after.states
-        if not each_alone:
-            arrived = after.arrived & problem.docks
-            if after.margin_violated.any():
-                return None
-    return controls
 
 
 def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals: FloatArray) -> BoolArray:

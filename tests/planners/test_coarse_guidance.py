@@ -11,7 +11,9 @@ from planner_support import hop_problem
 
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
+from d4orm_env.dynamics.models import COMMON
 from d4orm_env.envs.joint_state import JointState
+from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.candidate import failed_robots
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
@@ -32,6 +34,8 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.sampling_types import get_sampling_engine
+from d4orm_planners.tracking.reference_drives import follow_reference
+from d4orm_planners.tracking.steering import present_velocities
 
 
 @pytest.mark.parametrize(
@@ -206,8 +210,26 @@ def test_who_does_not_get_on_is_stuck() -> None:
 def test_a_path_is_followed() -> None:
     problem, engine, path = hop_problem(1, horizon=100), get_sampling_engine("cpu"), right_angle(1)
     present = problem.with_state(problem.start, path[-1])
-    controls = keep_time(problem, engine, joint(present, problem.start), path, np.zeros(1, int), 100)
+    controls = keep_time(problem, joint(present, problem.start), path, np.zeros(1, int), 100)
     places = engine.rollout(present, controls).positions[:, 0]
     off = np.linalg.norm(places[:, None] - path[:, 0], axis=2).min(axis=1)
     assert off.max() < 0.25
     assert np.linalg.norm(places[-1] - path[-1, 0]) < 0.1
+
+
+@pytest.mark.parametrize("model", COMMON)
+def test_robots_are_driven_at_a_velocity_and_brought_to_rest_in_as_few_steps_as_can_be(model: str) -> None:
+    problem = make_problem("circle", num_robots=2, model=model)
+    engine, steps, half = get_sampling_engine("cpu"), 20, np.float32(problem.team.max_speed[0] / 2)
+    along = (problem.goal - problem.start[:, : problem.dimension]) / 5
+    rows = [np.tile(half * share * along, (steps, 1, 1)).astype(np.float32) for share in (1, 0)]
+    nobody, states = np.zeros(2, bool), problem.start
+    for wanted in rows:
+        controls = follow_reference(problem, states, np.zeros_like(wanted), wanted, 0.0)
+        driven = engine.move(problem.arrays, states, nobody, controls)
+        velocity = present_velocities(problem, driven[-1], controls[-1])
+        np.testing.assert_allclose(velocity, wanted[0], atol=1e-3)
+        states = driven[-1]
+    if not problem.team.robot_models[0].first_order:
+        braking = int(np.ceil(half / (problem.team.max_acceleration[0] * problem.dt)))
+        np.testing.assert_allclose(driven[braking:] - driven[braking], 0, atol=1e-6)
