@@ -127,8 +127,6 @@ def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
     """Look for drives as a planner begins with, in the smallest problem of a team of these models."""
     planner, problem = make_planner(driver, engine="cpu"), _smallest_problem(models)
     prepare_drives(problem)
-    at_rest = np.zeros((1, *problem.goal.shape), np.float32)
-    follow_reference(problem, problem.start, at_rest, at_rest, 0.0)
     _index_paths(problem)
     # Last, because this rolls out, which another process compiles meanwhile.
     planner.init(SolveRun(planner, problem, seed=0))
@@ -183,6 +181,8 @@ def warm_up() -> WarmupReport:
         roll_out_once(models)
     for models in TEAMS[1:]:
         drive_once(models)
+    for models in TEAMS[:-1]:
+        _brake(models)
     _step_environments()
     other.wait()
     sample_once(TEAMS)
@@ -220,6 +220,13 @@ def _plan() -> None:
     # A planner that does not sample has nothing to compile that the others have not.
     for name in (name for name in PLANNERS.own() if issubclass(PLANNERS[name], SamplingPlanner)):
         make_planner(name, engine="cpu", num_samples=32, num_steps=1).solve(problem, max_iterations=1)
+
+
+def _brake(models: tuple[str, ...]) -> None:
+    """Bring robots to rest, as D4orm-C2F does after its plans."""
+    problem = _smallest_problem(models)
+    at_rest = np.zeros((1, *problem.goal.shape), np.float32)
+    follow_reference(problem, problem.start, at_rest, at_rest, 0.0)
 
 
 def _evade() -> None:
