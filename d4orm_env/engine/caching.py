@@ -31,6 +31,7 @@ from numba.core.caching import (
 )
 from numba.core.codegen import JITCPUCodegen
 from numba.core.compiler import CompileResult
+from numba.core.runtime.nrt import rtsys
 from numba.core.typing.templates import Signature
 from numba.misc.appdirs import AppDirs
 
@@ -194,6 +195,15 @@ class _SourceKeyedCache(FunctionCache):
 
     def _index_key(self, sig: Signature, codegen: JITCPUCodegen) -> tuple[object, ...]:
         return sig, codegen.magic_tuple(), self._source_key
+
+    def load_overload(self, sig: Signature, target_context: Any) -> Any:
+        """Return what is kept for a signature, or ``None``.
+
+        numba fills its registries first, for half a second, which only compiling has a use for.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
     def _load_overload(self, sig: Signature, target_context: Any) -> Any:
         shipped = self._shipped and self._shipped.load((sig, self._source_key))

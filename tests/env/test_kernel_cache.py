@@ -7,6 +7,7 @@ import errno
 import hashlib
 import importlib.util
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -266,3 +267,15 @@ class TestKernelCache:
         monkeypatch.setattr(config, "DISABLE_JIT", 1)
         with pytest.raises(ImportError, match="NUMBA_DISABLE_JIT is set"):
             self.hits(path)
+
+
+def test_numbas_registries_are_filled_only_to_compile(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNEL)
+    call = "import sys, kernels; print(kernels.twice(2), 'numba.np.linalg' in sys.modules)"
+    for filled in (True, False):
+        ran = subprocess.run(
+            [sys.executable, "-c", call],
+            cwd=tmp_path, env=os.environ | {"KERNEL_KEY": "", "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert ran.stdout.split() == ["4", str(filled)]
