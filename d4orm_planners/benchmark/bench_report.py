@@ -149,6 +149,9 @@ _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
         "loop, ms": lambda row: milliseconds(row["loop"]),
         "95%, ms": lambda row: f"{row['loop_95'] * 1e3:.1f}",
         "largest, ms": lambda row: f"{row['loop'].largest * 1e3:.1f}",
+        "loops": lambda row: row["loop"].count,
+        "replanned": itemgetter("replanned"),
+        "held": itemgetter("held"),
         "plan.sample(), ms": lambda row: milliseconds(row["sample"]),
     }),
     "startup": _tabulated("From the start of a process to its first plan", {
