@@ -11,12 +11,13 @@ import io
 import signal
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from d4orm_planners.base.display import one_line
 from d4orm_planners.cli import on_signals
@@ -52,13 +53,24 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 """Module and function of each command, and its line in the help."""
 
 
+class OnceEach(TyperCommand):
+    """A command none of whose options is given twice, unless it takes several: one would count for nothing."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given = Counter(self.make_parser(ctx).parse_args(args=list(args))[2])
+        for parameter, times in given.items():
+            if times > 1 and not parameter.multiple:
+                raise ValueError(f"{parameter.opts[0]} is given {times} times; give it once")
+        return super().parse_args(ctx, args)
+
+
 class LazyCommands(Mapping[str, Any]):
     """The commands by name, each imported when it is looked up: help needs none of them."""
 
     def __getitem__(self, name: str) -> Any:
         module, _, function = COMMANDS[name][0].partition(":")
         alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-        alone.command(name)(getattr(import_module(f"d4orm_planners.cli.{module}"), function))
+        alone.command(name, cls=OnceEach)(getattr(import_module(f"d4orm_planners.cli.{module}"), function))
         return typer.main.get_command(alone)
 
     def __iter__(self) -> Iterator[str]:

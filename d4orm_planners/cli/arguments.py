@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import typer
 
 from d4orm_env.core.files import parse_yaml, target_of
+from d4orm_planners.base.planner_registry import list_policies
 
 N = TypeVar("N", int, float)
 
@@ -70,6 +71,21 @@ def _add(values: dict[str, object], name: str, text: str, option: str, what: str
         values[name] = parse_yaml(text)
     except ValueError as error:
         raise ValueError(f"{option} {what} {error}") from None
+
+
+def policies_by_label(texts: list[str], option: str = "--policy") -> dict[str, dict[str, object]]:
+    """``policy`` and settings by label: a name stands for itself, and a configuration is called what was typed."""
+    chosen: dict[str, dict[str, object]] = {}
+    for text in texts:
+        # The name ends where the first setting begins, for an import path has a colon too.
+        policy, colon, _ = text.partition("=")[0].rpartition(":")
+        if not colon or ("=" not in text and policy not in list_policies()):
+            chosen.update((name, {}) for name in names(text) or ())
+            continue
+        if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), option)):
+            raise ValueError(f"{option} {text!r}: 'policy' is no setting; the name stands before the colon")
+        chosen[text] = {"policy": policy, **values}
+    return chosen
 
 
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from d4orm_planners.base.display import one_line
-from d4orm_planners.base.planner_registry import list_policies, setting_names
+from d4orm_planners.base.planner_registry import setting_names
 from d4orm_planners.cli.arguments import (
     check_target,
     decimals,
@@ -19,6 +19,7 @@ from d4orm_planners.cli.arguments import (
     output_folder,
     parse_levels,
     parse_settings,
+    policies_by_label,
     seed_list,
 )
 from d4orm_planners.cli.common_options import (
@@ -149,7 +150,9 @@ class StudyOptions(ObservationOptions):
 
     def _study(self) -> Study:
         return Study(
-            policies=_with_settings(_policies(self.policies or ["d4orm,go-to-goal"]), parse_settings(self.settings)),
+            policies=_with_settings(
+                policies_by_label(self.policies or ["d4orm,go-to-goal"]), parse_settings(self.settings)
+            ),
             scenarios=names(self.scenario) or (),
             seeds=seed_list(self.seeds),
             control_noise_std=decimals(
@@ -199,21 +202,6 @@ def require_trials(rates: list[SuccessRate]) -> None:
         trials = sum(rate.trials for rate in rates)
         typer.echo(f"every trial ({trials}) ended with an error; the first: {one_line(rates[0].error)}", err=True)
         raise typer.Exit(1)
-
-
-def _policies(texts: list[str]) -> dict[str, dict[str, object]]:
-    """Settings by label: a name stands for itself, and a configuration is called what was typed."""
-    chosen: dict[str, dict[str, object]] = {}
-    for text in texts:
-        # The name ends where the first setting begins, for an import path has a colon too.
-        policy, colon, _ = text.partition("=")[0].rpartition(":")
-        if not colon or ("=" not in text and policy not in list_policies()):
-            chosen.update((name, {}) for name in names(text) or ())
-            continue
-        if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), "--policy")):
-            raise ValueError(f"--policy {text!r}: 'policy' is no setting; the name stands before the colon")
-        chosen[text] = {"policy": policy, **values}
-    return chosen
 
 
 def _with_settings(chosen: dict[str, dict[str, object]], settings: dict[str, object]) -> dict[str, dict[str, object]]:

@@ -91,7 +91,9 @@ def export(
     format: Annotated[
         str, typer.Option("--format", "-f", help="csv, crazyswarm2, rosbag2 or mcap.", show_default=True)
     ] = "csv",
-    rate: Annotated[float, typer.Option(help="Setpoints per second.")] = 100.0,
+    rate: Annotated[
+        float | None, typer.Option(help="Setpoints per second; polynomials have none.", show_default="100")
+    ] = None,
     height: Annotated[float, typer.Option(help="z of a team that moves in the plane [m].")] = 0.0,
     max_acceleration: Annotated[
         float | None,
@@ -100,11 +102,11 @@ def export(
     max_jerk: Annotated[float | None, typer.Option(help="Limit of the setpoints [m/s^3].", show_default="none")] = None,
 ) -> None:
     """Smooth a plan, verify it again, and write setpoints for robots to execute."""
-    plan = Plan.load(plan_file)
+    if rate is not None and format == "crazyswarm2":
+        raise ValueError(f"--rate {rate:g} would count for nothing: {format} takes polynomials; leave it out")
+    plan, rates = Plan.load(plan_file), {} if rate is None else {"rate": rate}
     with output_folder(out):
-        report = plan.export(
-            format, out, rate=rate, height=height, max_acceleration=max_acceleration, max_jerk=max_jerk
-        )
+        report = plan.export(format, out, height=height, max_acceleration=max_acceleration, max_jerk=max_jerk, **rates)
     rows = [
         ("files", f"{len(report.files)} in {out}"),
         ("duration", f"{report.duration:.2f} s, {report.stretch:.2f} times the plan's"),
@@ -112,6 +114,8 @@ def export(
         ("least gap to obstacles", f"{report.min_clearance:.3f} m"),
         ("deviation from the plan", f"{report.deviation:.3f} m"),
     ]
+    if plan.problem.dimension == 3:
+        rows.append(("heights", "{:.2f} to {:.2f} m".format(*report.heights)))
     if report.min_overhead < np.inf:
         rows.append(("least height above another", f"{report.min_overhead:.3f} m; mind the downwash"))
     if report.pieces is not None:

@@ -19,7 +19,7 @@ from d4orm_planners.base.episode import open_env, run_episode
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner, make_policy
 from d4orm_planners.base.policy import OpenLoop
-from d4orm_planners.cli.arguments import check_target, names, output_folder, refuse_options, single_levels
+from d4orm_planners.cli.arguments import check_target, output_folder, policies_by_label, refuse_options, single_levels
 from d4orm_planners.cli.common_options import (
     Disturb,
     Engine,
@@ -53,15 +53,15 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
         typer.Option(
             "--policy",
             "-p",
-            help="Planner, policy or package.module:Name.",
+            help="Planner, policy or package.module:Name, with settings behind a colon: ppo:path=mine.zip.",
             show_default="the planner of make_planner()",
         ),
     ] = None
     preset: Annotated[str | None, typer.Option(help="Preset of the policy, as `paper`.")] = None
     control_noise_std: NoiseLevel = 0.0
     compare: Annotated[
-        str | None,
-        typer.Option(help="Several policies, separated by commas, on the same problem and seed."),
+        list[str] | None,
+        typer.Option(help="Policies on the same problem and seed, as of `d4orm evaluate --policy`; repeatable."),
     ] = None
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Replay to write, .html.")] = None
     physics: Physics = "model"
@@ -82,8 +82,12 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
     def chosen(self) -> tuple[Problem, Policy]:
         """The problem, and what acts in it."""
         if self.plan_file is None:
-            chosen = {} if self.preset is None else {"preset": self.preset}
-            return self.problem(), make_policy(RECOMMENDED if self.policy is None else self.policy, **chosen)
+            preset = {} if self.preset is None else {"preset": self.preset}
+            named = _made([RECOMMENDED if self.policy is None else self.policy], "--policy", **preset)
+            if len(named) > 1:
+                raise ValueError(f"--policy {self.policy!r} names several; give one, or all of them to --compare")
+            (policy,) = named.values()
+            return self.problem(), policy
         refuse_options(
             self.context,
             {"policy", "preset", "compare", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
@@ -93,13 +97,19 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
         return plan.problem, OpenLoop(plan=plan)
 
 
+def _made(texts: list[str], option: str, **settings: object) -> dict[str, Policy]:
+    """The policies that an option names, by label."""
+    chosen = policies_by_label(texts, option)
+    return {label: make_policy(str(given.pop("policy", label)), **given, **settings) for label, given in chosen.items()}
+
+
 @takes(RunOptions)
 def run(options: RunOptions) -> None:
     """Run a plan or a policy in the environment, step by step, and judge what happened."""
     options.check_pictures()
     check_target(options.out, (".html",))
     if options.compare is not None:
-        compare(options, names(options.compare) or ())
+        compare(options, options.compare)
         return
     disturbances = options.disturbances()
     problem, policy = options.chosen()
@@ -114,13 +124,13 @@ def run(options: RunOptions) -> None:
     require_success(episode, problem)
 
 
-def compare(options: RunOptions, policies: Sequence[str]) -> None:
+def compare(options: RunOptions, texts: list[str]) -> None:
     """Run several policies on the same problem with the same seed, and write them side by side."""
     if options.out is None:
         raise ValueError("--compare needs --out, the replay to write, as --out compare.html")
     alone = {"policy", "preset", "picture", "animation", "plan_file"}
-    refuse_options(options.context, alone, f"does not go with --compare {','.join(policies)}; run that policy alone")
-    problem, makers = options.problem(), {name: make_policy(name) for name in policies}
+    refuse_options(options.context, alone, f"does not go with --compare {','.join(texts)}; run that policy alone")
+    problem, makers = options.problem(), _made(texts, "--compare")
     episodes = {}
     for name, policy in makers.items():
         episodes[name] = options.execute(problem, policy, options.disturbances())

@@ -207,7 +207,7 @@ def _names(kernels: Iterable[Dispatcher[Callable[..., object]]]) -> tuple[str, .
 def _smallest_problem(models: tuple[str, ...]) -> Problem:
     team = Team(models)
     start = np.zeros((team.num_robots, team.state_size))
-    start[:, 0] = np.arange(team.num_robots)
+    start[:, 1] = np.arange(team.num_robots)  # beside each other: trailers are behind
     return Problem(team, start=start, goal=start[:, : team.dimension] + 1, horizon=5)
 
 

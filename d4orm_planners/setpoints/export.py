@@ -128,6 +128,7 @@ class ExportReport:
         min_clearance: Least gap to an obstacle or bound [m].
         min_overhead: Least height of a robot above the centre of another, no farther beside it than both radii and the
             margin [m]; infinite where none flies over another, or the team moves in the plane.
+        heights: Lowest and highest z of any robot [m].
         pieces: Polynomials a robot, or ``None``.
     """
 
@@ -138,6 +139,7 @@ class ExportReport:
     min_separation: float
     min_clearance: float
     min_overhead: float
+    heights: tuple[float, float]
     pieces: int | None = None
 
     @property
@@ -159,6 +161,12 @@ def _csv(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float
 def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:
     if motion.problem.dimension == 2 and height <= 0:
         raise ValueError(f"height is {height:g} m; a team that moves in the plane flies at a height above 0")
+    if motion.problem.dimension == 3 and (lowest := setpoints.position[..., 2].min(axis=0)).min() <= 0:
+        robot = int(lowest.argmin())
+        raise ValueError(
+            f"robot_{robot} comes down to z = {lowest[robot]:.2f} m, and the floor is at 0; plan with bounds above the "
+            "floor, or from a greater height"
+        )
     polynomials = fit_polynomials(motion, height)
     header = ["Duration", *(f"{axis}^{power}" for axis in AXES for power in range(8))]
     for robot in range(motion.problem.num_robots):
@@ -206,6 +214,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
             if (folder / entry).is_dir():
                 shutil.rmtree(folder / entry)
             (Path(name) / entry).replace(folder / entry)
+    heights = setpoints.position[..., 2] if motion.problem.dimension == 3 else np.array(height)
     return ExportReport(
         tuple(folder / entry for entry in names),
         motion.duration,
@@ -214,6 +223,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         motion.report.min_separation,
         motion.report.min_clearance,
         _least_overhead(motion.problem, setpoints.position),
+        (float(heights.min()), float(heights.max())),
         pieces,
     )
 

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem
+from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
-from d4orm_planners.cli import outputs
+from d4orm_planners.cli import outputs, warmup
 
 QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
 
@@ -56,6 +57,19 @@ def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
     assert outcome.status == 0, outcome.err
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert page.index('"title": "go-to-goal"') < page.index('"title": "random"')
+
+
+def test_run_takes_settings_of_policies(d4orm, tmp_path: Path) -> None:
+    policies = ("--compare", "d4orm:num_samples=64,max_iterations=1", "--compare", "go-to-goal")
+    outcome = d4orm("run", "--num-robots", "2", *policies, "--out", "compare.html")
+    assert outcome.status == 0, outcome.err
+    assert '"title": "d4orm:num_samples=64,max_iterations=1"' in (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert d4orm("run", "--num-robots", "2", "--policy", "orca:time_horizon=3", "--quiet").status == 0
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_compiled_ahead_fits_robots_of_every_model(model: str) -> None:
+    assert warmup._smallest_problem((model,) * 3).num_robots == 3
 
 
 @pytest.mark.parametrize(
@@ -223,6 +237,10 @@ BAD = [
     (("run", "--policy", "nope"), "policy 'nope' is unknown"),
     (("run", "--policy", "d4orm-c2f", "--preset", "nope"), "preset 'nope' of policy 'd4orm-c2f' is unknown"),
     (("run", "--policy", "orca", "--preset", "paper"), "'preset' is no setting of policy 'orca'"),
+    (("run", "--policy", "orca,d4orm"), "--policy 'orca,d4orm' names several; give one, or all of them to --compare"),
+    (("run", "--policy", "d4orm:nope=1"), "'nope' is no setting of planner 'd4orm'"),
+    (("plan", "--num-robots", "2", "-k", "3"), "--num-robots is given 2 times; give it once"),
+    (("export", "whole.npz", "--format", "crazyswarm2", "--rate", "10", "-o", "a"), "--rate 10 would count"),
     (("demo", "--out", "good.yaml"), "good.yaml"),
     (("demo", "--num-robots", "0"), "num_robots"),
     (("demo", "--denoising", "--engine", "gpu", "--out", "a/b"), "engine 'gpu' is unknown"),

@@ -24,7 +24,7 @@ from d4orm_planners.setpoints.smoothing import fit_spline
 CASES: dict[str, dict[str, Any]] = {
     "plane": {"scenario": "circle", "num_robots": 5},
     "slow goals": {"scenario": "circle", "num_robots": 5, "goal_speed": 0.1},
-    "space": {"scenario": "random", "num_robots": 5, "model": "holonomic3d"},
+    "space": {"scenario": "random", "num_robots": 5, "model": "holonomic3d", "height": 4.0},
     "wheels": {"scenario": "circle", "num_robots": 4, "model": "differential_drive"},
     "unicycles": {"scenario": "circle", "num_robots": 4, "model": "unicycle"},
     "first order": {"scenario": "circle", "num_robots": 4, "model": "velocity2d"},
@@ -320,6 +320,18 @@ def test_heights_belong_to_teams_in_the_plane(plans: dict[str, Plan], tmp_path: 
     with pytest.raises(ValueError, match="height is 1 m, and this team has heights of its own; leave it out"):
         plans["space"].export("csv", tmp_path / "space", height=1.0)
     assert not (tmp_path / "space").exists()
+
+
+def test_nobody_is_sent_into_the_floor(tmp_path: Path) -> None:
+    start = [[0, 0, 0.5, 0, 0, 0], [1, 0, 0.5, 0, 0, 0]]
+    problem = Problem(Team(("holonomic3d",) * 2), start, [[0, 0, 0.5], [1, 0, -0.2]])
+    plan = make_planner(engine="cpu").solve(problem, seed=0)
+    with pytest.raises(
+        ValueError, match=r"robot_1 comes down to z = -0\.2\d m, and the floor is at 0; plan with bounds"
+    ):
+        plan.export("crazyswarm2", tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+    assert plan.export("csv", tmp_path / "out").heights == pytest.approx((-0.2, 0.5), abs=0.1)
 
 
 def test_how_low_one_flies_over_another_is_told(tmp_path: Path) -> None:
