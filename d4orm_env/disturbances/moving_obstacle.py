@@ -239,17 +239,17 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
         radius: Of everyone [m].
 
     Raises:
-        ValueError: If the file cannot be read, a column is missing, a value is no number, or somebody is at two places
-            at one time.
+        ValueError: If the file cannot be read, a column is missing, a value is no number, there are fewer than two
+            times, or somebody is at two places at one time.
     """
     try:
-        file = open(path, newline="", encoding="utf-8")  # noqa: SIM115
+        file = open(path, newline="", encoding="utf-8-sig")  # noqa: SIM115
     except OSError as error:
         raise ValueError(
             f"{path}: cannot be read ({error.strerror or error}); give a CSV file of pedestrians"
         ) from None
     with file:
-        reader = csv.DictReader(file)
+        reader = csv.DictReader(file, skipinitialspace=True)
         missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise ValueError(f"{path} has no column {', '.join(missing)}; it needs a header with id, time, x and y")
@@ -262,6 +262,8 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
             if people[row["id"]].setdefault(time, (x, y)) != (x, y):
                 raise ValueError(f"{path}, line {reader.line_num}: {row['id']} is at two places at {time:g} s")
     times = np.unique([time for track in people.values() for time in track])
+    if len(times) < 2:
+        raise ValueError(f"{path} has rows of {len(times)} times; it takes two at least")
     places = np.full((len(times), len(people), 2), np.nan)
     for number, track in enumerate(people.values()):
         own = np.array(sorted(track))

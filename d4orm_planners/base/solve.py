@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, whole_number
+from d4orm_env.core.arrays import FloatArray, shown, whole_number
 from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
@@ -187,7 +187,13 @@ class SolveRun:
         """Run one iteration, evaluate it and remember the best; the record that is kept has no arrays."""
         if not self._began:
             self.state, self._began = self.planner.init(self), True
-        self.state, iteration = self.planner.iterate(self, self.state)
+        result = self.planner.iterate(self, self.state)
+        if not (isinstance(result, tuple) and len(result) == 2 and hasattr(result[1], "controls")):
+            raise ValueError(
+                f"iterate() of planner {self.planner.name!r} returned {shown(result)}; expected its new state and an "
+                "Iteration(controls)"
+            )
+        self.state, iteration = result
         self.current = drive_further_in(self, iteration.evaluated or self._evaluate(iteration.controls), self._evaluate)
         self.iteration += 1
         self.denoising_steps += iteration.denoising_steps

@@ -15,7 +15,7 @@ import typer
 from d4orm_env import render, scenarios
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import physics_module
-from d4orm_planners.cli.arguments import check_target, parse_settings, refuse_options
+from d4orm_planners.cli.arguments import check_target, names, parse_settings, refuse_options
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-Model = Annotated[str | None, typer.Option("--model", "-m", help="Robot model; the scenario's own by default.")]
+Model = Annotated[
+    str | None,
+    typer.Option("--model", "-m", help="Robot model, or one a robot, as car,unicycle; the scenario's own by default."),
+]
 ScenarioSettings = Annotated[
     list[str] | None,
     typer.Option("--scenario-set", help="An argument of the scenario, as diameter=8; repeatable."),
@@ -146,8 +149,10 @@ class ProblemOptions:
         for name in (*common, "seed"):
             if name in own:
                 raise ValueError(f"--scenario-set {name} is said by --{name.replace('_', '-')}; use that")
+        models = names(self.model) or ()
+        own["model"] = models if len(models) > 1 else self.model
         return scenarios.make_problem(
-            self.scenario, self.num_robots, self.seed, model=self.model, num_obstacles=self.num_obstacles, **own
+            self.scenario, self.num_robots, self.seed, num_obstacles=self.num_obstacles, **own
         )
 
 

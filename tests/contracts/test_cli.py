@@ -59,6 +59,12 @@ def test_run_compares_policies_side_by_side(d4orm, tmp_path: Path) -> None:
     assert page.index('"title": "go-to-goal"') < page.index('"title": "random"')
 
 
+def test_a_model_for_each_robot(d4orm, tmp_path: Path) -> None:
+    chosen = ("--model", "holonomic2d,velocity2d", "--num-robots", "2", "--out", "plan.npz")
+    assert d4orm("plan", *chosen, *QUICK).status in (0, 1)
+    assert Plan.load(tmp_path / "plan.npz").problem.team.models == ("holonomic2d", "velocity2d")
+
+
 def test_run_takes_settings_of_policies(d4orm, tmp_path: Path) -> None:
     policies = ("--compare", "d4orm:num_samples=64,max_iterations=1", "--compare", "go-to-goal")
     outcome = d4orm("run", "--num-robots", "2", *policies, "--out", "compare.html")

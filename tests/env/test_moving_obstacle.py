@@ -99,6 +99,8 @@ def test_pedestrians_are_read_from_a_file(tmp_path: Path) -> None:
     path.write_text("id,time,x,y,group\nb,101,5,5,0\na,100,0,0,0\na,102,2,4,0\nb,103,7,5,0\nc,100,1,1,0\n")
     people = load_pedestrians(path)
     assert people.times == pytest.approx([0, 1, 2, 3])
+    path.write_text("\ufeff" + path.read_text().replace(",", ", "), encoding="utf-8")  # as spreadsheets write it
+    np.testing.assert_array_equal(load_pedestrians(path).positions, people.positions)
     nan = np.nan
     np.testing.assert_allclose(people.positions[:, 0], [[nan] * 2, [5, 5], [6, 5], [7, 5]])
     np.testing.assert_allclose(people.positions[:, 1], [[0, 0], [1, 2], [2, 4], [nan] * 2])
@@ -117,7 +119,8 @@ def test_pedestrians_are_read_from_a_file(tmp_path: Path) -> None:
         ("id,time,x\na,0,0\n", "has no column y; it needs a header with id, time, x and y"),
         ("id,time,x,y\na,0,0,zero\n", "line 2: time, x and y must be numbers"),
         ("id,time,x,y\na,0,0,0\na,0,1,0\n", "line 3: a is at two places at 0 s"),
-        ("id,time,x,y\na,0,0,0\n", "times must be two or more"),
+        ("id,time,x,y\na,0,0,0\n", "people.csv has rows of 1 times; it takes two at least"),
+        ("id,time,x,y\n", "people.csv has rows of 0 times; it takes two at least"),
     ],
 )
 def test_a_bad_file_is_an_error(tmp_path: Path, text: str, message: str) -> None:

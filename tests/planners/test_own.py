@@ -118,6 +118,13 @@ def test_an_episode_takes_whatever_acts(policy: Any) -> None:
     np.testing.assert_array_equal(controls(policy), controls("test_own:Push"))
 
 
+@pytest.mark.parametrize("result", [None, (None, np.zeros((1, 1, 2))), Iteration(np.zeros((1, 1, 2)))])
+def test_an_iteration_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch, result: object) -> None:
+    monkeypatch.setattr(Ahead, "iterate", lambda *_: result)
+    with pytest.raises(ValueError, match=r"iterate\(\) of planner .* returned .*; expected its new state and an It"):
+        make_planner(Ahead).solve(PROBLEM, seed=0)
+
+
 def test_settings_reach_what_takes_them() -> None:
     weak = controls(Push(0.5))
     assert weak[0, 0, 0] == 0.5
