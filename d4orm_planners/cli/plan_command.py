@@ -77,7 +77,7 @@ def solving(
     if get_sampling_engine(planner.config.engine).name == "cpu":
         compile_for_planning(
             problem.team.models,
-            lambda: typer.echo("compiling, once per installation ...", err=True),
+            lambda: typer.echo("compiling, once per robot model ...", err=True),
             driver=planner.name if planner.drives_straight else "",
             walls=len(problem.arrays.boxes) + len(problem.arrays.triangles) > 0,
         )
