@@ -45,7 +45,7 @@ GENERATED = ("reference/settings.md", "reference/d4orm_env/modules.rst", "refere
 """Pages that the build makes."""
 PRINTS = {
     "own_policy": "3.0 0.0\nin turn 1.0\nat once 0.0\ngently 0.0\ngo-to-goal 0.0\n",
-    "own_planner": "True solved True\nsolved\n",
+    "own_planner": "True solved True\nsolved\nsolved\n",
     "own_robot": "solved True\n",
 }
 """What the programs of some pages print."""
