@@ -16,7 +16,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.base.planner_registry import PolicyLike, make_policy
+from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Policy
 from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round, track_velocities
 
@@ -53,6 +53,10 @@ class ControlSetpoint:
     held: bool
 
 
+IN_TIME = 0.9
+"""Share of a step's timeout that is a policy's deadline."""
+
+
 class Controller:
     """A policy as a controller of real or simulated robots.
 
@@ -74,7 +78,8 @@ class Controller:
             feedback, in mode ``"nominal"`` or with a tracker. By default 0.5 with a tracker, which has its robot tilt
             or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
-            meanwhile, and its answer, which would be too late, is not used. ``None`` waits.
+            meanwhile, and its answer, which would be too late, is not used. ``None`` waits. A policy that is named and
+            has a ``deadline``, as D4orm-C2F, gets nine tenths of it, and plans anew beside its loops.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
@@ -104,6 +109,8 @@ class Controller:
         default = 0.5 if tracker else 0.2 if mode == "nominal" else 0.0
         self.reserve = default if reserve is None else positive_number(reserve, "reserve", zero_allowed=True, most=0.9)
         self.timeout = None if timeout is None else positive_number(timeout, "timeout")
+        if self.timeout is not None and isinstance(policy, str) and "deadline" in setting_names(policy, settings):
+            settings = {"deadline": IN_TIME * self.timeout} | settings
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = tracker
         self._lag, self._leads = lag, mode == "nominal" or tracker
@@ -146,9 +153,9 @@ class Controller:
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
         start = self._possible(self._completed(states)[0])
-        left, team = 1 - self.reserve, problem.team
-        limits = {name: left * getattr(team, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
-        self._open(problem.with_state(start, problem.goal, team=team.replace(**limits)), seed)
+        limited = ("max_speed", "max_acceleration", "max_turn_rate")
+        limits = {name: (1 - self.reserve) * getattr(problem.team, name) for name in limited}
+        self._open(problem.with_state(start, problem.goal, team=problem.team.replace(**limits)), seed)
         self.policy.reset(self._env, seed=seed)
         self._time, self._lead = time - problem.dt, np.zeros_like(problem.goal, np.float64)
         self._setpoint = self._described(self._joint, self._joint.controls, held=False)
@@ -231,8 +238,7 @@ class Controller:
         brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
         controls, held = brakes, not self.over and actions is None
         if not self.over:
-            if actions is None:
-                actions = dict(zip(self._env.possible_agents, brakes))
+            actions = dict(zip(self._env.possible_agents, brakes)) if actions is None else actions
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
         controls = self._with_feedback(measured, known if self._leads else known & parked, controls)
@@ -273,9 +279,8 @@ class Controller:
 
     def _with_feedback(self, measured: FloatArray, follows: BoolArray, controls: FloatArray) -> FloatArray:
         """``(K, m)`` controls that bring those robots from where they were measured to the reference."""
-        joint, d = self._joint, self.problem.dimension
-        error = self._setpoint.position - measured[:, :d]
-        wanted = self._velocities(joint) + FEEDBACK / self.problem.dt * error
+        error = self._setpoint.position - measured[:, : self.problem.dimension]
+        wanted = self._velocities(self._joint) + FEEDBACK / self.problem.dt * error
         followed = track_velocities(self._robots, measured, wanted.astype(np.float32))
         off = np.linalg.norm(error, axis=1) > self.problem.rounding
         return np.where((follows & off)[:, None], followed, controls)
@@ -289,7 +294,6 @@ class Controller:
         for model, robots in by_model(self.problem):
             if model.heading_index is not None:
                 heading[robots] = joint.states[robots, model.heading_index]
-        velocity = self._velocities(joint)
+        velocity, position = self._velocities(joint), joint.states[:, : self.problem.dimension] + self._lead
         acceleration = (velocity - self._velocities(before)) / self.problem.dt
-        position = joint.states[:, : self.problem.dimension] + self._lead
         return ControlSetpoint(position, velocity, acceleration, heading, controls.copy(), joint.arrived.copy(), held)

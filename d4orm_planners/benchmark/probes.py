@@ -24,7 +24,6 @@ from d4orm_planners.base.controller import Controller, Mode
 from d4orm_planners.base.planner_registry import make_planner, make_policy
 from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn, measure
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
-from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 
 _FIRST_PLAN = """
 import json, sys, time
@@ -124,12 +123,13 @@ def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Measureme
     seconds: list[float] = []
     replanned = held = 0
     for seed in range(min(repetitions, 3)):
-        policy = D4ormC2F(D4ormC2FConfig(replan_distance=1.2))
-        with Controller(policy, mode=mode, reserve=0.0, timeout=0.9 * problem.dt) as controller:
+        timeout = 0.9 * problem.dt
+        with Controller("d4orm-c2f", mode=mode, reserve=0.0, timeout=timeout, replan_distance=1.2) as controller:
             steps = _driven(problem, controller, seed)
         seconds += [taken for taken, _ in steps[WARMUP:]]
         held += sum(was_held for _, was_held in steps)
-        replanned += sum(loop.replanned for loop in policy.loops)
+        assert isinstance(controller.policy, D4ormC2F)
+        replanned += sum(loop.replanned for loop in controller.policy.loops)
     return {
         "mode": mode,
         "num_robots": CONTROLLED,

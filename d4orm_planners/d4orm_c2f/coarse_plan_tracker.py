@@ -259,7 +259,7 @@ class CoarsePlanTracker:
         # What was refined may have been replanned since.
         if refined is not None and refined.problem is guidance.problem:
             self.guidance = guidance = refined
-        if done and due:
+        if done and due and self._late is None:
             self._background.start(lambda: self._refined(guidance, index, seed))
         return self.guidance is refined
 

@@ -370,3 +370,11 @@ def test_setpoints_have_the_shapes_that_are_promised() -> None:
     assert said.position.shape == said.velocity.shape == said.acceleration.shape == (3, 2)
     assert said.control.shape == (3, 2)
     assert said.heading.shape == said.arrived.shape == (3,)
+
+
+def test_a_policy_that_is_named_answers_in_time() -> None:
+    for given, deadline in (({}, 0.09), ({"deadline": 0.05}, 0.05)):
+        with Controller("d4orm-c2f", timeout=0.1, **given) as controller:
+            assert controller.policy.config.deadline == pytest.approx(deadline)
+    with Controller("orca", timeout=0.1) as controller:
+        assert controller.timeout == 0.1
