@@ -26,17 +26,17 @@ from d4orm_planners.base.machine import Provenance
 if TYPE_CHECKING:
     from d4orm_env.scenarios import dynobench
     from d4orm_planners.base import plan_file
-    from d4orm_planners.setpoints import export as exports
-    from d4orm_planners.setpoints import setpoints, smoothing
-    from d4orm_planners.setpoints.export import ExportReport
-    from d4orm_planners.setpoints.setpoints import Setpoints
-    from d4orm_planners.setpoints.smoothing import SmoothMotion
+    from d4orm_planners.tracking import export as exports
+    from d4orm_planners.tracking import setpoints, smoothing
+    from d4orm_planners.tracking.export import ExportReport
+    from d4orm_planners.tracking.setpoints import Setpoints
+    from d4orm_planners.tracking.smoothing import SmoothMotion
 else:
     dynobench = LazyModule("d4orm_env.scenarios.dynobench")
     plan_file = LazyModule("d4orm_planners.base.plan_file")
-    exports = LazyModule("d4orm_planners.setpoints.export")
-    setpoints = LazyModule("d4orm_planners.setpoints.setpoints")
-    smoothing = LazyModule("d4orm_planners.setpoints.smoothing")
+    exports = LazyModule("d4orm_planners.tracking.export")
+    setpoints = LazyModule("d4orm_planners.tracking.setpoints")
+    smoothing = LazyModule("d4orm_planners.tracking.smoothing")
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
 """End of a search; see :class:`Plan`."""
@@ -175,7 +175,7 @@ class Plan(DisplayMixin):
         """Return smooth setpoints for the robots' own controllers, verified again.
 
         The controls of a plan jump at every step. This is a spline of class C4 through its positions, driven as much
-        more slowly as the limits need (:mod:`d4orm_planners.setpoints.smoothing`).
+        more slowly as the limits need (:mod:`d4orm_planners.tracking.smoothing`).
 
         Args:
             rate: Of the setpoints [Hz].
@@ -202,7 +202,7 @@ class Plan(DisplayMixin):
 
         Args:
             format: ``"csv"``, ``"crazyswarm2"`` (polynomials), ``"rosbag2"`` or ``"mcap"`` (ROS 2 messages);
-                see :data:`d4orm_planners.setpoints.export.FORMATS`.
+                see :data:`d4orm_planners.tracking.export.FORMATS`.
             path: Folder for the files, which is made.
             rate: Of the setpoints [Hz]; polynomials have none.
             height: z of a team that moves in the plane [m].

@@ -13,7 +13,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.lazy import LazyModule
-from d4orm_planners.setpoints.setpoints import Setpoints
+from d4orm_planners.tracking.setpoints import Setpoints
 
 rosbag2: Any = LazyModule("rosbags.rosbag2", "a ROS bag", "ros")
 typesys: Any = LazyModule("rosbags.typesys", "a ROS bag", "ros")
