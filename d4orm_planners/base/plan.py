@@ -14,10 +14,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.metrics import mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, mean_stretch
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.candidate import step_faults
 from d4orm_planners.base.display import DisplayMixin
@@ -102,7 +101,7 @@ class Plan(DisplayMixin):
         wall_time: Seconds, first-call compilation excluded.
         history: One record per iteration.
         trajectory: Rollout of the controls.
-        metrics: See :func:`d4orm_env.core.metrics.trajectory_metrics`, and ``"denoising_steps"`` and
+        metrics: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, and ``"denoising_steps"`` and
             ``"denoising_share"``, the share of the iterations that did some. ``d-d4orm`` adds ``"messages"`` and
             ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
             time that they waited for each other.
@@ -144,7 +143,7 @@ class Plan(DisplayMixin):
 
     @cached_property
     def stretch(self) -> float:
-        """Path travelled over the shortest path, see :func:`d4orm_env.core.metrics.mean_stretch`; found when it is
+        """Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; found when it is
         first asked for, so that solving does not wait for it.
         """
         return mean_stretch(self.problem, self.trajectory)

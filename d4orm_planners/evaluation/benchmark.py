@@ -19,6 +19,7 @@ from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
+from d4orm_planners.evaluation.bench_report import Measurement, Spread, in_turn, measure
 from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
 from d4orm_planners.evaluation.env_steps import (
     DISTURBANCES,
@@ -43,7 +44,6 @@ from d4orm_planners.evaluation.probes import (
     measure_robots,
     measure_startup,
 )
-from d4orm_planners.evaluation.timing import Measurement, Spread, in_turn, measure
 from d4orm_planners.sampling.d4orm import D4orm
 
 PRESETS = (None, "paper")

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
-from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.portable import log
 from d4orm_env.core.seeds import Stream
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, arrival_steps
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun

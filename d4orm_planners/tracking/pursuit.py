@@ -23,7 +23,7 @@ from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.tile_layout import SQUARED_NORM, Row
 
 if TYPE_CHECKING:
-    from d4orm_planners.tracking.routes import Routes
+    from d4orm_planners.tracking.path_drives import Routes
     from d4orm_planners.tracking.timed_path import Timed
 
 Length: TypeAlias = Callable[[Row], np.float32]
