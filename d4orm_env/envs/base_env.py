@@ -22,6 +22,16 @@ from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.simulation import Simulation
 from d4orm_env.envs.team_step import TeamStep
 
+if TYPE_CHECKING:
+    from d4orm_env.render import frames
+    from d4orm_env.render.frames import FrameRenderer, WindowRenderer
+else:
+    frames = LazyModule("d4orm_env.render.frames")
+
+Frame: TypeAlias = NDArray[np.uint8]
+"""``(height, width, 3)``."""
+
+RENDER_MODES = ("human", "rgb_array")
 _TRAIL_LENGTH = 50
 
 
@@ -139,18 +149,6 @@ class TeamSimulation(Simulation):
         partners = touching(problem.team, self.states, collided, problem.rounding) if len(collided) > 1 else {}
         self.last = TeamStep(observations[0], rewards, arrived, *flags, worlds.distance[0].copy(), partners, terms)
         return self.last
-
-
-if TYPE_CHECKING:
-    from d4orm_env.render import frames
-    from d4orm_env.render.frames import FrameRenderer, WindowRenderer
-else:
-    frames = LazyModule("d4orm_env.render.frames")
-
-Frame: TypeAlias = NDArray[np.uint8]
-"""``(height, width, 3)``."""
-
-RENDER_MODES = ("human", "rgb_array")
 
 
 class Viewer:
