@@ -19,8 +19,7 @@ from d4orm_env.engine.footprint_contacts import place_bodies
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.sample_noise import TURN, VECTOR
 from d4orm_env.engine.simd import BLOCK, TILE, use_wide_registers
-from d4orm_env.engine.stepping import Docking, make_stepper
-from d4orm_env.engine.tile_layout import READ, WRITE, Row
+from d4orm_env.engine.stepping import READ, WRITE, Docking, Row, make_stepper
 from d4orm_planners.engine.proximity import POSES, pose_of
 
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.

@@ -22,8 +22,7 @@ from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import WITHOUT_ARRAYS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
-from d4orm_env.engine.stepping import Docking, docking_of, models_key
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Docking, Row, docking_of, models_key
 from d4orm_planners.engine.path_index import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
 from d4orm_planners.mapf.beam import (

@@ -19,8 +19,7 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
-from d4orm_env.engine.stepping import models_key
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Row, models_key
 from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
 from d4orm_planners.tracking.steering import by_model
 from d4orm_planners.tracking.tracker import tracker
