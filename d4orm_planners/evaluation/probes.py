@@ -133,9 +133,9 @@ def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Measureme
     }
 
 
-def boxed_problem(num_boxes: int, where: Where, horizon: int = 100) -> Problem:
+def boxed_problem(num_boxes: int, where: Where) -> Problem:
     """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from everybody."""
-    problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=horizon)
+    problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=100)
     random = np.random.default_rng(0)
     if where == "near":
         distance, angle = 2.0 * np.sqrt(random.uniform(0, 1, num_boxes)), random.uniform(0, 2 * np.pi, num_boxes)
