@@ -6,7 +6,7 @@ import argparse
 import csv
 import json
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.base.machine import commit, describe_machine
-from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
+from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
@@ -112,6 +112,49 @@ def keep_known(arguments: argparse.Namespace) -> None:
 def tell(what: str, done: int, total: int) -> None:
     """Say how far a study is."""
     print(f"{done} of {total}: {what}", flush=True)
+
+
+def steps_to_solution(trial: Trial) -> int | None:
+    """Denoising steps of a sampling planner until its first solution; ``None`` if it found none.
+
+    Rows that older versions wrote tell it of solves that ended with the first solution only.
+    """
+    first = next((best for best in trial.progress if best.solved), None)
+    if first is not None and first.steps is not None:
+        return first.steps
+    return steps_spent(trial) if trial.status == "solved" else None
+
+
+def is_solved(trial: Trial) -> bool:
+    """Check whether a sampling planner found a solution: all arrive, the margin is kept and ``verify()`` agrees."""
+    return steps_to_solution(trial) is not None
+
+
+def steps_spent(trial: Trial) -> int | None:
+    """Denoising steps of a whole trial; ``None`` where they are not known."""
+    steps = _iteration_steps(json.loads(trial.config))
+    return None if steps is None or not trial.iterations else trial.iterations * steps
+
+
+def penalised_steps(trial: Trial) -> int:
+    """:func:`steps_to_solution`, and twice all the steps that there were where it found none (PAR-2)."""
+    steps, config = steps_to_solution(trial), json.loads(trial.config)
+    return 2 * (_iteration_steps(config) or 0) * int(config["max_iterations"]) if steps is None else steps
+
+
+def _iteration_steps(config: Mapping[str, Any]) -> int | None:
+    """Denoising steps of an iteration with these settings; ``None`` where there are none."""
+    steps = config.get("check_every") or config.get("num_steps")
+    return None if steps is None else int(steps)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P values corrected for how many there are by Holm's method, in their order."""
+    order = np.argsort(p_values, kind="stable")
+    left = len(p_values) - np.arange(len(p_values))
+    corrected = np.empty(len(p_values))
+    corrected[order] = np.minimum(np.maximum.accumulate(np.asarray(p_values, float)[order] * left), 1)
+    return [float(value) for value in corrected]
 
 
 def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:

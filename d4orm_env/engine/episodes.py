@@ -78,6 +78,15 @@ def _tally(batch: WorldBatch, max_cycles: int, b: int) -> None:
 
 
 @inlined
+def _close_step(batch: WorldBatch, order: np.uint8, max_cycles: int, b: int, s: int, w: FloatArray) -> None:
+    """Count a step of world ``b``, if it was moved, and note how far its robots are from their goals."""
+    if order <= MOVED:
+        _tally(batch, max_cycles, b)
+    for k in range(batch.docked.shape[1]):
+        batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
+
+
+@inlined
 def _move_tile(
     move_robot: RobotMover,
     arrays: ProblemArrays,
@@ -131,8 +140,7 @@ def advance_worlds_kernel(
         near, boxes = np.empty((num_robots, 3), np.uint64), allocate_boxes(arrays)
         sensed = allocate_sensed(num_robots, 0, dimension, view)
         for index in range(tile_range[0], tile_range[1]):
-            first = index * TILE
-            count = min(TILE, orders.shape[0] - first)
+            first, count = index * TILE, min(TILE, orders.shape[0] - index * TILE)
             moving, busy = _prepare_tile(batch, orders, first, count)
             if not busy:
                 continue
@@ -144,10 +152,7 @@ def advance_worlds_kernel(
             for b in range(first, first + count):
                 if orders[b] == SKIP:
                     continue
-                if orders[b] <= MOVED:
-                    _tally(batch, max_cycles, b)
-                for k in range(num_robots):
-                    batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + b - first])
+                _close_step(batch, orders[b], max_cycles, b, b - first, w)
                 if out.shape[0] > 0:
                     time_left = np.float32(max(0.0, 1.0 - batch.steps[b] / max_cycles))
                     observe(read_motion, arrays, batch, b, time_left, w, view, sensed, out[b])

@@ -18,7 +18,7 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import INLINED, OPTIONS, compiled, inlined
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.simd import copy_chunk, use_wide_registers
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Row
 
 
 class Drawing(NamedTuple):

@@ -27,8 +27,19 @@ from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined, to
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.footprint_contacts import POSE, place_bodies, refine_pair
 from d4orm_env.engine.simd import TILE, at_most, use_wide_registers, within_2, within_3
-from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_stepper
-from d4orm_env.engine.tile_layout import PICK, READ, WRITE, read2, read3, squared_gap2, squared_gap3
+from d4orm_env.engine.stepping import (
+    PICK,
+    READ,
+    WRITE,
+    Docking,
+    dispatch,
+    docking_of,
+    make_stepper,
+    read2,
+    read3,
+    squared_gap2,
+    squared_gap3,
+)
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
 # set.

@@ -105,6 +105,18 @@ def _meets_body(
 
 
 @inlined
+def _mark_static(arrays: ProblemArrays, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]) -> None:
+    """Flag every robot closer to an obstacle or the bounds than its radius plus ``extra``."""
+    num_robots, f = arrays.radius.shape[0], arrays.footprints
+    for k in range(num_robots):
+        robot = w[k * STRIDE : (k + 1) * STRIDE]
+        places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
+        touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
+        touch = refine_static(f, arrays, k, touch, extra, places, w, POSE * TILE, num_robots * STRIDE, buffer)
+        near[k, OBSTACLE] |= touch
+
+
+@inlined
 def _mark_bodies(
     arrays: ProblemArrays, bodies: FloatArray, first: int, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]
 ) -> None:
@@ -152,7 +164,6 @@ def check_contacts(
     ``boxes`` of :func:`allocate_boxes` are overwritten, and so is ``near`` ``(K, 3)``.
     """
     num_robots, count = arrays.radius.shape[0], min(TILE, worlds.state.shape[0] - first)
-    poses = num_robots * STRIDE
     place_team(arrays.footprints, num_robots, w)
     enclose_team(count, w, boxes)
     for k in range(num_robots):
@@ -161,13 +172,7 @@ def check_contacts(
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
         mark_pairs(arrays, extra, w, w[BUFFER * TILE : ROWS * TILE], boxes, near)
-        for k in range(num_robots):
-            robot = w[k * STRIDE : (k + 1) * STRIDE]
-            places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
-            touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
-            f = arrays.footprints
-            touch = refine_static(f, arrays, k, touch, extra, places, w, POSE * TILE, poses, buffer)
-            near[k, OBSTACLE] |= touch
+        _mark_static(arrays, extra, w, near)
         _mark_bodies(arrays, worlds.bodies, first, extra, w, near)
         flags = worlds.collided if level == 0 else worlds.violated
         for s in range(count):

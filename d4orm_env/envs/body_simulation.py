@@ -15,10 +15,10 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.transition import stands
 from d4orm_env.engine.types import MOVED
+from d4orm_env.envs.base_env import TeamSimulation
 from d4orm_env.envs.lifelong import reached_goals
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.setup import EnvSetup
-from d4orm_env.envs.team_simulation import TeamSimulation
 from d4orm_env.envs.team_step import TeamStep
 
 Robots = NDArray[np.intp]
@@ -86,7 +86,7 @@ class BodySimulation(TeamSimulation):
         check(self.problem)
 
     def reset(self, random: np.random.Generator) -> TeamStep:
-        """See :meth:`d4orm_env.envs.team_simulation.TeamSimulation.reset`."""
+        """See :meth:`d4orm_env.envs.base_env.TeamSimulation.reset`."""
         step = super().reset(random)
         radius = self.worlds.bodies[0, :, -1]
         if not radius.all():

@@ -19,9 +19,8 @@ from d4orm_env.engine.types import LOOK, RESET, SKIP, STEP, ObservationInputs, W
 from d4orm_env.envs.inputs import checked_states
 from d4orm_env.envs.lifelong import assign_goals, reached_goals
 from d4orm_env.envs.rewards import RewardInput, along_paths, compute_rewards, no_terms
-from d4orm_env.envs.setup import EnvSetup
+from d4orm_env.envs.setup import EnvSetup, WorldPaths, WorldProblems
 from d4orm_env.envs.team_step import EpisodeCounts, episode_metrics
-from d4orm_env.envs.world_problems import WorldPaths, WorldProblems
 from d4orm_env.paths.shortest_paths import observe_paths
 
 _READ_BEFORE = ("state", "distance", "docked", "total_reward")

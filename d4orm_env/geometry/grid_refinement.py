@@ -97,15 +97,19 @@ def _refined(
             if nearest == 1 and not within:
                 keep = ~_hidden(shapes, centre, cells, distance, width, 2 * rounding)
                 cells, distance = _Cells(cells.place, cells.cell[keep], cells.item[keep]), distance[keep]
-            # Most cells have one only.
-            several = np.flatnonzero(np.bincount(cells.cell, minlength=len(cells.place))[cells.cell] > 1)
-            items = cells.item.copy()
-            items[several] = items[several[np.lexsort((distance[several], cells.cell[several]))]]
-            cells = _Cells(cells.place, cells.cell, items)
-            yield cells, clearance
+            yield _nearest_first(cells, distance), clearance
             continue
         for part in _halved(cells):
             waiting.append((level - 1, _split(part, np.ceil(size / 2 ** (level - 1)))))
+
+
+def _nearest_first(cells: _Cells, distance: Floats) -> _Cells:
+    """Return cells with the obstacles of each in the order of their distance."""
+    # Most cells have one only.
+    several = np.flatnonzero(np.bincount(cells.cell, minlength=len(cells.place))[cells.cell] > 1)
+    items = cells.item.copy()
+    items[several] = items[several[np.lexsort((distance[several], cells.cell[several]))]]
+    return _Cells(cells.place, cells.cell, items)
 
 
 def _hidden(

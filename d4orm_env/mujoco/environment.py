@@ -19,10 +19,9 @@ from pettingzoo.utils import OrderEnforcingWrapper
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray, shown
 from d4orm_env.core.problem import Problem
-from d4orm_env.envs.base_env import Frame, Viewer
+from d4orm_env.envs.base_env import Frame, TeamSimulation, Viewer
 from d4orm_env.envs.body_simulation import BodySimulation
 from d4orm_env.envs.options import EnvOptions
-from d4orm_env.envs.team_simulation import TeamSimulation
 from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_env.mujoco.scene import Physics, check_problem, colour
 from d4orm_env.navigation_v0 import AECNavigationEnv

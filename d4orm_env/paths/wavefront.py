@@ -151,6 +151,17 @@ def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, plac
     parents[number] = parent
 
 
+@register_jitable(nogil=True, **OPTIONS)
+def _twice_as_many(points: Floats, values: Floats, parents: Ints) -> tuple[Floats, Floats, Ints]:
+    """Return arrays of anchors with room for twice as many."""
+    count = len(values)
+    return (
+        np.concatenate((points, np.empty((count, 3)))),
+        np.concatenate((values, np.empty(count))),
+        np.concatenate((parents, np.empty(count, np.int32))),
+    )
+
+
 Heap: TypeAlias = list[tuple[float, np.int64]]
 """Nodes by the length of their paths."""
 
@@ -228,9 +239,7 @@ def _spread(
                     at = place_of(points, parent)
                     b, c = _turned(space, reach, at, _kept(parent, own_goal, reach), b, q)
                 if used + 2 > len(values):
-                    points = np.concatenate((points, np.empty((used, 3))))
-                    values = np.concatenate((values, np.empty(used)))
-                    parents = np.concatenate((parents, np.empty(used, np.int32)))
+                    points, values, parents = _twice_as_many(points, values, parents)
                 _add_anchor(points, values, parents, used, b, parent)
                 _add_anchor(points, values, parents, used + 1, c, used)
                 a, used = np.int32(used + 1), used + 2
@@ -243,9 +252,7 @@ def _spread(
                 continue
         nodes.done[n] = True
         _pass_on(space, lattice, reach, nodes, n, a, place_of(points, a), _kept(a, own_goal, reach), values[a], heap)
-    for node in range(lattice.places.shape[0]):
-        if not nodes.done[node]:
-            anchor[node] = NOBODY
+    anchor[~nodes.done] = NOBODY
     return points[:used].copy(), values[:used].copy(), parents[:used].copy(), own_goal
 
 

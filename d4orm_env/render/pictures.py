@@ -17,10 +17,9 @@ from matplotlib.lines import Line2D
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.metrics import arrival_times
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count
-from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
+from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, arrival_times
 from d4orm_env.render.event_marks import MarkLayer, mark_legend
 from d4orm_env.render.panels import (
     CONTACT,

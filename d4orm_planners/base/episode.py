@@ -13,10 +13,9 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
-from d4orm_env.core.metrics import accelerations, mean_squared_jerk, mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
-from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
+from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, accelerations, mean_squared_jerk, mean_stretch
 from d4orm_env.disturbances.disturbance import marks_of
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -40,7 +39,7 @@ class Episode(DisplayMixin):
         problem: Problem of the environment.
         trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
         metrics: The environment's own, see :func:`d4orm_env.envs.team_step.episode_metrics`, and
-            ``mean_squared_jerk``, see :func:`d4orm_env.core.metrics.mean_squared_jerk`.
+            ``mean_squared_jerk``, see :func:`d4orm_env.core.trajectory.mean_squared_jerk`.
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.
         goals: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode.
@@ -76,7 +75,7 @@ class Episode(DisplayMixin):
 
     @cached_property
     def stretch(self) -> float:
-        """Path travelled over the shortest path, see :func:`d4orm_env.core.metrics.mean_stretch`.
+        """Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`.
 
         In lifelong mode, where goals change, it means nothing.
         """

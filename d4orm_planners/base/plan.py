@@ -14,10 +14,9 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.metrics import mean_stretch
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, mean_stretch
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.candidate import step_faults
 from d4orm_planners.base.display import DisplayMixin
@@ -26,17 +25,17 @@ from d4orm_planners.base.machine import Provenance
 if TYPE_CHECKING:
     from d4orm_env.scenarios import dynobench
     from d4orm_planners.base import plan_file
-    from d4orm_planners.setpoints import export as exports
-    from d4orm_planners.setpoints import setpoints, smoothing
-    from d4orm_planners.setpoints.export import ExportReport
-    from d4orm_planners.setpoints.setpoints import Setpoints
-    from d4orm_planners.setpoints.smoothing import SmoothMotion
+    from d4orm_planners.tracking import export as exports
+    from d4orm_planners.tracking import setpoints, smoothing
+    from d4orm_planners.tracking.export import ExportReport
+    from d4orm_planners.tracking.setpoints import Setpoints
+    from d4orm_planners.tracking.smoothing import SmoothMotion
 else:
     dynobench = LazyModule("d4orm_env.scenarios.dynobench")
     plan_file = LazyModule("d4orm_planners.base.plan_file")
-    exports = LazyModule("d4orm_planners.setpoints.export")
-    setpoints = LazyModule("d4orm_planners.setpoints.setpoints")
-    smoothing = LazyModule("d4orm_planners.setpoints.smoothing")
+    exports = LazyModule("d4orm_planners.tracking.export")
+    setpoints = LazyModule("d4orm_planners.tracking.setpoints")
+    smoothing = LazyModule("d4orm_planners.tracking.smoothing")
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
 """End of a search; see :class:`Plan`."""
@@ -102,7 +101,7 @@ class Plan(DisplayMixin):
         wall_time: Seconds, first-call compilation excluded.
         history: One record per iteration.
         trajectory: Rollout of the controls.
-        metrics: See :func:`d4orm_env.core.metrics.trajectory_metrics`, and ``"denoising_steps"`` and
+        metrics: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, and ``"denoising_steps"`` and
             ``"denoising_share"``, the share of the iterations that did some. ``d-d4orm`` adds ``"messages"`` and
             ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
             time that they waited for each other.
@@ -144,7 +143,7 @@ class Plan(DisplayMixin):
 
     @cached_property
     def stretch(self) -> float:
-        """Path travelled over the shortest path, see :func:`d4orm_env.core.metrics.mean_stretch`; found when it is
+        """Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; found when it is
         first asked for, so that solving does not wait for it.
         """
         return mean_stretch(self.problem, self.trajectory)
@@ -175,7 +174,7 @@ class Plan(DisplayMixin):
         """Return smooth setpoints for the robots' own controllers, verified again.
 
         The controls of a plan jump at every step. This is a spline of class C4 through its positions, driven as much
-        more slowly as the limits need (:mod:`d4orm_planners.setpoints.smoothing`).
+        more slowly as the limits need (:mod:`d4orm_planners.tracking.smoothing`).
 
         Args:
             rate: Of the setpoints [Hz].
@@ -202,7 +201,7 @@ class Plan(DisplayMixin):
 
         Args:
             format: ``"csv"``, ``"crazyswarm2"`` (polynomials), ``"rosbag2"`` or ``"mcap"`` (ROS 2 messages);
-                see :data:`d4orm_planners.setpoints.export.FORMATS`.
+                see :data:`d4orm_planners.tracking.export.FORMATS`.
             path: Folder for the files, which is made.
             rate: Of the setpoints [Hz]; polynomials have none.
             height: z of a team that moves in the plane [m].

@@ -14,10 +14,9 @@ import numpy as np
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import ArrayArchive, replaced_when_done, require_file
 from d4orm_env.core.infeasibility import prove_infeasible
-from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import DEFAULT_RADIUS
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, trajectory_metrics
 from d4orm_env.engine.choice import rollout
 from d4orm_env.scenarios.problem_files import describe
 from d4orm_env.scenarios.schema import parse

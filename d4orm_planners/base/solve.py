@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, shown, whole_number
-from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
+from d4orm_env.core.trajectory import trajectory_metrics
 from d4orm_env.engine.types import checked_controls
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.machine import Provenance

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, arrival_steps
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.conflict_groups import Graph, graph_of

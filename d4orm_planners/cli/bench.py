@@ -8,12 +8,12 @@ from typing import Annotated
 
 import typer
 
-from d4orm_planners.benchmark.bench_report import circumstances, write_report
-from d4orm_planners.benchmark.benchmark import parts, run_parts
-from d4orm_planners.benchmark.settings import QUICK, SECTIONS, BenchmarkSettings
 from d4orm_planners.cli.arguments import MOST_SEEDS, names, numbers, output_folder
 from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.cli.outputs import parts_progress
+from d4orm_planners.evaluation.bench_report import circumstances, write_report
+from d4orm_planners.evaluation.benchmark import parts, run_parts
+from d4orm_planners.evaluation.benchmark_settings import QUICK, SECTIONS, BenchmarkSettings
 
 
 def bench(

@@ -8,15 +8,16 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays
+from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine import noise
 from d4orm_env.engine.cpu import CpuEngine, typed
 from d4orm_env.engine.noise import DRAWS, TURNS
 from d4orm_env.engine.sample_noise import Drawing
-from d4orm_env.engine.simd import TILE
+from d4orm_env.engine.simd import BLOCK, TILE
 from d4orm_env.engine.threads import Threads
 from d4orm_env.footprints import Disc
 from d4orm_planners.engine import score, weighting
-from d4orm_planners.engine.proximity import bound_boxes, make_bodies
+from d4orm_planners.engine.proximity import Bodies
 from d4orm_planners.engine.sampling_types import (
     WATCHED_SAMPLES,
     DenoisingStep,
@@ -89,6 +90,36 @@ def _nobody(task: SamplingTask) -> MovingObstacles:
 
 def _discs(radius: FloatArray) -> FootprintArrays:
     return as_arrays([Body(number, Disc(size), None, 0.0) for number, size in enumerate(radius.tolist())])
+
+
+def bound_boxes(arrays: ProblemArrays) -> FloatArray:
+    """``(S, d, 2)`` ends of the boxes round what lies beyond each of the bounds, widened by half of the margin."""
+    dimension = arrays.goal.shape[1]
+    low, high = np.full((2, 0, dimension), np.float32(0))
+    for side, axis in np.argwhere(np.isfinite(arrays.bounds)):
+        beyond = np.full((2, 1, dimension), np.float32(np.inf))
+        beyond[0] = -np.float32(np.inf)
+        beyond[1 - side, 0, axis] = arrays.bounds[side, axis]
+        low, high = np.concatenate([low, beyond[0]]), np.concatenate([high, beyond[1]])
+    return _widened(low, high, arrays.margin)
+
+
+def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
+    """The bodies, with their boxes."""
+    # Copies, for which one compilation serves: read-only arrays are of another type.
+    places, radius = (np.array(values, np.float32, order="C") for values in (moving.positions, moving.radius))
+    num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
+    # A last block that is short goes on with its last place.
+    blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
+    blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
+    boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
+    headings = np.zeros((num_steps, 0)) if moving.headings is None else moving.headings
+    return Bodies(places, radius, boxes, moving.footprints, np.array(headings, np.float32, order="C"))
+
+
+def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
+    widening = np.float32(0.5) * margin
+    return np.ascontiguousarray(np.stack([low - widening, high + widening], axis=-1), np.float32)
 
 
 class Sampling:

@@ -37,7 +37,6 @@ from d4orm_env.engine.simd import (
     worlds_overlap_3,
 )
 from d4orm_env.engine.tiles import near_round
-from d4orm_planners.engine.sampling_types import MovingObstacles
 
 DIGITS = 7
 """Binary digits that robots near each other are counted in; one tells only whether there are any."""
@@ -45,9 +44,7 @@ DIGITS = 7
 WIDER = np.float32(1 + 2.0**-6)
 """Factor by which robots' boxes are stretched for rounding, of coordinates many thousand times as large too."""
 
-_INFINITY = np.float32(np.inf)
 _CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
-_HALF = np.float32(0.5)
 
 
 class Scratch(NamedTuple):
@@ -96,36 +93,6 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
         np.empty((num_robots, num_robots), np.int32), np.empty((DIGITS, num_robots, BLOCK), np.uint64),
         aligned_zeros(2 * TILE),
     )  # fmt: skip
-
-
-def bound_boxes(arrays: ProblemArrays) -> FloatArray:
-    """``(S, d, 2)`` ends of the boxes round what lies beyond each of the bounds, widened by half of the margin."""
-    dimension = arrays.goal.shape[1]
-    low, high = np.full((2, 0, dimension), np.float32(0))
-    for side, axis in np.argwhere(np.isfinite(arrays.bounds)):
-        beyond = np.full((2, 1, dimension), _INFINITY)
-        beyond[0] = -_INFINITY
-        beyond[1 - side, 0, axis] = arrays.bounds[side, axis]
-        low, high = np.concatenate([low, beyond[0]]), np.concatenate([high, beyond[1]])
-    return _widened(low, high, arrays.margin)
-
-
-def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
-    """The bodies, with their boxes."""
-    # Copies, for which one compilation serves: read-only arrays are of another type.
-    places, radius = (np.array(values, np.float32, order="C") for values in (moving.positions, moving.radius))
-    num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
-    # A last block that is short goes on with its last place.
-    blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
-    blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
-    boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
-    headings = np.zeros((num_steps, 0)) if moving.headings is None else moving.headings
-    return Bodies(places, radius, boxes, moving.footprints, np.array(headings, np.float32, order="C"))
-
-
-def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
-    widening = _HALF * margin
-    return np.ascontiguousarray(np.stack([low - widening, high + widening], axis=-1), np.float32)
 
 
 @inlined
@@ -215,9 +182,7 @@ def _count(digits: int, k: Whole, step: int, touch: np.uint64, near: NDArray[np.
 @inlined
 def _undecided(f: FootprintArrays | None, digits: int, both: np.uint64, chunk: int, touch: np.uint64) -> np.uint64:
     """Leave out of ``touch`` where both robots are known to be near something, if one thing counts as much as two."""
-    if f is None:
-        return touch
-    return touch & ~(both >> np.uint64(chunk)) if digits == 1 else touch
+    return touch if f is None or digits > 1 else touch & ~(both >> np.uint64(chunk))
 
 
 @compiled
@@ -327,7 +292,7 @@ def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatA
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
     if arrays.grid.clearance.shape[0] > 0:
         # The boxes are wider than the places by the radius and half of the margin.
-        reach, half = arrays.radius[k] + arrays.margin, WIDER * (arrays.radius[k] + _HALF * arrays.margin)
+        reach, half = arrays.radius[k] + arrays.margin, WIDER * (arrays.radius[k] + np.float32(0.5) * arrays.margin)
         touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, buffer)
     for bound in range(bounds.shape[0]):
         touch |= _meets(k, bound, dimension, boxes, limits)

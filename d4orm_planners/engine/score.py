@@ -17,22 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
-from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import transition
-from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine import obstacles
 from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import ONE, WITHOUT_ARRAYS, ZERO, aligned_zeros, compiled, inlined, to_fixed_tuple
-from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.footprint_contacts import place_bodies, refine_static
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, aligned_zeros, inlined
+from d4orm_env.engine.footprint_contacts import refine_static
 from d4orm_env.engine.noise import DRAWS
-from d4orm_env.engine.sample_noise import TURN, VECTOR, Drawing, draw_block, fill_keys
+from d4orm_env.engine.sample_noise import Drawing, draw_block, fill_keys
 from d4orm_env.engine.simd import BLOCK, NOWHERE, TILE, subtract_where, use_wide_registers
-from d4orm_env.engine.stepping import Docking, dispatch, docking_of, make_stepper, models_key, models_of_kernel
-from d4orm_env.engine.tile_layout import READ, WRITE, Row
+from d4orm_env.engine.stepping import dispatch, docking_of, models_key, models_of_kernel
 from d4orm_planners.engine.proximity import (
     DIGITS,
     POSES,
@@ -45,14 +40,19 @@ from d4orm_planners.engine.proximity import (
     place_of,
     pose_of,
 )
+from d4orm_planners.engine.sample_rollout import (
+    CONTROL_ROWS,
+    DOCKED,
+    STRIDE,
+    TOTAL,
+    add_standing,
+    all_docked,
+    begin_tile,
+    runner,
+    stay,
+)
 
-# First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
-STATE, DOCKED, TOTAL, ROWS = 0, 6, 7, 9
-STRIDE = ROWS * TILE
 HALF = np.float32(0.5)
-
-CONTROL_ROWS = 3
-"""Rows of one step's controls."""
 
 
 class Workspace(NamedTuple):
@@ -116,110 +116,6 @@ def make_workspace(shape: tuple[int, ...], dimension: int, num_bodies: int) -> W
     )  # fmt: skip
 
 
-@compiled
-def _copy(source: FloatArray, target: FloatArray) -> None:
-    for i in range(target.shape[0]):
-        target[i] = source[i]
-
-
-@cache
-def _runner(name: str) -> Callable[..., None]:
-    """The compiled steps of one robot of this model in every sample of a tile, which add its reward without violations.
-    The draws and controls are the same few rows for every robot: they stay in cache.
-    """
-    model = MODELS[name]
-    move, dock = make_stepper(model)
-    limit_control = inlined(model.functions.limit_control)
-    read_x, write_x = READ[model.state_size], WRITE[model.state_size]
-    read_u, write_u = READ[model.control_size], WRITE[model.control_size]
-    turn, vector, dimension = TURN[model.control_size], VECTOR[model.control_size], model.dimension
-    num_limits = len(model.limit_names)
-
-    @compiled
-    def run(
-        all_limits: FloatArray, h: TimeStep, docking: Docking, goal: Row, inverse: np.float32,
-        offset: FloatArray, scale: FloatArray, draws: FloatArray, controls: FloatArray, moved: FloatArray,
-        places: FloatArray, f: FootprintArrays | None, k: int, poses: FloatArray, w: FloatArray,
-    ) -> None:  # fmt: skip
-        use_wide_registers()
-        limits = to_fixed_tuple(all_limits, num_limits)
-        goal, count = goal[:dimension], offset.shape[0]
-        for i in range(count):
-            u = controls[i * CONTROL_ROWS * TILE : (i + 1) * CONTROL_ROWS * TILE]
-            o, c, d = vector(offset[i]), vector(scale[i]), draws[4 * i * DRAWS : 4 * (i + 1) * DRAWS]
-            for s in range(DRAWS):
-                u1, u2, u3, u4 = turn(o, c, d, s)
-                write_u(u, 0, s, limit_control(u1, limits, OPS))
-                write_u(u, DRAWS, s, limit_control(u2, limits, OPS))
-                write_u(u, 2 * DRAWS, s, limit_control(u3, limits, OPS))
-                write_u(u, 3 * DRAWS, s, limit_control(u4, limits, OPS))
-        # Two loops for the same reason as in tiles. They read rows and write others: to store a choice between a new
-        # number and the one that is there becomes a masked store, which takes long on AMD's processors without AVX-512.
-        for i in range(count):
-            u = controls[i * CONTROL_ROWS * TILE : (i + 1) * CONTROL_ROWS * TILE]
-            for s in range(TILE):
-                standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
-                x = move(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, h)
-                write_x(moved, 0, s, x)
-            for s in range(TILE):
-                standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
-                x, gap2, docked = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
-                write_x(w, STATE * TILE, s, x)
-                w[DOCKED * TILE + s] = ONE if docked else ZERO
-                w[TOTAL * TILE + s] += transition.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
-            _copy(w[: dimension * TILE], places[i * dimension * TILE : (i + 1) * dimension * TILE])
-            if f is not None:
-                place_bodies(f, k, w, poses, POSES, pose_of(i))
-
-    return run
-
-
-@inlined
-def _add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: FloatArray) -> None:
-    """Add the reward, violations aside, of ``count`` steps in which the robot does not move."""
-    for s in range(TILE):
-        gap2 = ZERO
-        for axis in range(goal.shape[0]):
-            gap = w[(STATE + axis) * TILE + s] - goal[axis]
-            gap2 += gap * gap
-        w[TOTAL * TILE + s] += count * transition.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
-
-
-@inlined
-def _all_docked(w: FloatArray) -> bool:
-    if w[DOCKED * TILE] == ZERO:
-        return False
-    total = ZERO
-    for s in range(TILE):
-        total += w[DOCKED * TILE + s]
-    return total == np.float32(TILE)
-
-
-@inlined
-def _begin_tile(arrays: ProblemArrays, docked: BoolArray, w: FloatArray) -> None:
-    for k in range(arrays.radius.shape[0]):
-        robot = w[k * STRIDE : (k + 1) * STRIDE]
-        for i in range(arrays.start.shape[1]):
-            robot[(STATE + i) * TILE : (STATE + i + 1) * TILE] = arrays.start[k, i]
-        robot[DOCKED * TILE : (DOCKED + 1) * TILE] = ONE if docked[k] else ZERO
-        robot[TOTAL * TILE : (TOTAL + 1) * TILE] = ZERO
-
-
-@inlined
-def _stay(dimension: int, w: FloatArray, places: FloatArray) -> None:
-    """Fill the places of every step of a block with where the robot is."""
-    for step in range(BLOCK):
-        _copy(w[: dimension * TILE], places[step * dimension * TILE : (step + 1) * dimension * TILE])
-
-
-@inlined
-def _stay_turned(f: FootprintArrays | None, k: int, w: FloatArray, poses: FloatArray) -> None:
-    """Fill the poses of every step of a block with the robot's."""
-    if f is not None:
-        for step in range(BLOCK):
-            place_bodies(f, k, w, poses, POSES, pose_of(step))
-
-
 @inlined
 def _punish_near(near: NDArray[np.uint64], digits: int, count: int, penalties: FloatArray, w: FloatArray) -> None:
     """Take the penalties from the robots that are near each other or a body, in the steps of a block."""
@@ -233,68 +129,75 @@ def _punish_near(near: NDArray[np.uint64], digits: int, count: int, penalties: F
 
 
 @inlined
+def _punish_static(
+    arrays: ProblemArrays, scoring: Scoring, k: int, count: int, rest: int, places: FloatArray, poses: FloatArray,
+    scratch: Scratch, w: FloatArray,
+) -> None:  # fmt: skip
+    """Take the penalty from robot ``k`` where it is near an obstacle or the bounds; ``rest`` times more at the end."""
+    radius, margin, dimension, buffer = arrays.radius[k], arrays.margin, arrays.goal.shape[1], scratch.buffer
+    if not near_static(arrays, k, scoring.bounds, scratch.boxes, buffer):
+        return
+    for step in range(count):
+        rows = places[step * dimension * TILE : (step + 1) * dimension * TILE]
+        touch = obstacles.near_obstacles(arrays, radius + margin, rows, buffer)
+        begin = pose_of(step)
+        touch = refine_static(arrays.footprints, arrays, k, touch, margin, rows, poses, POSES, begin, buffer)
+        steps = np.float32(1 + rest if step == count - 1 else 1)
+        subtract_where(w, TOTAL * TILE, touch, steps * scoring.penalties[k])
+
+
+@inlined
+def _advance_robot(
+    run_robot: Callable[..., None], arrays: ProblemArrays, scoring: Scoring, drawing: Drawing, counter: int,
+    kept: FloatArray, space: Workspace, h: TimeStep, k: int, first: int, count: int,
+) -> None:  # fmt: skip
+    """Move robot ``k`` for ``count`` steps of a block from ``first`` on, and reward it, but for what moves as well."""
+    num_steps, _, num_controls = drawing.offset.shape
+    num_pairs, dimension, reach = (num_controls + 1) // 2, arrays.goal.shape[1], arrays.radius[k] + HALF * arrays.margin
+    # The noise of a robot that stands counts in the mean all the same.
+    draw_block(space.keys, counter, (k * num_steps + first) * num_pairs, count, num_pairs, kept, space.draws)
+    robot, footprints = space.w[k * STRIDE : (k + 1) * STRIDE], arrays.footprints
+    places = space.places[place_of(k, 0, dimension) : place_of(k + 1, 0, dimension)]
+    if space.standing[k]:
+        stay(dimension, footprints, k, robot, places, space.poses)
+        enclose(k, reach, dimension, space.places, space.scratch.boxes)
+        return
+    goals, last = arrays.goal, first + count
+    goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
+    run_robot(
+        arrays.model_codes[k], arrays.limits[k], h, docking_of(arrays, k), goal, arrays.inverse_initial_distance[k],
+        drawing.offset[first:last, k], drawing.scale[first:last, k], space.draws, space.controls, space.moved, places,
+        footprints, k, space.poses, robot,
+    )  # fmt: skip
+    # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags towards
+    # static obstacles.
+    rest = 0
+    if arrays.docks and all_docked(robot):
+        space.standing[k] = True
+        rest = num_steps - last
+        add_standing(goals[k], arrays.inverse_initial_distance[k], np.float32(rest), robot)
+    enclose(k, reach, dimension, space.places, space.scratch.boxes)
+    _punish_static(arrays, scoring, k, count, rest, places, space.poses, space.scratch, robot)
+
+
+@inlined
 def _score_tile(
-    run_robot: Callable[..., None],
-    arrays: ProblemArrays,
-    scoring: Scoring,
-    drawing: Drawing,
-    counter: int,
-    kept: FloatArray,
-    space: Workspace,
-) -> None:
+    run_robot: Callable[..., None], arrays: ProblemArrays, scoring: Scoring, drawing: Drawing, counter: int,
+    kept: FloatArray, space: Workspace,
+) -> None:  # fmt: skip
     """Roll out a tile of samples, noise beginning with this counter; leave summed rewards in rows TOTAL."""
-    w, places, draws, controls, standing = space.w, space.places, space.draws, space.controls, space.standing
-    moved, keys, scratch, offset, scale = space.moved, space.keys, space.scratch, drawing.offset, drawing.scale
-    poses, footprints = space.poses, arrays.footprints
-    penalties, bounds, digits = scoring.penalties, scoring.bounds, DIGITS if scoring.per_pair else 1
-    num_steps, num_robots, num_controls = offset.shape
-    num_pairs = (num_controls + 1) // 2
-    # Taken out of the tuple once: every access counts a reference, which costs as much as several samples.
-    codes, all_limits, goals, inverse = arrays.model_codes, arrays.limits, arrays.goal, arrays.inverse_initial_distance
-    h = transition.TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
-    docks, dimension = arrays.docks, goals.shape[1]
-    radius, margin = arrays.radius, arrays.margin
-    standing[:] = False
-    _begin_tile(arrays, scoring.docked, w)
-    boxes = scratch.boxes
+    penalties, digits = scoring.penalties, DIGITS if scoring.per_pair else 1
+    h = TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
+    num_steps, num_robots, _ = drawing.offset.shape
+    space.standing[:] = False
+    begin_tile(arrays, scoring.docked, space.w)
     for first in range(0, num_steps, BLOCK):
         count = min(BLOCK, num_steps - first)
         for k in range(num_robots):
-            # The noise of a robot that stands counts in the mean all the same.
-            stream = (k * num_steps + first) * num_pairs
-            draw_block(keys, counter, stream, count, num_pairs, kept, draws)
-            robot = w[k * STRIDE : (k + 1) * STRIDE]
-            own_places = places[place_of(k, 0, dimension) : place_of(k + 1, 0, dimension)]
-            if standing[k]:
-                _stay(dimension, robot, own_places)
-                _stay_turned(footprints, k, robot, poses)
-                enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-                continue
-            goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
-            last, docking = first + count, docking_of(arrays, k)
-            run_robot(
-                codes[k], all_limits[k], h, docking, goal, inverse[k], offset[first:last, k], scale[first:last, k],
-                draws, controls, moved, own_places, footprints, k, poses, robot,
-            )  # fmt: skip
-            # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags
-            # towards static obstacles.
-            rest = 0
-            if docks and _all_docked(robot):
-                standing[k] = True
-                rest = num_steps - (first + count)
-                _add_standing(goals[k], inverse[k], np.float32(rest), robot)
-            enclose(k, radius[k] + HALF * margin, dimension, places, boxes)
-            if near_static(arrays, k, bounds, boxes, scratch.buffer):
-                for step in range(count):
-                    rows = own_places[step * dimension * TILE : (step + 1) * dimension * TILE]
-                    touch = obstacles.near_obstacles(arrays, radius[k] + margin, rows, scratch.buffer)
-                    begin, buffer = pose_of(step), scratch.buffer
-                    touch = refine_static(footprints, arrays, k, touch, margin, rows, poses, POSES, begin, buffer)
-                    steps = np.float32(1 + rest if step == count - 1 else 1)
-                    subtract_where(robot, TOTAL * TILE, touch, steps * penalties[k])
+            _advance_robot(run_robot, arrays, scoring, drawing, counter, kept, space, h, k, first, count)
         if scoring.collisions:
-            mark_robots(arrays, scoring.bodies, digits, first, count, places, poses, scratch)
-            _punish_near(scratch.near, digits, count, penalties, w)
+            mark_robots(arrays, scoring.bodies, digits, first, count, space.places, space.poses, space.scratch)
+            _punish_near(space.scratch.near, digits, count, penalties, space.w)
 
 
 def score_kernel(models: tuple[str, ...]) -> Score:
@@ -316,7 +219,7 @@ def score_kernel(models: tuple[str, ...]) -> Score:
 
 @cache
 def _score_kernel(models: tuple[str, ...]) -> Score:
-    run_robot = dispatch({name: _runner(name) for name in models})
+    run_robot = dispatch({name: runner(name) for name in models})
 
     @cached_kernel(variant="_".join(models), key=models_key(models), **WITHOUT_ARRAYS)
     def score_tiles(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from operator import attrgetter
@@ -43,15 +42,6 @@ class Paired:
     cost_p: float
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
-    """P values corrected for how many there are by Holm's method, in their order."""
-    order = np.argsort(p_values, kind="stable")
-    left = len(p_values) - np.arange(len(p_values))
-    corrected = np.empty(len(p_values))
-    corrected[order] = np.minimum(np.maximum.accumulate(np.asarray(p_values, float)[order] * left), 1)
-    return [float(value) for value in corrected]
-
-
 def paired(
     first: Sequence[Trial],
     second: Sequence[Trial],
@@ -65,7 +55,7 @@ def paired(
         second: Trials of another.
         cost: Cost, such as steps to the first solution with twice the budget for none.
         succeeded: Criterion of success; by default that everyone arrived and nothing was touched. A plan that touches
-            nothing and does not keep the margin is no solution, see :func:`is_solved`.
+            nothing and does not keep the margin is no solution.
 
     Raises:
         ValueError: If they have none in common.
@@ -203,40 +193,6 @@ def _bootstrap(differences: Sequence[float] | np.ndarray) -> tuple[float, float]
         (values,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)
     )
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
-
-
-def steps_to_solution(trial: Trial) -> int | None:
-    """Denoising steps of a sampling planner until its first solution; ``None`` if it found none.
-
-    Rows that older versions wrote tell it of solves that ended with the first solution only.
-    """
-    first = next((best for best in trial.progress if best.solved), None)
-    if first is not None and first.steps is not None:
-        return first.steps
-    return steps_spent(trial) if trial.status == "solved" else None
-
-
-def is_solved(trial: Trial) -> bool:
-    """Check whether a sampling planner found a solution: all arrive, the margin is kept and ``verify()`` agrees."""
-    return steps_to_solution(trial) is not None
-
-
-def steps_spent(trial: Trial) -> int | None:
-    """Denoising steps of a whole trial; ``None`` where they are not known."""
-    steps = _iteration_steps(json.loads(trial.config))
-    return None if steps is None or not trial.iterations else trial.iterations * steps
-
-
-def penalised_steps(trial: Trial) -> int:
-    """:func:`steps_to_solution`, and twice all the steps that there were where it found none (PAR-2)."""
-    steps, config = steps_to_solution(trial), json.loads(trial.config)
-    return 2 * (_iteration_steps(config) or 0) * int(config["max_iterations"]) if steps is None else steps
-
-
-def _iteration_steps(config: Mapping[str, Any]) -> int | None:
-    """Denoising steps of an iteration with these settings; ``None`` where there are none."""
-    steps = config.get("check_every") or config.get("num_steps")
-    return None if steps is None else int(steps)
 
 
 @dataclass(frozen=True, eq=False)

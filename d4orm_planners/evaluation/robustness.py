@@ -170,23 +170,22 @@ class Tolerance:
         return f"{self.fails:g}" if self.fails is not None else f"over {self.stands:g}"
 
 
-def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
+def tolerances(rates: Iterable[SuccessRate]) -> list[Tolerance]:
     """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
 
     Args:
         rates: Those of one policy and disturbance from harmless to bad; those without a disturbance are passed over.
-        share: Share of the success rate at the first level that is asked for.
     """
     lines: dict[tuple[object, ...], list[SuccessRate]] = {}
     for rate in rates:
         if rate.disturbance:
             key = (rate.label, rate.scenario, rate.num_robots, rate.model, rate.control_noise_std, rate.disturbance)
             lines.setdefault(key, []).append(rate)
-    return [_tolerance(line, share) for line in lines.values()]
+    return [_tolerance(line) for line in lines.values()]
 
 
-def _tolerance(line: Sequence[SuccessRate], share: float) -> Tolerance:
-    threshold = share * line[0].rate
+def _tolerance(line: Sequence[SuccessRate]) -> Tolerance:
+    threshold = THRESHOLD * line[0].rate
     failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
     first = line[0]
     return Tolerance(

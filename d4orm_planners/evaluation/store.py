@@ -80,10 +80,10 @@ class Trial:
         arrived: Robots that arrived.
         travel_time: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive.
         makespan: Latest arrival time [s], likewise.
-        stretch: Path travelled over the shortest path, see :func:`d4orm_env.core.metrics.mean_stretch`; ``None`` if
+        stretch: Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; ``None`` if
             nobody arrived, and in rows that older versions wrote.
         reward: Mean over steps and robots.
-        mean_squared_jerk: See :func:`d4orm_env.core.metrics.mean_squared_jerk` [m^2/s^6].
+        mean_squared_jerk: See :func:`d4orm_env.core.trajectory.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
         iterations: Iterations of the planner; ``None`` for a policy that executes no plan.
         denoising_share: Share of them that denoised; 0 where the plan is search's and path finding's alone.

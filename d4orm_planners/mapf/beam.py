@@ -1,4 +1,6 @@
-"""Paths that a beam search has found so far, compiled with numba: those in the beam, and all that ever were."""
+"""What a beam search is asked for, and the paths that it has found so far, compiled with numba: those in the beam, and
+all that ever were.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,52 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
+
+
+class BeamRules(NamedTuple):
+    """Rules by which the beam keeps paths.
+
+    Attributes:
+        width: Number of paths.
+        contact: Cost of being near another robot in a block [s].
+        dedup_distance: Least distance between two, or else twice as much in speed [m, m/s].
+    """
+
+    width: int
+    contact: float
+    dedup_distance: float
+
+
+class OtherAgents(NamedTuple):
+    """Agents that robots which look for a path avoid, other than the team as it drives at present.
+
+    Attributes:
+        without: ``(R, N)`` numbers of robots that each does not mind, its own among them.
+        beside: ``(R, M, H+1, d)`` paths that it minds as well [m].
+        radius: ``(R, M)`` radii of the agents on them [m].
+    """
+
+    without: IntArray
+    beside: FloatArray
+    radius: Floats
+
+
+class Queries(NamedTuple):
+    """Robots that look for paths.
+
+    Attributes:
+        robots: ``(R,)`` their numbers in the team.
+        blocks: ``(R,)`` the block at whose beginning their new paths begin,
+        states: ``(R, n)`` and in which state.
+        limits: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost.
+        others: Agents that they mind, or do not mind.
+    """
+
+    robots: IntArray
+    blocks: IntArray
+    states: FloatArray
+    limits: Floats
+    others: OtherAgents
 
 
 class Beam(NamedTuple):

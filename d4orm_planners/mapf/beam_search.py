@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -23,11 +22,20 @@ from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import WITHOUT_ARRAYS, ZERO, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.obstacles import is_closed, touches_static
-from d4orm_env.engine.stepping import Docking, docking_of, models_key
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Docking, Row, docking_of, models_key
 from d4orm_planners.engine.path_index import is_unsure
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
-from d4orm_planners.mapf.beam import BeamSpace, is_like_another, keep, sink, trace_back
+from d4orm_planners.mapf.beam import (
+    Beam,
+    BeamRules,
+    BeamSpace,
+    OtherAgents,
+    Queries,
+    is_like_another,
+    keep,
+    sink,
+    trace_back,
+)
 from d4orm_planners.mapf.motion_primitives import Moves, aiming
 from d4orm_planners.tracking.tracker import tracker, velocity_step
 
@@ -38,50 +46,8 @@ _TOUCH = 100.0
 """Robots that are met rather than an obstacle touched for a step."""
 
 
-class BeamRules(NamedTuple):
-    """Rules by which the beam keeps paths.
-
-    Attributes:
-        width: Number of paths.
-        contact: Cost of being near another robot in a block [s].
-        dedup_distance: Least distance between two, or else twice as much in speed [m, m/s].
-    """
-
-    width: int
-    contact: float
-    dedup_distance: float
-
-
-class OtherAgents(NamedTuple):
-    """Agents that robots which look for a path avoid, other than the team as it drives at present.
-
-    Attributes:
-        without: ``(R, N)`` numbers of robots that each does not mind, its own among them.
-        beside: ``(R, M, H+1, d)`` paths that it minds as well [m].
-        radius: ``(R, M)`` radii of the agents on them [m].
-    """
-
-    without: NDArray[np.int64]
-    beside: FloatArray
-    radius: NDArray[np.float64]
-
-
-class Queries(NamedTuple):
-    """Robots that look for paths.
-
-    Attributes:
-        robots: ``(R,)`` their numbers in the team.
-        blocks: ``(R,)`` the block at whose beginning their new paths begin,
-        states: ``(R, n)`` and in which state.
-        limits: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost.
-        others: Agents that they mind, or do not mind.
-    """
-
-    robots: NDArray[np.int64]
-    blocks: NDArray[np.int64]
-    states: FloatArray
-    limits: NDArray[np.float64]
-    others: OtherAgents
+Ending: TypeAlias = tuple[float, Whole, Whole]
+"""Cost of the best path that arrives [s], the path that it goes on from, and its last move; -1 if there is none."""
 
 
 @compiled
@@ -224,6 +190,63 @@ def _move_follower(model: Model) -> Callable[..., int]:
     return tracker(model, by_moves)
 
 
+@inlined
+def _add_path(new: Beam, at: Whole, state: Row, velocity: Row, cost: float, bound: float, faults: float) -> None:
+    for axis in range(new.velocities.shape[1]):
+        new.velocities[at, axis] = velocity[axis]
+    for i in range(new.states.shape[1]):
+        new.states[at, i] = state[i]
+    new.costs[at], new.bounds[at], new.faults[at] = cost, bound, faults
+
+
+def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
+    """Function that goes on from every path in the beam by every move for a block: how many paths are new, and the best
+    one that arrives.
+    """
+    drive_block = _block_driver(model)
+    d, num_limits = model.dimension, len(model.limit_names)
+
+    @inlined
+    def grow_paths(
+        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, r: int,
+        space: BeamSpace, size: Whole, block: Whole, ending: Ending,
+    ) -> tuple[Whole, Ending]:  # fmt: skip
+        beam, new, numbers = space.beam, space.new, space.numbers
+        robot, steps, last_busy = queries.robots[r], steps_of(table, block), _last_busy(table)
+        goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
+        docking, reach = docking_of(arrays, robot), arrays.radius[robot] + arrays.margin
+        at, count = to_fixed_tuple(goal, d), np.int64(0)
+        best, best_number, best_move = ending
+        for node in range(size):
+            for number in range(moves.pace.shape[0]):
+                path = new.paths[count]
+                state, velocity, at_goal, cost, faults = drive_block(
+                    arrays, moves, number, beam.states[node], beam.faults[node], goal, at, limits, docking, reach,
+                    steps, path,
+                )  # fmt: skip
+                if rules.contact * faults + cost >= best:
+                    continue
+                if at_goal:
+                    # It stays there: whoever comes by later counts too.
+                    faults += _count_met(table, queries, r, path, block)
+                    faults += _count_passing(table, robot, queries.others, r, path, block, last_busy)
+                    if rules.contact * faults + cost < best:
+                        best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
+                    continue
+                _add_path(new, count, state, velocity, cost, rules.contact * faults + cost, faults)
+                new.before[count], new.moves[count] = numbers[node], number
+                count += 1
+        return count, (best, best_number, best_move)
+
+    return grow_paths
+
+
+@inlined
+def _last_busy(table: PathTable) -> Whole:
+    """Number of the last block in which anybody moves, or the one after it."""
+    return min(table.first.shape[0] - 1, table.moving[0] + 1)
+
+
 Search: TypeAlias = Kernel[
     [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, BeamSpace, FloatArray, FloatArray, BoolArray], None
 ]
@@ -238,8 +261,8 @@ def search_kernel(name: str) -> Search:
     paths begin, and says in ``found`` ``(R,)`` whether a path arrives; if none does, the rest is left alone.
     """
     model = MODELS[name]
-    drive_block, follow = _block_driver(model), _move_follower(model)
-    n, d, num_limits = model.state_size, model.dimension, len(model.limit_names)
+    grow_paths, follow = _path_grower(model), _move_follower(model)
+    n, d = model.state_size, model.dimension
 
     @cached_kernel(variant=name, key=models_key((name,)), **WITHOUT_ARRAYS)
     def search(
@@ -248,55 +271,27 @@ def search_kernel(name: str) -> Search:
     ) -> None:  # fmt: skip
         arrays, table, moves = borrow(arrays), borrow(table), borrow(moves)
         queries, space = borrow(queries), borrow(space)
-        num_blocks, num_moves = table.first.shape[0], moves.pace.shape[0]
         zero: Whole = np.int64(0)  # a literal would compile what it is passed to once more
-        last_busy = min(num_blocks - 1, table.moving[0] + 1)
-        beam, new, ever, numbers, did = space.beam, space.new, space.ever, space.numbers, space.did
         for r in range(part[0], part[1]):
-            robot, begin = queries.robots[r], queries.blocks[r]
-            goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
-            docking = docking_of(arrays, robot)
-            at, reach = to_fixed_tuple(goal, d), arrays.radius[robot] + arrays.margin
             for i in range(n):
-                beam.states[0, i] = queries.states[r, i]
-            beam.faults[0], numbers[0], size, ever.used[0] = 0.0, -1, zero + 1, 0
-            best, best_number, best_move = queries.limits[r], zero - 1, zero - 1
-            for block in range(begin, num_blocks):
-                steps, count = steps_of(table, block), zero
-                for node in range(size):
-                    for number in range(num_moves):
-                        path = new.paths[count]
-                        state, velocity, at_goal, cost, faults = drive_block(
-                            arrays, moves, number, beam.states[node], beam.faults[node], goal, at, limits, docking,
-                            reach, steps, path,
-                        )  # fmt: skip
-                        if rules.contact * faults + cost >= best:
-                            continue
-                        if at_goal:
-                            # It stays there: whoever comes by later counts too.
-                            faults += _count_met(table, queries, r, path, block)
-                            faults += _count_passing(table, robot, queries.others, r, path, block, last_busy)
-                            if rules.contact * faults + cost < best:
-                                best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
-                            continue
-                        for axis in range(d):
-                            new.velocities[count, axis] = velocity[axis]
-                        for i in range(n):
-                            new.states[count, i] = state[i]
-                        new.costs[count], new.bounds[count] = cost, rules.contact * faults + cost
-                        new.faults[count], new.before[count], new.moves[count] = faults, numbers[node], number
-                        count += 1
-                size = _keep_best(space, count, best, rules, table, queries, r, block)
+                space.beam.states[0, i] = queries.states[r, i]
+            space.beam.faults[0], space.numbers[0], size, space.ever.used[0] = 0.0, -1, zero + 1, 0
+            ending = (queries.limits[r], zero - 1, zero - 1)
+            for block in range(queries.blocks[r], table.first.shape[0]):
+                count, ending = grow_paths(arrays, table, moves, rules, queries, r, space, size, block, ending)
+                size = _keep_best(space, count, ending[0], rules, table, queries, r, block)
                 if size == 0:
                     break
-            found[r] = best_move >= 0
+            _, number, move = ending
+            found[r] = move >= 0
             if found[r]:
-                length = trace_back(ever, best_number, best_move, did)
-                state, start = to_fixed_tuple(queries.states[r], n), begin * BLOCK
+                length = trace_back(space.ever, number, move, space.did)
+                robot, begin, start = queries.robots[r], queries.blocks[r], queries.blocks[r] * BLOCK
+                state, goal = to_fixed_tuple(queries.states[r], n), arrays.goal[robot]
                 for i in range(n):
                     x[r, start, i] = state[i]
                 goal_radius = np.sqrt(arrays.squared_goal_radius)
-                reference = (moves, did[:length], begin, goal, goal_radius, x[r])
-                follow(arrays, robot, reference, at, start, state, False, u[r], x[r])
+                reference = (moves, space.did[:length], begin, goal, goal_radius, x[r])
+                follow(arrays, robot, reference, to_fixed_tuple(goal, d), start, state, False, u[r], x[r])
 
     return search

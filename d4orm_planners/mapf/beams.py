@@ -12,8 +12,8 @@ from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
-from d4orm_planners.mapf.beam import make_space
-from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents, Queries, search_kernel
+from d4orm_planners.mapf.beam import BeamRules, OtherAgents, Queries, make_space
+from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives, Moves
 from d4orm_planners.tracking.steering import Rollouts, by_model
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_planners.mapf.pibt import PibtWorkspace, step_team
-from d4orm_planners.mapf.roadmap import PAIR_SLACK, Roadmap
-from d4orm_planners.mapf.roadmap_costs import ROUNDING, Footprints, fill_costs, is_open
+from d4orm_planners.mapf.roadmap import PAIR_SLACK, ROUNDING, Footprints, Roadmap, fill_costs, is_open
 
 
 class SearchConstraint(NamedTuple):

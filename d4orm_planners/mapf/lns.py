@@ -1,7 +1,7 @@
 """Large-neighbourhood search: some robots at a time, one that is late and those near to it, look for better paths.
 
 As in MAPF-LNS (J. Li, Z. Chen, D. Harabor, P. J. Stuckey and S. Koenig, IJCAI 2021). Low-level planners find the
-paths: on a roadmap (:mod:`~d4orm_planners.mapf.roadmap_lns`) and under the robots' dynamics
+paths: on a roadmap (:mod:`~d4orm_planners.mapf.planner`) and under the robots' dynamics
 (:mod:`~d4orm_planners.mapf.motion_lns`).
 """
 

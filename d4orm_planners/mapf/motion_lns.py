@@ -7,16 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
-from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.portable import log
 from d4orm_env.core.seeds import Stream
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, arrival_steps
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
-from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
+from d4orm_planners.mapf.beam import BeamRules, OtherAgents
 from d4orm_planners.mapf.beams import find_paths, prepare_beams
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives

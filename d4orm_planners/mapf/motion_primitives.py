@@ -12,7 +12,7 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
 from d4orm_env.dynamics.robot_model import SPEED, Model
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Row
 
 _FAR = np.float32(10)
 """Look-ahead of a robot that turns off, in seconds at full speed."""

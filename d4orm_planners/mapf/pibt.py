@@ -17,8 +17,7 @@ from d4orm_env.core.arrays import BoolArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.mapf.near_neighbours import squared_gap
-from d4orm_planners.mapf.roadmap import Roadmap
-from d4orm_planners.mapf.roadmap_costs import Footprints, passes_too_near
+from d4orm_planners.mapf.roadmap import Footprints, Roadmap, passes_too_near
 
 FREE, MOVING, DONE = 0, 1, 2
 """Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST
+from d4orm_env.core.arrays import LARGEST, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MAX_HORIZON
 from d4orm_env.core.seeds import Stream
@@ -16,14 +17,57 @@ from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
-from d4orm_planners.mapf.lns import search_neighbourhoods
-from d4orm_planners.mapf.roadmap import lay_roadmap
-from d4orm_planners.mapf.roadmap_costs import fill_costs
-from d4orm_planners.mapf.roadmap_lns import RoadmapPaths
+from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
+from d4orm_planners.mapf.roadmap import fill_costs, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves, is_compiled
 
 if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap import Roadmap
+
+
+NEARNESS = 10 / 3
+"""Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
+
+
+@dataclass
+class RoadmapPaths:
+    """Low-level planner of :func:`~d4orm_planners.mapf.lns.search_neighbourhoods`: paths in space and time.
+
+    Attributes:
+        replanning: Search for paths.
+        solution: Rollout of the team.
+        most: Robots that are replanned together, at most.
+        should_stop: Asked before every path.
+    """
+
+    replanning: Replanning
+    solution: TeamRollout
+    most: int
+    should_stop: Callable[[], bool]
+    groups: int = 1
+
+    @property
+    def cost(self) -> tuple[int, int]:
+        """See :meth:`TeamRollout.cost`."""
+        return self.solution.cost(self.replanning.problem.horizon)
+
+    def odds(self, random: np.random.Generator) -> Odds:
+        """See :meth:`LowLevelPlanner.odds`: often one of those that come too late."""
+        driven, replanning = self.solution, self.replanning
+        delay = np.maximum(driven.arrivals - replanning.alone, 1.0)
+        late = driven.arrivals > replanning.problem.horizon
+        if late.any() and random.random() < 0.5:
+            delay[~late] = 0.0
+        sizes = (1, min(len(delay), self.most))
+        return Odds(delay, driven.places, driven.arrivals, NEARNESS * replanning.size, sizes)
+
+    def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
+        """See :meth:`LowLevelPlanner.replan`; what is worse is never accepted."""
+        for robots in groups:
+            changed = self.replanning.replan(self.solution, robots, random, self.should_stop)
+            if changed is not None and changed.cost(self.replanning.problem.horizon) < self.cost:
+                self.solution = changed
+
 
 FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
 """Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""

@@ -19,7 +19,7 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.mapf.near_neighbours import Cells, cells_about, items_in, sort_into_cells
 from d4orm_planners.mapf.roadmap import Roadmap
-from d4orm_planners.tracking.routes import Corners, Route, Routes
+from d4orm_planners.tracking.path_drives import Corners, Route, Routes
 
 SPACING = 4 / 15
 """Distance between the points of a route, at most, in radii of the largest robot, as all lengths below."""

@@ -14,8 +14,7 @@ from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.spaces import Space, is_free_line
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, bucket_of, last_passage, sort_boxes
-from d4orm_planners.mapf.roadmap import Roadmap
-from d4orm_planners.mapf.roadmap_costs import Footprints
+from d4orm_planners.mapf.roadmap import Footprints, Roadmap
 from d4orm_planners.mapf.safe_intervals import Intervals, free_intervals, interval_at
 
 

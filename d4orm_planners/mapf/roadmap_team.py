@@ -11,9 +11,8 @@ import numpy as np
 from numba import types
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
-from d4orm_env.core.metrics import arrival_steps
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, arrival_steps
 from d4orm_env.paths.spaces import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
@@ -21,8 +20,7 @@ from d4orm_planners.mapf.occupancy import Occupancy, Others, find_meetings
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path, straighten
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
-from d4orm_planners.tracking.path_drives import drive_routes
-from d4orm_planners.tracking.routes import Corners
+from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
 FIRST_CUT = 0.2

@@ -29,8 +29,7 @@ from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.settings import Count, PathText
 from d4orm_planners.rl.algorithms import ALGORITHMS
-from d4orm_planners.rl.checkpoints import Checkpoints
-from d4orm_planners.rl.curve import Evaluation, evaluate_network
+from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
 from d4orm_planners.rl.samples import Samples, dataset_samples, record_samples
 from d4orm_planners.rl.sb3_network import network_of

@@ -21,8 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
-from d4orm_planners.rl.checkpoints import Checkpoints
-from d4orm_planners.rl.curve import Evaluation, evaluate_network
+from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network, range_sensors
 from d4orm_planners.rl.sb3_network import leave_as_they_are, network_of, set_network
 from d4orm_planners.rl.train_config import MIXTURE, VALIDATION_SEED, Drawn, Stage, TrainingSettings, make_stages

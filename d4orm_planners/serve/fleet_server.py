@@ -14,17 +14,23 @@ from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller, ControlSetpoint
 from d4orm_planners.serve.wire import (
+    BOOL,
+    DIAGNOSTICS,
+    ODOMETRY,
+    POSE,
+    TRAJECTORY,
+    TWIST,
     RosSession,
     diagnostics,
     full_state,
     heading_of,
-    messages,
     place_of,
     state_from,
     time_of,
     turned,
     twist,
 )
+from d4orm_planners.tracking import ros_messages as ros
 
 NODE = "d4orm"
 DRIVING, BRAKING, PLANNING, WAITING, STOPPED = "driving", "braking", "planning", "waiting", "stopped"
@@ -116,14 +122,14 @@ class FleetServer:
         unknown = np.full(problem.state_size, np.nan, np.float32)
         self._robots = [FleetRobot(name, unknown) for name in names]
         self._by_name = {name: robot for robot, name in enumerate(names)}
-        self._odometry = session.subscriber("*/odom", messages.Odometry)
-        self._poses = session.subscriber("*/pose", messages.PoseStamped)
-        self._goal = session.subscriber("*/goal", messages.PoseStamped)
-        self._e_stop = session.subscriber("e_stop", messages.Bool)
+        self._odometry = session.subscriber("*/odom", ODOMETRY)
+        self._poses = session.subscriber("*/pose", POSE)
+        self._goal = session.subscriber("*/goal", POSE)
+        self._e_stop = session.subscriber("e_stop", BOOL)
         self._inputs = self._odometry, self._poses, self._goal, self._e_stop
-        self._commands = [session.publisher(f"{name}/cmd_vel", messages.Twist) for name in names]
-        self._setpoints = [session.publisher(f"{name}/setpoint", messages.MultiDOFJointTrajectory) for name in names]
-        self._diagnostics = session.publisher("diagnostics", messages.DiagnosticArray)
+        self._commands = [session.publisher(f"{name}/cmd_vel", TWIST) for name in names]
+        self._setpoints = [session.publisher(f"{name}/setpoint", TRAJECTORY) for name in names]
+        self._diagnostics = session.publisher("diagnostics", DIAGNOSTICS)
         self._planner = ThreadPoolExecutor(1, thread_name_prefix="serve")
         self._begun: Future[None] | None = None
         self._setpoint: ControlSetpoint | None = None
@@ -239,19 +245,18 @@ class FleetServer:
         self._pace = max(before - self._braking, 0.0)
         for number, robot in enumerate(self._robots):
             own, turn_rate = robot.command.linear, robot.command.angular.z
-            velocity = turned(np.array([own.x, own.y, own.z]), robot.heading)[: self._problem.dimension]
+            velocity = turned(place_of(own), robot.heading)[: self._problem.dimension]
             stand = last.position[number] if robot.stand is None else robot.stand
             robot.stand = stand + self._pace * dt * velocity
             point = (robot.stand, self._pace * velocity, (self._pace - before) / dt * velocity, robot.heading)
             self._setpoints[number].publish(full_state(robot.name, *point))
-            linear = messages.Vector3(*(self._pace * part for part in (own.x, own.y, own.z)))
-            self._commands[number].publish(messages.Twist(linear, messages.Vector3(z=self._pace * turn_rate)))
+            self._commands[number].publish(ros.twist(self._pace * place_of(own), self._pace * turn_rate))
 
     def _stand(self) -> None:
         """Have everybody stand where it was when that began."""
         still, d = np.zeros(self._problem.dimension), self._problem.dimension
         for robot, command, setpoint in zip(self._robots, self._commands, self._setpoints):
-            command.publish(messages.Twist())
+            command.publish(ros.twist(np.zeros(3)))
             if robot.stand is None and np.isfinite(robot.state).all():
                 robot.stand = robot.state[:d].astype(np.float64)
             if robot.stand is not None:

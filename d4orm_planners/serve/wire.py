@@ -21,9 +21,14 @@ from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, zenoh_config
+from d4orm_planners.tracking import ros_messages as ros
 
 _zenoh: Any = LazyModule("zenoh", "d4orm serve", "zenoh")
-messages: Any = LazyModule("d4orm_planners.serve.messages", "d4orm serve", "ros")
+_rosbags: Any = LazyModule("rosbags.typesys", "d4orm serve", "ros")
+
+BOOL, POSE, ODOMETRY = "std_msgs/msg/Bool", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+TWIST, TRAJECTORY = "geometry_msgs/msg/Twist", "trajectory_msgs/msg/MultiDOFJointTrajectory"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 DEPTH = 64
 """Messages of a topic that wait to be read; older ones make room."""
@@ -48,12 +53,12 @@ class RosSession:
         node: Name of the node.
 
     Raises:
-        ImportError: If zenoh or pycdr2 is not installed.
+        ImportError: If zenoh or rosbags is not installed.
         ValueError: If zenoh refuses the settings.
     """
 
     def __init__(self, settings: ZenohSettings, domain: int, node: str) -> None:
-        load(messages)
+        load(_rosbags)
         zenoh = load(_zenoh)
         self._domain, self._node, self._tokens = domain, node, 0
         try:
@@ -73,8 +78,8 @@ class RosSession:
         """Leave the network."""
         self._session.close()
 
-    def publisher(self, topic: str, kind: type[Any]) -> Publisher:
-        """A publisher of messages of a kind."""
+    def publisher(self, topic: str, kind: str) -> Publisher:
+        """A publisher of messages of a type, such as :data:`TWIST`."""
         zenoh = load(_zenoh)
         key = _key(self._domain, topic, kind)
         self._declare("MP", topic, kind)
@@ -82,19 +87,19 @@ class RosSession:
         drop = zenoh.CongestionControl.DROP
         return Publisher(self._session.declare_publisher(key, congestion_control=drop, express=True))
 
-    def subscriber(self, topic: str, kind: type[Any]) -> Subscriber:
-        """A subscriber to messages of a kind; ``*`` in the topic is any one part of a name."""
+    def subscriber(self, topic: str, kind: str) -> Subscriber:
+        """A subscriber to messages of a type; ``*`` in the topic is any one part of a name."""
         zenoh = load(_zenoh)
         self._declare("MS", topic.replace("*", "robots"), kind)
         # Whatever the hash: ROS 2 Humble has none.
         key = _key(self._domain, topic, kind).rpartition("/")[0] + "/*"
         return Subscriber(self._session.declare_subscriber(key, zenoh.handlers.RingChannel(DEPTH)), kind)
 
-    def _declare(self, entity: str, topic: str = "", kind: type[Any] | None = None) -> None:
+    def _declare(self, entity: str, topic: str = "", kind: str = "") -> None:
         parts = ["@ros2_lv", str(self._domain), str(self._session.zid()), "0", str(self._tokens), entity]
         parts += ["%", "%", self._node]
-        if kind is not None:
-            parts += [f"%{topic.replace('/', '%')}", messages.type_name(kind), _hash(kind), RELIABLE]
+        if kind:
+            parts += [f"%{topic.replace('/', '%')}", *_type(kind), RELIABLE]
         self._tokens += 1
         self._open.append(self._session.liveliness().declare_token("/".join(parts)))
 
@@ -109,7 +114,8 @@ class Publisher:
         """Send a message."""
         self._number += 1
         attachment = _ATTACHMENT.pack(self._number, time.time_ns(), len(self._identity), self._identity)
-        self._publisher.put(message.serialize(), attachment=attachment)
+        content = ros.message_types().serialize_cdr(message, message.__msgtype__)
+        self._publisher.put(bytes(content), attachment=attachment)
 
 
 class Subscriber:
@@ -119,7 +125,7 @@ class Subscriber:
         refused: Messages that could not be read.
     """
 
-    def __init__(self, subscriber: Any, kind: type[Any]) -> None:
+    def __init__(self, subscriber: Any, kind: str) -> None:
         self._subscriber, self._kind, self.refused = subscriber, kind, 0
 
     def take(self) -> list[Received]:
@@ -127,7 +133,7 @@ class Subscriber:
         received = []
         while (sample := self._subscriber.try_recv()) is not None:
             try:
-                message = self._kind.deserialize(sample.payload.to_bytes())
+                message = ros.message_types().deserialize_cdr(sample.payload.to_bytes(), self._kind)
             except Exception:  # whatever bytes a stranger sends
                 self.refused += 1
                 continue
@@ -136,15 +142,14 @@ class Subscriber:
         return received
 
 
-def _key(domain: int, topic: str, kind: type[Any]) -> str:
-    return f"{domain}/{topic}/{messages.type_name(kind)}/{_hash(kind)}"
+def _key(domain: int, topic: str, kind: str) -> str:
+    return "/".join([str(domain), topic, *_type(kind)])
 
 
-def _hash(kind: type[Any]) -> str:
-    return f"RIHS01_{messages.HASHES[kind]}"
-
-
-FRAME = "map"
+def _type(kind: str) -> tuple[str, str]:
+    """Name and hash of a type, as they are in keys: ``geometry_msgs::msg::dds_::Twist_``, ``RIHS01_9c45...``."""
+    package, _, name = kind.split("/")
+    return f"{package}::msg::dds_::{name}_", ros.message_types().hash_rihs01(kind)
 
 
 def heading_of(orientation: Any) -> float:
@@ -202,35 +207,17 @@ def twist(problem: Problem, robot: int, state: FloatArray, control: FloatArray, 
     if model.heading_index is not None:
         turn_rate = (float(after[model.heading_index]) - float(state[model.heading_index])) / problem.dt
         heading = float(after[model.heading_index])
-    message = messages.Twist()
-    message.linear.x, message.linear.y, message.linear.z = map(float, turned(velocity, -heading))
-    message.angular.z = turn_rate
-    return message
+    return ros.twist(turned(velocity, -heading), turn_rate)
 
 
 def full_state(name: str, position: Floats, velocity: Floats, acceleration: Floats, heading: float) -> Any:
     """A ``trajectory_msgs/MultiDOFJointTrajectory`` of one point: where a robot is to be, ``(d,)`` each."""
-    vectors = [messages.Vector3(*map(float, [*part, 0.0][:3])) for part in (position, velocity, acceleration)]
-    point = messages.MultiDOFJointTrajectoryPoint(
-        transforms=[messages.Transform(vectors[0], quaternion(heading))],
-        velocities=[messages.Twist(linear=vectors[1])],
-        accelerations=[messages.Twist(linear=vectors[2])],
-    )
-    return messages.MultiDOFJointTrajectory(header(), [name], [point])
-
-
-def quaternion(heading: float) -> Any:
-    """The ``geometry_msgs/Quaternion`` of a heading."""
-    return messages.Quaternion(0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
-
-
-def header() -> Any:
-    """A ``std_msgs/Header`` of now."""
-    seconds, nanoseconds = divmod(time.time_ns(), 10**9)
-    return messages.RosHeader(messages.Time(seconds, nanoseconds), FRAME)
+    point = ros.trajectory_point(position, velocity, acceleration, heading)
+    return ros.trajectory(name, [point], time.time_ns())
 
 
 def diagnostics(node: str, level: int, state: str, values: dict[str, str]) -> Any:
     """A ``diagnostic_msgs/DiagnosticArray`` with one state."""
-    pairs = [messages.KeyValue(key, value) for key, value in values.items()]
-    return messages.DiagnosticArray(header(), [messages.DiagnosticStatus(level, node, state, node, pairs)])
+    pairs = [ros.make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+    status = ros.make("diagnostic_msgs/msg/DiagnosticStatus", level, node, state, node, pairs)
+    return ros.make(DIAGNOSTICS, ros.header(time.time_ns()), [status])

@@ -20,10 +20,10 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
 from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.elementary import OPS, cosine, sine
-from d4orm_env.engine.tile_layout import SQUARED_NORM, Row
+from d4orm_env.engine.stepping import SQUARED_NORM, Row
 
 if TYPE_CHECKING:
-    from d4orm_planners.tracking.routes import Routes
+    from d4orm_planners.tracking.path_drives import Routes
     from d4orm_planners.tracking.timed_path import Timed
 
 Length: TypeAlias = Callable[[Row], np.float32]

@@ -14,11 +14,9 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, inlined, to_fixed_tuple
-from d4orm_env.engine.stepping import models_key
-from d4orm_env.engine.tile_layout import Row
-from d4orm_planners.tracking.path_drives import BRAKING, RESERVE, beyond_goal, paces_along
+from d4orm_env.engine.stepping import Row, models_key
+from d4orm_planners.tracking.path_drives import BRAKING, RESERVE, Corners, Route, beyond_goal, paces_along
 from d4orm_planners.tracking.pursuit import lookaheads, point_ahead, point_reached, square_to, steering
-from d4orm_planners.tracking.routes import Corners, Route
 from d4orm_planners.tracking.tracker import tracker
 
 HURRYING = 0.85

@@ -22,8 +22,7 @@ from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import WITHOUT_ARRAYS, ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
-from d4orm_env.engine.stepping import Docking, docking_of, make_stepper, models_key
-from d4orm_env.engine.tile_layout import SQUARED_GAP, Row
+from d4orm_env.engine.stepping import SQUARED_GAP, Docking, Row, docking_of, make_stepper, models_key
 
 CREEPING = np.float32(2.0**-20)
 """Share of its speed limit with which a robot at its goal heads for its goal heading: it turns in place."""

@@ -15,10 +15,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table, solved_columns, study_trials, trials_parser
+from examples.outputs import is_solved, save_table, solved_columns, study_trials, trials_parser
 
 from d4orm_env import Problem, make_problem
-from d4orm_planners.evaluation.comparison import is_solved
 from d4orm_planners.evaluation.study import Study
 
 PAPER: Mapping[str, object] = {"preset": "paper"}

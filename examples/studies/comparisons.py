@@ -15,12 +15,20 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import first_solutions, save_table, solved_columns, study_trials, trials_parser
+from examples.outputs import (
+    first_solutions,
+    is_solved,
+    penalised_steps,
+    save_table,
+    solved_columns,
+    study_trials,
+    trials_parser,
+)
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 from examples.studies.tune_rivals import TEAMS as TUNED_ON
 
 from d4orm_planners import make_planner
-from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps
+from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.sampling.settings import TUNED

@@ -19,9 +19,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.outputs import (
+    is_solved,
+    penalised_steps,
+    plt,
+    save_figure,
+    save_table,
+    solved_columns,
+    steps_to_solution,
+    study_trials,
+    trials_parser,
+)
 
-from d4orm_planners.evaluation.comparison import is_solved, paired, penalised_steps, steps_to_solution, survival
+from d4orm_planners.evaluation.comparison import paired, survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 

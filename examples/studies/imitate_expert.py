@@ -23,7 +23,7 @@ from examples.outputs import require, save_table, study_parser, study_rows, succ
 
 require("rl", "stable_baselines3", "tensorboard")
 
-from d4orm_planners.rl.curve import Evaluation
+from d4orm_planners.rl.checkpoints import Evaluation
 from d4orm_planners.rl.imitation import ImitationSettings, imitate
 from d4orm_planners.rl.training import TrainingSettings, train
 

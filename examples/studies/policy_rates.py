@@ -22,7 +22,7 @@ from examples.studies import AS_IN_THE_PAPER
 
 require("rl", "stable_baselines3")
 from d4orm_planners.evaluation.summary import wilson_interval
-from d4orm_planners.rl.curve import run_worlds
+from d4orm_planners.rl.checkpoints import run_worlds
 from d4orm_planners.rl.learned import SHIPPED
 from d4orm_planners.rl.network import SUFFIX, load_network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv

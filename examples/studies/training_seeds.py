@@ -22,7 +22,7 @@ require("rl", "stable_baselines3", "tensorboard")
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.evaluation.summary import mean_interval
-from d4orm_planners.rl.curve import Evaluation
+from d4orm_planners.rl.checkpoints import Evaluation
 from d4orm_planners.rl.training import TrainingSettings, train
 
 CROWDS = TrainingSettings(

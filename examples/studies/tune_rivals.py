@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import count, save_table, study_parser
+from examples.outputs import count, is_solved, penalised_steps, save_table, study_parser
 
 from d4orm_planners import make_planner
-from d4orm_planners.evaluation.comparison import is_solved, penalised_steps
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study

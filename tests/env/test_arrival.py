@@ -11,9 +11,9 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 from d4orm_env import load_problem, make_problem, navigation_v0, rollout, save_problem, verify
-from d4orm_env.core.metrics import arrival_steps, arrival_times, trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.core.trajectory import arrival_steps, arrival_times, trajectory_metrics
 from d4orm_planners import make_planner, make_policy, run_episode
 from d4orm_planners.tracking.steering import straight_drives
 

@@ -19,7 +19,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.utils import aec_to_parallel
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.metrics import trajectory_metrics
+from d4orm_env.core.trajectory import trajectory_metrics
 from d4orm_env.core.world import World
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.envs.joint_env import JointNavigationEnv

@@ -9,11 +9,10 @@ import pytest
 from engine_support import ENGINE_NAMES, open_problem, stand
 
 from d4orm_env import make_problem, rollout
-from d4orm_env.core.metrics import arrival_times, mean_squared_jerk, trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.team import Team
-from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.core.trajectory import Trajectory, arrival_times, mean_squared_jerk, trajectory_metrics
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.transition import step_reward
 from d4orm_env.engine.choice import get_engine

@@ -10,7 +10,7 @@ import pytest
 from shortest_support import visible_lengths
 
 from d4orm_env import Problem, Team, World, make_problem, rollout
-from d4orm_env.core.metrics import mean_stretch, stretch
+from d4orm_env.core.trajectory import mean_stretch, stretch
 from d4orm_env.paths.shortest_paths import MAX_NODES, shortest_paths
 from d4orm_planners import make_planner
 

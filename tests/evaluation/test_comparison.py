@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples.outputs import holm, penalised_steps, steps_to_solution
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d4orm_planners.evaluation.comparison import holm, paired, penalised_steps, steps_to_solution, survival
+from d4orm_planners.evaluation.comparison import paired, survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import wilson_interval
 

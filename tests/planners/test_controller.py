@@ -373,8 +373,8 @@ def test_setpoints_have_the_shapes_that_are_promised() -> None:
 
 
 def test_a_policy_that_is_named_answers_in_time() -> None:
-    for given, deadline in (({}, 0.09), ({"deadline": 0.05}, 0.05)):
-        with Controller("d4orm-c2f", timeout=0.1, **given) as controller:
+    for own, deadline in (({}, 0.09), ({"deadline": 0.05}, 0.05)):
+        with Controller("d4orm-c2f", timeout=0.1, **own) as controller:
             assert controller.policy.config.deadline == pytest.approx(deadline)
     with Controller("orca", timeout=0.1) as controller:
         assert controller.timeout == 0.1

@@ -19,14 +19,13 @@ from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.mapf.lacam import TeamMoves, find_moves
 from d4orm_planners.mapf.lns import search_neighbourhoods
 from d4orm_planners.mapf.occupancy import Occupancy
-from d4orm_planners.mapf.planner import needs_detour
+from d4orm_planners.mapf.planner import RoadmapPaths, needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
-from d4orm_planners.mapf.roadmap_lns import RoadmapPaths
 from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
+from d4orm_planners.tracking.path_drives import Corners
 from d4orm_planners.tracking.pursuit import gear_towards
-from d4orm_planners.tracking.routes import Corners
 from d4orm_planners.tracking.timed_path import drive_by_clock
 
 

@@ -20,9 +20,9 @@ from planner_support import (
     walled_in_problem,
 )
 
-from d4orm_env.core.metrics import trajectory_metrics
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
+from d4orm_env.core.trajectory import trajectory_metrics
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import IterationRecord, Plan, list_planners, make_planner

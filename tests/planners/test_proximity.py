@@ -10,7 +10,8 @@ from d4orm_env import World, make_problem
 from d4orm_env.engine.compiling import aligned_zeros
 from d4orm_env.engine.simd import BLOCK, TILE
 from d4orm_planners.engine import proximity
-from d4orm_planners.engine.proximity import bound_boxes, make_bodies, make_scratch
+from d4orm_planners.engine.cpu_sampling import bound_boxes, make_bodies
+from d4orm_planners.engine.proximity import make_scratch
 from d4orm_planners.engine.sampling_types import MovingObstacles
 
 PROBLEMS = {2: make_problem("circle", num_robots=2), 3: make_problem("sphere", num_robots=2)}

@@ -18,7 +18,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beams
-from d4orm_planners.mapf.beam_search import BeamRules, OtherAgents
+from d4orm_planners.mapf.beam import BeamRules, OtherAgents
 from d4orm_planners.mapf.beams import find_paths
 from d4orm_planners.mapf.motion_lns import improve_paths
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives

@@ -21,24 +21,34 @@ from d4orm_planners import Controller
 from d4orm_planners.cli.app import main
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 
-pytest.importorskip("pycdr2", reason="pycdr2 is not installed: pip install 'd4orm-env[ros]'")
 zenoh = pytest.importorskip("zenoh")
-typesys = pytest.importorskip("rosbags.typesys")
+typesys = pytest.importorskip("rosbags.typesys", reason="rosbags is not installed: pip install 'd4orm-env[ros]'")
 
-from d4orm_planners.serve import messages  # noqa: E402
 from d4orm_planners.serve.fleet_server import FleetRobot, FleetServer  # noqa: E402
 from d4orm_planners.serve.wire import (  # noqa: E402
+    BOOL,
+    ODOMETRY,
+    POSE,
+    TRAJECTORY,
+    TWIST,
     RosSession,
     state_from,
     twist,
 )
+from d4orm_planners.tracking import ros_messages as ros  # noqa: E402
 
 STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 DT, DEADLINE = 0.05, 0.3
 
 
-def ros_name(kind: Any) -> str:
-    return str(messages.type_name(kind)).replace("::dds_::", "/").replace("::", "/").rstrip("_")
+def pose_stamped(*place: float) -> Any:
+    return ros.make(POSE, ros.header(0), ros.pose(np.array(place or (0.0, 0.0)), 0.0))
+
+
+def odometry_of(place: np.ndarray, told: Any = None) -> Any:
+    told, zeros = ros.twist(np.zeros(3)) if told is None else told, np.zeros(36)
+    pose = ros.make("geometry_msgs/msg/PoseWithCovariance", ros.pose(place, 0.0), zeros)
+    return ros.make(ODOMETRY, ros.header(0), "", pose, ros.make("geometry_msgs/msg/TwistWithCovariance", told, zeros))
 
 
 def key(topic: str, ros_type: str) -> str:
@@ -86,9 +96,7 @@ class Fleet:
         self.say("e_stop", "std_msgs/msg/Bool", STORE.types["std_msgs/msg/Bool"](wanted))
 
     def goal(self, robot: int, place: list[float]) -> None:
-        message = STORE.deserialize_cdr(messages.PoseStamped().serialize(), "geometry_msgs/msg/PoseStamped")
-        message.pose.position.x, message.pose.position.y = place
-        self.say(f"robot_{robot}/goal", "geometry_msgs/msg/PoseStamped", message)
+        self.say(f"robot_{robot}/goal", "geometry_msgs/msg/PoseStamped", pose_stamped(*place))
 
     def _command(self, sample: Any) -> None:
         number, sequence = int(str(sample.key_expr).split("/")[1][-1]), sample.attachment.to_bytes()
@@ -109,8 +117,7 @@ class Fleet:
         self.diagnosis.append(array.status[0].message)
 
     def _live(self) -> None:
-        odometry = STORE.deserialize_cdr(messages.Odometry().serialize(), "nav_msgs/msg/Odometry")
-        stamped = STORE.deserialize_cdr(messages.PoseStamped().serialize(), "geometry_msgs/msg/PoseStamped")
+        odometry, stamped = odometry_of(np.zeros(2)), pose_stamped()
         while not self._over.wait(DT / 5):
             self.velocity[time.monotonic() - np.array(self.heard) > self.watchdog] = 0
             self.position += DT / 5 * self.velocity
@@ -238,9 +245,7 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
         def live(until_told: Callable[[], bool]) -> None:
             while not until_told():
                 for name, place, told in zip(names, position, commands, strict=True):
-                    odometry = messages.Odometry()
-                    odometry.pose.pose.position = messages.Point(*place.tolist(), 0.0)
-                    odometry.twist.twist = told[-1] if told else messages.Twist()
+                    odometry = odometry_of(place, told[-1] if told else None)
                     session.inbox["*/odom"].append((f"{name}/odom", odometry))
                 server.tick(DT * len(states))
                 states.append(server.state)
@@ -251,9 +256,7 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
                     assert time.monotonic() < end
 
         live(lambda: bool(commands[1]) and commands[1][-1].linear.x > 0.4)
-        goal = messages.PoseStamped()
-        goal.pose.position = messages.Point(0.3, 0.2, 0.0)
-        session.inbox["*/goal"].append(("robot_0/goal", goal))
+        session.inbox["*/goal"].append(("robot_0/goal", pose_stamped(0.3, 0.2)))
         begun = len(states)
         live(lambda: states[-1] == "planning" and len(states) > begun)
     speeds = np.array([command.linear.x for command in commands[1]])
@@ -267,7 +270,7 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
 
 
 def test_velocities_are_taken_from_poses() -> None:
-    robot, stamped = FleetRobot("a", np.zeros(4, np.float32)), messages.PoseStamped()
+    robot, stamped = FleetRobot("a", np.zeros(4, np.float32)), pose_stamped()
     for now, x, velocity in ((0.0, 1.0, 0.0), (0.01, 9.0, 0.0), (0.05, 1.1, 2.0), (0.06, 1.1, 2.0), (0.01, 3.0, 0.0)):
         stamped.header.stamp.nanosec, stamped.pose.position.x = round(1e9 * now), x
         robot.take_pose(stamped, 0.04)
@@ -275,11 +278,18 @@ def test_velocities_are_taken_from_poses() -> None:
 
 
 def test_types_are_those_of_ros() -> None:
-    for kind, expected in messages.HASHES.items():
-        assert f"RIHS01_{expected}" == STORE.hash_rihs01(ros_name(kind))
-        read = STORE.deserialize_cdr(kind().serialize(), ros_name(kind))
-        assert bytes(STORE.serialize_cdr(read, ros_name(kind))) == kind().serialize()
-        assert kind.deserialize(kind().serialize()) == kind()
+    types = ros.message_types()
+    for kind, expected in {
+        "std_msgs/msg/Bool": "feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9",
+        "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
+        TRAJECTORY: "3a18fd095292a65cfde8833c72985a30af981f3ec44494655c6267262b443a4a",
+        "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+        "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+        "geometry_msgs/msg/Twist": "9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
+    }.items():
+        assert f"RIHS01_{expected}" == types.hash_rihs01(kind) == STORE.hash_rihs01(kind)
+    content = bytes(types.serialize_cdr(ros.twist(np.array([1.0, 2.0, 3.0]), 0.5), TWIST))
+    assert content == b"\x00\x01\x00\x00" + struct.pack("<6d", 1, 2, 3, 0, 0, 0.5)
 
 
 @pytest.mark.parametrize("model", ["holonomic2d", "velocity2d", "differential_drive", "unicycle", "holonomic3d"])
@@ -287,8 +297,7 @@ def test_states_and_velocities_are_in_the_robots_own_frame(model: str) -> None:
     team = Team((model,))
     d = 3 if model == "holonomic3d" else 2
     alone = Problem(team, [[0] * team.state_size], [[3] * d])
-    odometry = messages.Odometry()
-    odometry.pose.pose.position = messages.Point(1.0, 2.0, 3.0)
+    odometry = odometry_of(np.array([1.0, 2.0, 3.0]))
     odometry.pose.pose.orientation.z = odometry.pose.pose.orientation.w = math.sqrt(0.5)
     state = state_from(alone, 0, odometry.pose.pose, np.array([0.4, 0, 0]))
     expected = {
@@ -303,7 +312,7 @@ def test_states_and_velocities_are_in_the_robots_own_frame(model: str) -> None:
 
 def test_strangers_bytes_are_counted(endpoint: str) -> None:
     with RosSession(ZenohSettings(listen=(endpoint,)), 0, "d4orm") as session:
-        subscriber = session.subscriber("e_stop", messages.Bool)
+        subscriber = session.subscriber("e_stop", BOOL)
         fleet = Fleet(endpoint, np.zeros((2, 2)))
         try:
             until(

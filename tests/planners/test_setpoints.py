@@ -18,8 +18,8 @@ from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import get_sampling_engine
-from d4orm_planners.setpoints.export import FORMATS, MOST_PIECES
-from d4orm_planners.setpoints.smoothing import fit_spline
+from d4orm_planners.tracking.export import FORMATS, MOST_PIECES
+from d4orm_planners.tracking.smoothing import fit_spline
 
 CASES: dict[str, dict[str, Any]] = {
     "plane": {"scenario": "circle", "num_robots": 5},
@@ -345,7 +345,7 @@ def test_how_low_one_flies_over_another_is_told(tmp_path: Path) -> None:
 def test_too_long_a_motion_for_the_memory_on_board_is_refused(
     plans: dict[str, Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("d4orm_planners.setpoints.export.MOST_PIECES", 2)
+    monkeypatch.setattr("d4orm_planners.tracking.export.MOST_PIECES", 2)
     with pytest.raises(ValueError, match=r"2 polynomials, which is all that 4096 bytes on board hold, are"):
         plans["walls"].export("crazyswarm2", tmp_path, height=1.0)
 

@@ -166,7 +166,7 @@ def test_clutter_keeps_its_obstacles_and_leaves_room_at_starts_and_goals() -> No
 
 pytest.importorskip("stable_baselines3")
 from d4orm_planners.rl.algorithms import ALGORITHMS  # noqa: E402
-from d4orm_planners.rl.curve import evaluate_network  # noqa: E402
+from d4orm_planners.rl.checkpoints import evaluate_network  # noqa: E402
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv  # noqa: E402
 from d4orm_planners.rl.task_mixture import MIXTURES, MixedVecEnv, TrainTask, parse_mixture  # noqa: E402
 from d4orm_planners.rl.train_config import Stage  # noqa: E402

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from examples.outputs import study_trials
+from examples.outputs import steps_to_solution, study_trials
 from examples.studies.paper import main
 from examples.studies.paper.figure import Figure, Group, Section, grouped
 from examples.studies.paper.figure_report import markdown, write_figure
@@ -21,7 +21,6 @@ from examples.studies.paper.plots import PLOTS, best_reward
 
 from d4orm_planners import list_planners
 from d4orm_planners.evaluation import evaluate
-from d4orm_planners.evaluation.comparison import steps_to_solution
 from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 

@@ -16,8 +16,7 @@ from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.stepping import models_key
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Row, models_key
 from d4orm_env.paths.spaces import Space, clearance_at
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, segment_length, trace
 from d4orm_planners.tracking.tracker import tracker

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from examples.outputs import holm, steps_to_solution
 from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from examples.studies.paper.plots import draw
 
-from d4orm_planners.evaluation.comparison import Paired, holm, paired, steps_to_solution
+from d4orm_planners.evaluation.comparison import Paired, paired
 from d4orm_planners.evaluation.leaderboard import origin
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import SuccessWithin, success_by

@@ -10,7 +10,7 @@ import numpy as np
 from d4orm_env.core.arrays import Floats, positive_number
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.verify import VerificationReport
-from d4orm_planners.setpoints.smoothing import SmoothMotion
+from d4orm_planners.tracking.smoothing import SmoothMotion
 
 if TYPE_CHECKING:
     import pandas as pd

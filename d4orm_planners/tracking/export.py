@@ -24,9 +24,9 @@ from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.verify import VerificationReport
 from d4orm_env.verify.discs import verify_curves
-from d4orm_planners.setpoints.rosbag import write_bag
-from d4orm_planners.setpoints.setpoints import Setpoints, sample_motion
-from d4orm_planners.setpoints.smoothing import SmoothMotion
+from d4orm_planners.tracking.ros_messages import write_bag
+from d4orm_planners.tracking.setpoints import Setpoints, sample_motion
+from d4orm_planners.tracking.smoothing import SmoothMotion
 
 MEMORY, PIECE_BYTES = 4096, 132
 MOST_PIECES = MEMORY // PIECE_BYTES

@@ -22,8 +22,8 @@ from d4orm_env.geometry.world_index import build_index
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
 from d4orm_planners.base.planner_registry import make_planner, make_policy
-from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn, measure
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
+from d4orm_planners.evaluation.bench_report import Measurement, Spread, in_turn, measure
 
 _FIRST_PLAN = """
 import json, sys, time
@@ -158,9 +158,9 @@ def _driven(problem: Problem, controller: Controller, seed: int) -> list[tuple[f
     return steps
 
 
-def boxed_problem(num_boxes: int, where: Where, horizon: int = 100) -> Problem:
+def boxed_problem(num_boxes: int, where: Where) -> Problem:
     """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from everybody."""
-    problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=horizon)
+    problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=100)
     random = np.random.default_rng(0)
     if where == "near":
         distance, angle = 2.0 * np.sqrt(random.uniform(0, 1, num_boxes)), random.uniform(0, 2 * np.pi, num_boxes)

@@ -18,7 +18,10 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.benchmark.env_steps import (
+from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
+from d4orm_planners.evaluation.bench_report import Measurement, Spread, in_turn, measure
+from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
+from d4orm_planners.evaluation.env_steps import (
     DISTURBANCES,
     RAY_BOXES,
     RAYS,
@@ -29,7 +32,7 @@ from d4orm_planners.benchmark.env_steps import (
     measure_rooms,
     measure_worlds,
 )
-from d4orm_planners.benchmark.probes import (
+from d4orm_planners.evaluation.probes import (
     BOXES,
     Where,
     measure_big_loops,
@@ -41,9 +44,6 @@ from d4orm_planners.benchmark.probes import (
     measure_robots,
     measure_startup,
 )
-from d4orm_planners.benchmark.settings import BenchmarkSettings
-from d4orm_planners.benchmark.timing import Measurement, Spread, in_turn, measure
-from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
 from d4orm_planners.sampling.d4orm import D4orm
 
 PRESETS = (None, "paper")

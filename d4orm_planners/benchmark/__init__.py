@@ -1,1 +1,0 @@
-"""Benchmark of the engines, the environments and the planners on this machine."""
