@@ -15,8 +15,7 @@ from d4orm_env.dynamics.robot_model import TimeStep
 from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import WITHOUT_ARRAYS, inlined, to_fixed_tuple
-from d4orm_env.engine.stepping import models_key
-from d4orm_env.engine.tile_layout import Row
+from d4orm_env.engine.stepping import Row, models_key
 from d4orm_planners.tracking.pursuit import vectors
 from d4orm_planners.tracking.steering import by_model
 from d4orm_planners.tracking.tracker import tracker
