@@ -1,24 +1,9 @@
-"""Double integrators in space: ``x = [px, py, pz, vx, vy, vz]``, ``u = [ax, ay, az]`` (paper, section IV-B)."""
+"""A double integrator in space: ``x = [px, py, pz, vx, vy, vz]``, ``u = [ax, ay, az]`` (paper, section IV-B)."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from d4orm_env.dynamics.formulas import control_scale, norm_scale, share, stopping_speed
-from d4orm_env.dynamics.robot_model import (
-    ACCELERATION,
-    OWN_LIMITS,
-    SPEED,
-    Limit,
-    Model,
-    ModelFunctions,
-    Number,
-    Ops,
-    TimeStep,
-    Vector,
-)
-
-DRAG = OWN_LIMITS
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, Model, ModelFunctions, Number, Ops, TimeStep, Vector
 
 
 def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
@@ -77,26 +62,3 @@ HOLONOMIC3D = Model(
         _derivative, _limit_control, _limit_state, _velocity, _rest, _approach, _track, _integrate
     ),
 )
-
-
-def _braked_derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
-    drag = limits[DRAG]
-    return (x[3], x[4], x[5], u[0] - drag * x[3], u[1] - drag * x[4], u[2] - drag * x[5])
-
-
-def _braked_track(x: Vector, velocity: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
-    drag = limits[DRAG]
-    return (
-        (velocity[0] - x[3]) / h.full + drag * x[3],
-        (velocity[1] - x[4]) / h.full + drag * x[4],
-        (velocity[2] - x[5]) / h.full + drag * x[5],
-    )
-
-
-HOLONOMIC3D_DRAG = replace(
-    HOLONOMIC3D,
-    name="holonomic3d_drag",
-    functions=HOLONOMIC3D.functions._replace(derivative=_braked_derivative, track=_braked_track, integrate=None),
-    own_limits=(Limit("drag", 0.5),),
-)
-"""One that the air brakes: its acceleration is ``u - drag v``, with ``drag`` in 1/s."""

@@ -1,4 +1,4 @@
-"""Robot models by name: those that come with the package, in the files beside this one, and users'."""
+"""Robot models by name: those that come with the package, one file each beside this one, and users'."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
 from d4orm_env.dynamics.car_with_trailers import CARS_WITH_TRAILERS
 from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
-from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D, HOLONOMIC2D_JERK, VELOCITY2D
-from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D, HOLONOMIC3D_DRAG
+from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
+from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
+from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D
+from d4orm_env.dynamics.holonomic3d_drag import HOLONOMIC3D_DRAG
 from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
 from d4orm_env.dynamics.source_digest import pieces
 from d4orm_env.dynamics.transition import TimeStep
-from d4orm_env.dynamics.unicycle import UNICYCLE, UNICYCLE1
+from d4orm_env.dynamics.unicycle import UNICYCLE
+from d4orm_env.dynamics.unicycle1 import UNICYCLE1
 from d4orm_env.dynamics.unicycle2 import UNICYCLE2
+from d4orm_env.dynamics.velocity2d import VELOCITY2D
 
 _BUILT_IN = (
     HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR, UNICYCLE1, UNICYCLE2, HOLONOMIC2D_JERK,

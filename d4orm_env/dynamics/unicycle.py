@@ -1,32 +1,16 @@
-"""Unicycles of first order: ``x = [px, py, heading]``, ``u = [speed, turn rate]``, both taken at once."""
+"""A unicycle of first order: ``x = [px, py, heading]``, ``u = [speed, turn rate]``, both taken at once."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-
 from d4orm_env.dynamics.formulas import (
     at_once,
-    between,
     clip,
     commanded_drive,
     first_order_approach,
     turn_towards,
     without_limit,
 )
-from d4orm_env.dynamics.robot_model import (
-    OWN_LIMITS,
-    SPEED,
-    TURN_RATE,
-    Limit,
-    Model,
-    ModelFunctions,
-    Ops,
-    TimeStep,
-    Vector,
-)
-
-MAX_REVERSE_SPEED, MAX_RIGHT_TURN_RATE = range(OWN_LIMITS, OWN_LIMITS + 2)
+from d4orm_env.dynamics.robot_model import SPEED, TURN_RATE, Model, ModelFunctions, Ops, TimeStep, Vector
 
 
 def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
@@ -66,21 +50,3 @@ UNICYCLE = Model(
         _derivative, _limit_control, without_limit, commanded_drive, at_once, first_order_approach, _track, _integrate
     ),
 )
-
-
-def _limit_both_ways(u: Vector, limits: Vector, ops: Ops) -> Vector:
-    reverse = ops.minimum(limits[MAX_REVERSE_SPEED], limits[SPEED])
-    return (
-        between(u[0], -reverse, limits[SPEED], ops),
-        between(u[1], -limits[MAX_RIGHT_TURN_RATE], limits[TURN_RATE], ops),
-    )
-
-
-UNICYCLE1 = replace(
-    UNICYCLE,
-    name="unicycle1",
-    functions=UNICYCLE.functions._replace(limit_control=_limit_both_ways),
-    own_limits=(Limit("max_reverse_speed", 0.5), Limit("max_right_turn_rate", math.pi / 2)),
-    lower_limits=((SPEED, MAX_REVERSE_SPEED), (TURN_RATE, MAX_RIGHT_TURN_RATE)),
-)
-"""One that reverses, and turns right, at limits of its own."""

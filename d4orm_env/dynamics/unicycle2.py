@@ -21,9 +21,8 @@ from d4orm_env.dynamics.robot_model import (
     TimeStep,
     Vector,
 )
-from d4orm_env.dynamics.unicycle import MAX_REVERSE_SPEED, MAX_RIGHT_TURN_RATE
 
-MAX_TURN_ACCELERATION = OWN_LIMITS + 2
+MAX_REVERSE_SPEED, MAX_RIGHT_TURN_RATE, MAX_TURN_ACCELERATION = range(OWN_LIMITS, OWN_LIMITS + 3)
 
 
 def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
