@@ -5,6 +5,7 @@ By value each is hundreds of numbers, to be taken apart and put together at ever
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -28,8 +29,10 @@ class _Borrowed(types.Type):
 
     def __init__(self, struct: types.NamedTuple) -> None:
         self.struct = struct
-        # Short, because it becomes part of the names of all functions that take it.
-        super().__init__(name=f"Borrowed{struct.instance_class.__name__}")
+        # Short, because it becomes part of the names of all functions that take it. Two that differ must have names
+        # that do: kernels of several processes are loaded into one, and numba numbers functions by process.
+        digest = hashlib.sha256(struct.name.encode()).hexdigest()[:8]
+        super().__init__(name=f"Borrowed{struct.instance_class.__name__}{digest}")
 
     @property
     def key(self) -> types.NamedTuple:

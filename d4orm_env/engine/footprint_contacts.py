@@ -249,6 +249,14 @@ def _any_leaves_bounds(
 
 
 @compiled
+def _is_beyond(boxes: FloatArray, i: Whole, reach: np.float32, x: np.float32, y: np.float32) -> bool:
+    """Check whether a rounded box of the plane is farther from a place than this."""
+    gap_x, gap_y = max(boxes[i, 0] - x, x - boxes[i, 2], ZERO), max(boxes[i, 1] - y, y - boxes[i, 3], ZERO)
+    reach += boxes[i, 4]
+    return bool(gap_x * gap_x + gap_y * gap_y > reach * reach)
+
+
+@compiled
 def touches_static(
     f: FootprintArrays, arrays: ProblemArrays, k: Whole, place: tuple[np.float32, np.float32, np.float32],
     poses: FloatArray, stride: int, begin: Whole, extra: np.float32, buffer: FloatArray,
@@ -267,6 +275,8 @@ def touches_static(
                 return True
             continue
         if item < arrays.boxes.shape[0]:
+            if _is_beyond(arrays.boxes, item, arrays.radius[k] + extra, x, y):
+                continue
             place_box(arrays.boxes, item, x, y, buffer[TILE : 2 * TILE])
         else:
             place_triangle(arrays.triangles, item - arrays.boxes.shape[0], x, y, buffer[TILE : 2 * TILE])

@@ -6,7 +6,7 @@ Runge-Kutta in many sub-steps of a control step, with the same bits on every pro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,7 +52,7 @@ class Integrated:
     def __init__(
         self, model: Any, robots: NDArray[np.intp], start: Floats, controls: Floats, team: Team, dt: float
     ) -> None:
-        self.robots, self._model, self._dt = robots, model, dt
+        self.robots, self._model, self._dt, self._ops = robots, model, dt, _ops()
         self._limits = tuple(team.limits.astype(np.float64)[robots].T)
         self._units = np.ones((model.state_size, 1, len(robots)))
         self._units[: model.dimension] = (team.radius[robots] / SIZE).astype(np.float64)
@@ -64,13 +64,15 @@ class Integrated:
         self.sizes: Floats = self.limits + np.moveaxis(np.abs(asked - self._commands), 0, 2)
         states = self._states(start[robots, : model.state_size].T)
         self._begins = states[:, :-1]
+        self._moving: NDArray[np.bool_] = (self._slope(self._begins, self._commands) != 0).any(axis=0)
+        self._known: tuple[slice, int, list[Floats]] | None = None
         self.end_headings = self._headings(states[:, 1:])
         velocity = self._call(model.functions.velocity, states[:, 1:], self._commands)
         self.pace: Floats = norm(np.moveaxis(velocity, 0, 2))
         displacement = self.displacement(slice(None), SUB_STEPS)
         change = np.diff(displacement, n=2, axis=1) * (SUB_STEPS / dt) ** 2
         self.bend: Floats = BEND_MARGIN * norm(change).max(axis=1)
-        coarse = self._advanced(self._begins, self._commands, dt) - self._begins
+        coarse = self._advanced(self._begins, self._commands, dt, self._limits) - self._begins
         self.step_error: Floats = norm(np.moveaxis(coarse[: model.dimension], 0, 2) - displacement[:, -1])
 
     def _states(self, start: Floats) -> Floats:
@@ -92,10 +94,15 @@ class Integrated:
         return self._one_by_one(start, sub_steps)
 
     def _one_by_one(self, start: Floats, sub_steps: int) -> Floats:
-        states = [start]
+        states, before = [start], None
         for u in np.moveaxis(self._commands, 1, 0):
-            ends = self._integrated(states[-1], u, sub_steps)
-            states.append(self._call(self._model.functions.limit_state, ends))
+            # Commands under which nothing has changed will change nothing.
+            if before is None or not (np.array_equal(u, before) and np.array_equal(states[-1], states[-2])):
+                ends = self._integrated(states[-1], u, sub_steps)
+                states.append(self._call(self._model.functions.limit_state, ends))
+            else:
+                states.append(states[-1])
+            before = u
         return np.stack(states, axis=1)
 
     def _sub_steps(self, begins: Floats) -> int:
@@ -135,22 +142,24 @@ class Integrated:
 
     def _integrated(self, x: Floats, u: Floats, sub_steps: int) -> Floats:
         for _ in range(sub_steps):
-            x = self._advanced(x, u, self._dt / sub_steps)
+            x = self._advanced(x, u, self._dt / sub_steps, self._limits)
         return x
 
-    def _advanced(self, x: Floats, u: Floats, h: float) -> Floats:
-        k1 = self._slope(x, u)
-        k2 = self._slope(x + h / 2 * k1, u)
-        k3 = self._slope(x + h / 2 * k2, u)
-        k4 = self._slope(x + h * k3, u)
+    def _advanced(self, x: Floats, u: Floats, h: float, limits: tuple[Floats, ...]) -> Floats:
+        k1 = self._slope(x, u, limits)
+        k2 = self._slope(x + h / 2 * k1, u, limits)
+        k3 = self._slope(x + h / 2 * k2, u, limits)
+        k4 = self._slope(x + h * k3, u, limits)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
-    def _slope(self, x: Floats, u: Floats) -> Floats:
-        return self._call(self._model.functions.derivative, x, u)
+    def _slope(self, x: Floats, u: Floats, limits: tuple[Floats, ...] | None = None) -> Floats:
+        return self._call(self._model.functions.derivative, x, u, limits=limits)
 
-    def _call(self, function: Callable[..., Iterable[ArrayLike]], *arguments: Floats) -> Floats:
+    def _call(
+        self, function: Callable[..., Iterable[ArrayLike]], *arguments: Floats, limits: tuple[Floats, ...] | None = None
+    ) -> Floats:
         """A function of the model over arrays whose first axis is the component; it may return single numbers too."""
-        result = function(*map(tuple, arguments), self._limits, _ops())
+        result = function(*map(tuple, arguments), self._limits if limits is None else limits, self._ops)
         return np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])
 
     def displacement(self, steps: slice, sub_steps: int) -> Floats:
@@ -171,24 +180,33 @@ class Integrated:
             headings.append(headings[-1] - states[hitch])
         return np.stack(headings, axis=-1)
 
-    def _within(self, steps: slice, sub_steps: int) -> Iterator[Floats]:
-        """``(n, T, R)`` states at the ends of sub-steps, the beginning of each step first."""
-        x, u = self._begins[:, steps], self._commands[:, steps]
-        yield x
-        for _ in range(sub_steps):
-            x = self._advanced(x, u, self._dt / sub_steps)
-            yield x
+    def _within(self, steps: slice, sub_steps: int) -> list[Floats]:
+        """``(n, T, R)`` states at the ends of sub-steps, the beginning of each step first; those asked for last are
+        known. Who is at rest when a step begins is so until it ends.
+        """
+        if self._known is None or self._known[:2] != (steps, sub_steps):
+            x, moving = self._begins[:, steps], self._moving[steps]
+            own, u = x[:, moving], self._commands[:, steps][:, moving]
+            limits = tuple(np.broadcast_to(limit, moving.shape)[moving] for limit in self._limits)
+            states = [x]
+            for _ in range(sub_steps):
+                own, x = self._advanced(own, u, self._dt / sub_steps, limits), x.copy()
+                x[:, moving] = own
+                states.append(x)
+            self._known = (steps, sub_steps, states)
+        return self._known[2]
 
 
 def _ops() -> Any:
-    """The portable functions, which compute sine and cosine of the same array once: they take most of the time."""
+    """The portable functions, which compute sine and cosine of the same numbers once: they take most of the time."""
     known: list[tuple[Floats, tuple[Floats, Floats]]] = []
 
     def sin_cos(x: Floats) -> tuple[Floats, Floats]:
         for asked, answer in known:
-            if asked is x:
+            # Runge-Kutta's second and third stage mostly have the same heading.
+            if asked is x or np.array_equal(asked, x):
                 return answer
-        known.append((x, portable.sin_cos(x)))
+        known[:] = [*known[-1:], (x, portable.sin_cos(x))]
         return known[-1][1]
 
     return portable.NUMPY_OPS._replace(sin=lambda x: sin_cos(x)[0], cos=lambda x: sin_cos(x)[1])

@@ -37,33 +37,47 @@ class Costs(NamedTuple):
 
     Attributes:
         lattice: Cells.
-        steps: ``(cells,)``.
-        far: Steps from where that is not known, at least.
+        steps: ``(cells,)``, infinite where they are not known: there they are at least
+        far: this, ...
+        pace: ... less so many for each metre from the start, ...
+        start: ... which is at ``(x, y)``.
     """
 
     lattice: PoseLattice
     steps: FloatArray
     far: float
+    pace: float
+    start: tuple[float, float]
 
 
-def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal, team_size: int) -> Costs:
-    """Steps to a goal for a robot that starts at a pose ``(6,)``, in a team of so many."""
+def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal, team_size: int, bent: bool) -> Costs:
+    """Steps to a goal for a robot that starts at a pose ``(6,)``, in a team of so many; ``bent`` if its trailers may
+    end in a bend.
+    """
     layers = SECTORS if kind.model.heading_index is not None else 1
     modes, cells = primitives_of(kind)[2], np.clip(TEAM_CELLS / team_size, LEAST_CELLS, MOST_CELLS)
     size = np.prod(area.high - area.low) * len(modes) * layers
     cell = max(area.cell, float(np.sqrt(size / cells)))
     lattice = area.lattice(cell, 0.0 if np.isnan(goal.heading) else goal.heading, layers, len(modes))
     back, pace = primitives_of(replace(kind, cell=cell))[1], 1 / (kind.limits[SPEED] * kind.dt)
-    steps, far = _spread(body, back, lattice, goal, start, modes.index(kind.start), pace)
-    return Costs(lattice, steps, far)
+    goals = _goals(goal, lattice, len(modes) if bent else 1)
+    steps, far = _spread(body, back, lattice, goals, start, modes.index(kind.start), pace)
+    if far == np.inf:
+        # Cells are coarse: where none of them leads to the goal, a way may do so even so.
+        far, pace = float(steps[steps < np.inf].max(initial=0)), 0.0
+    return Costs(lattice, steps, far, pace, (float(start[0]), float(start[1])))
+
+
+def _goals(goal: Goal, lattice: PoseLattice, modes: int) -> Floats:
+    """``(., 4)`` poses and modes at which a robot is there."""
+    headings = [goal.heading] if not np.isnan(goal.heading) else (np.arange(lattice.sectors) * SECTOR).tolist()
+    return np.array([[goal.x, goal.y, heading, mode] for mode in range(modes) for heading in headings])
 
 
 def _spread(
-    body: RobotBody, back: Primitives, lattice: PoseLattice, goal: Goal, start: Floats, mode: int, pace: float
+    body: RobotBody, back: Primitives, lattice: PoseLattice, goals: Floats, start: Floats, mode: int, pace: float
 ) -> tuple[FloatArray, float]:
     cells = lattice.modes * lattice.sectors * lattice.size[0] * lattice.size[1]
-    headings = [goal.heading] if not np.isnan(goal.heading) else np.arange(lattice.sectors) * SECTOR
-    goals = np.array([[goal.x, goal.y, heading] for heading in headings])
     steps = np.full(cells, np.inf, np.float32)
     far = fill_costs(
         body, back, lattice, goals, start, pace, steps, np.empty((cells, 3)), Heap.of(2 * cells + 512), mode,

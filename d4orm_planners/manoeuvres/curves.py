@@ -1,7 +1,8 @@
 """The last stretch of a car with trailers: a curve, a straight and another curve, exactly to its goal.
 
 As L. E. Dubins' paths (1957), but a circle begins and ends with a swing of the trailers, worked out beforehand. Since a
-swing leads as far wherever it begins, the centres of both circles are known, and with them the straight between.
+swing leads as far wherever it begins, the centres of both circles are known, and with them the straight between. Where
+there is no room for trailers in line at the goal, the last swing is left out: they stay in a bend.
 """
 
 from __future__ import annotations
@@ -25,13 +26,17 @@ from d4orm_planners.manoeuvres.trailer_moves import circle, steering, swing, tig
 LEVELS = (1.0, 0.5, 0.25, 0.125)
 """Curvatures, in that of the tightest circle."""
 SIDES = (1, -1)
+CIRCLES = len(LEVELS) * len(SIDES)
+"""Circles in each direction."""
 TURN = 2 * np.pi
 
 
 class Curves(NamedTuple):
-    """Circles that trailers follow: ``W`` of them, forwards to the left and to the right by levels, then in reverse.
+    """Circles that trailers follow: forwards to the left and to the right by levels, then in reverse; and once more
+    without the swings out of them, if curves end in a bend. ``W`` in all.
 
     Attributes:
+        last: Number of the first one that may be a curve's last.
         begin: ``(2 W + 1,)`` where the steps of the swing into each begin, and of that out of it.
         poses: ``(S, 6)`` after each of these steps, from where the swing began.
         controls: ``(S, 2)``.
@@ -43,6 +48,7 @@ class Curves(NamedTuple):
         stride: ``(W,)`` distance in a step, in reverse negative [m].
     """
 
+    last: int
     begin: IntArray
     poses: Floats
     controls: FloatArray
@@ -59,6 +65,7 @@ Curve: TypeAlias = tuple[int, int, float, float, int, float]
 circle and the length of its arc."""
 NO_CURVE = (0, -1, 0.0, 0.0, -1, 0.0)
 NO_CURVES = Curves(
+    0,
     np.zeros(1, np.int64),
     np.zeros((0, POSE_SIZE)),
     np.zeros((0, 2), np.float32),
@@ -70,10 +77,10 @@ NO_CURVES = Curves(
 
 
 @cache
-def curves_of(kind: Kind) -> Curves:
-    """Circles of a car with trailers, and the swings between them and straight on."""
+def curves_of(kind: Kind, bent: bool) -> Curves:
+    """Circles of a car with trailers, and the swings between them and straight on; ``bent`` if curves end in a bend."""
     swings, rows, straight = [], [], (0.0,) * len(kind.model.trailers)
-    for way, level, side in product((1, -1), LEVELS, SIDES):
+    for ends, way, level, side in product((False, True) if bent else (False,), (1, -1), LEVELS, SIDES):
         curvature = side * level * tightest(kind)
         hitches = circle(kind, curvature)
         assert hitches is not None
@@ -82,7 +89,9 @@ def curves_of(kind: Kind) -> Curves:
         if into is None or out is None:
             return NO_CURVES
         first, last = drive(kind, straight, into)[0][1:], drive(kind, mode, out)[0][1:]
-        swings += [(into, first), (out, last)]
+        if ends:
+            out, last = out[:0], np.zeros((1, POSE_SIZE))
+        swings += [(into, first), (out, last[: len(out)])]
         (x, y, turn), (its_x, its_y, its_turn) = first[-1, :3].tolist(), last[-1, :3].tolist()
         sine, cosine = portable.sin_cos_of(turn)
         ahead = (x - sine / curvature, y + cosine / curvature)
@@ -93,7 +102,7 @@ def curves_of(kind: Kind) -> Curves:
     controls, poses = zip(*swings, strict=True)
     begin = np.cumsum([0, *map(len, controls)])
     columns = (np.array(column) for column in zip(*rows, strict=True))
-    return Curves(begin, np.concatenate(poses), np.concatenate(controls), *columns)
+    return Curves(2 * CIRCLES * bent, begin, np.concatenate(poses), np.concatenate(controls), *columns)
 
 
 @compiled
@@ -142,16 +151,15 @@ def _joined(curves: Curves, goal: Goal, x: float, y: float, heading: float, firs
 @compiled
 def curve_of(curves: Curves, goal: Goal, x: float, y: float, heading: float, way: float) -> Curve:
     """The quickest curve from a pose with trailers in line, forwards (``way`` is 1) or in reverse (-1)."""
-    half, best = curves.curvature.shape[0] // 2, NO_CURVE
-    begin = 0 if way > 0 else half
+    begin, best = 0 if way > 0 else CIRCLES, NO_CURVE
     along, across = _turned(goal.x - x, goal.y - y, -heading)
-    if half == 0 or np.isnan(goal.heading):
+    if curves.curvature.shape[0] == 0 or np.isnan(goal.heading):
         return best
     turn = abs(turned_by(goal.heading - heading))
-    if way * along >= 0 and abs(across) <= 0.5 * goal.radius and turn <= 0.5 * goal.tolerance:
+    if curves.last == 0 and way * along >= 0 and abs(across) <= 0.5 * goal.radius and turn <= 0.5 * goal.tolerance:
         return _count(curves, begin, along), -1, 0.0, along, begin, 0.0
-    for first in range(begin, begin + half):
-        level = first - first % 2
+    for first in range(begin, begin + CIRCLES):
+        level = curves.last + first - first % 2
         for second in range(level, level + 2):
             curve = _joined(curves, goal, x, y, heading, first, second)
             if curve[0] > 0 and (best[0] == 0 or curve[0] < best[0]):

@@ -19,8 +19,8 @@ from d4orm_planners.manoeuvres.kinds import SECTOR, SECTORS
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
 
 TURN = 2 * np.pi
-WIDER, LATER = 1.2, 20
-"""Poses count from which a robot takes at most so many times as long as from its start, and so many steps more."""
+LATER = 40
+"""Poses count by way of which a robot takes at most so many steps more to its goal than it must."""
 
 
 Pose: TypeAlias = tuple[float, float, float, float, float, float]
@@ -150,17 +150,24 @@ def direction(body: RobotBody, robot: Whole, heading: float) -> tuple[np.float32
 
 
 @compiled
-def moved(x: float, y: float, heading: float, step: Floats) -> tuple[float, float, float]:
-    """Position and heading after a step ``(6,)`` seen from a pose; the heading is not wound up."""
-    c, s = np.float64(cosine(np.float32(heading))), np.float64(sine(np.float32(heading)))
+def unit_vector(heading: float) -> tuple[float, float]:
+    """Cosine and sine."""
+    return np.float64(cosine(np.float32(heading))), np.float64(sine(np.float32(heading)))
+
+
+@compiled
+def moved_along(
+    x: float, y: float, heading: float, facing: tuple[float, float], step: Floats
+) -> tuple[float, float, float]:
+    """Position and heading after a step ``(6,)`` seen from a pose that faces along a unit vector."""
+    c, s = facing
     return x + (c * step[0] - s * step[1]), y + (s * step[0] + c * step[1]), turned_by(heading + step[2])
 
 
 @compiled
-def pose_after(x: float, y: float, heading: float, step: Floats) -> Pose:
-    """The pose after a step ``(6,)`` seen from a pose."""
-    px, py, turned = moved(x, y, heading, step)
-    return px, py, turned, step[3], step[4], step[5]
+def moved(x: float, y: float, heading: float, step: Floats) -> tuple[float, float, float]:
+    """Position and heading after a step ``(6,)`` seen from a pose; the heading is not wound up."""
+    return moved_along(x, y, heading, unit_vector(heading), step)
 
 
 @compiled
@@ -200,15 +207,18 @@ def cell_of(lattice: PoseLattice, x: float, y: float, heading: float, mode: Whol
 
 
 @compiled
-def is_way_free(
-    body: RobotBody, primitives: Primitives, number: Whole, x: float, y: float, heading: float, buffer: FloatArray
-) -> bool:
-    """Check whether the robot is clear of obstacles and bounds after every step of a primitive."""
+def _is_way_free(
+    body: RobotBody, primitives: Primitives, number: Whole, x: float, y: float, heading: float,
+    facing: tuple[float, float], stride: int, buffer: FloatArray,
+) -> bool:  # fmt: skip
+    """Check whether the robot is clear of obstacles and bounds on a primitive, after every so many steps."""
     if is_far_from_all(body, x, y, primitives.reach[number]):
         return True
     # From the end on: what is not free is found there soonest.
-    for step in range(primitives.first[number + 1] - 1, primitives.first[number] - 1, -1):
-        if not is_free(body, pose_after(x, y, heading, primitives.poses[step]), buffer):
+    for i in range(primitives.first[number + 1] - 1, primitives.first[number] - 1, -stride):
+        step = primitives.poses[i]
+        px, py, turned = moved_along(x, y, heading, facing, step)
+        if not is_free(body, (px, py, turned, step[3], step[4], step[5]), buffer):
             return False
     return True
 
@@ -220,12 +230,17 @@ def _spread(
 ) -> None:  # fmt: skip
     """Spread costs from a cell to those that primitives lead to."""
     x, y, heading = poses[cell, 0], poses[cell, 1], poses[cell, 2]
+    # Nothing that is as wide as the robot fits in between the poses that are looked at.
+    stride = max(1, int(2 * body.footprints.inner[body.robot] * pace))
+    facing = unit_vector(heading)
     mode = cell // (lattice.sectors * lattice.size[0] * lattice.size[1])
     for number in range(primitives.begin[mode], primitives.begin[mode + 1]):
         first, end = primitives.first[number], primitives.first[number + 1]
-        px, py, turned = moved(x, y, heading, primitives.poses[end - 1])
+        px, py, turned = moved_along(x, y, heading, facing, primitives.poses[end - 1])
         other, cost = cell_of(lattice, px, py, turned, primitives.mode[number]), costs[cell] + np.float32(end - first)
-        if other < 0 or costs[other] <= cost or not is_way_free(body, primitives, number, x, y, heading, buffer):
+        if other < 0 or costs[other] <= cost:
+            continue
+        if not _is_way_free(body, primitives, number, x, y, heading, facing, stride, buffer):
             continue
         costs[other] = cost
         poses[other, 0], poses[other, 1], poses[other, 2] = px, py, turned
@@ -237,13 +252,13 @@ def fill_costs(
     body: RobotBody, primitives: Primitives, lattice: PoseLattice, goals: Floats, start: Floats, pace: float,
     costs: FloatArray, poses: Floats, heap: Heap, mode: int, buffer: FloatArray,
 ) -> float:  # fmt: skip
-    """Spread costs backwards from the goals over all poses from which it may be worthwhile to go there.
+    """Spread costs backwards from the goals over all poses by way of which it may be worthwhile to go there.
 
     Args:
         body: The robot.
         primitives: What it can do, backwards in time.
         lattice: Cells and sectors.
-        goals: ``(., 3)`` poses.
+        goals: ``(., 4)`` poses and modes.
         start: ``(3,)`` pose, towards which costs are spread first.
         pace: Steps that a metre takes at least.
         costs: ``(cells,)`` steps to the goal, filled; infinite to begin with, and beyond what was reached.
@@ -253,14 +268,15 @@ def fill_costs(
         buffer: To overwrite, see :func:`buffer_size`.
 
     Returns:
-        The cost up to which all are known.
+        The sum, of a cost and the steps that it takes at least from the start, up to which all are known; infinite if
+        there are no others.
     """
     begin = cell_of(lattice, start[0], start[1], start[2], mode)
     heap.filled[0] = 0
     for number in range(goals.shape[0]):
-        cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], 0)
+        cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], int(goals[number, 3]))
         if cell >= 0 and costs[cell] > 0:
-            costs[cell], poses[cell] = 0, goals[number]
+            costs[cell], poses[cell] = 0, goals[number, :3]
             push(heap, 0.0, cell)
     most, last = np.inf, 0.0
     while 0 < heap.filled[0] < heap.value.shape[0] - 256 and last <= most:
@@ -270,6 +286,6 @@ def fill_costs(
         if value > cost + pace * np.sqrt((x - start[0]) ** 2 + (y - start[1]) ** 2) + 1e-3:
             continue
         if cell == begin:
-            most = min(most, WIDER * cost + LATER)
+            most = min(most, cost + LATER)
         _spread(body, primitives, lattice, start, pace, cell, costs, poses, heap, buffer)
-    return last
+    return last if heap.filled[0] > 0 else np.inf

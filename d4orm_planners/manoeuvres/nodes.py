@@ -128,13 +128,17 @@ def is_dominated(nodes: Nodes, slot: int, number: int, own: int, time: int) -> b
 
 @compiled
 def cost_to_go(task: Task, x: float, y: float, heading: float, mode: Whole) -> float:
-    """Steps to the goal; where there are no obstacles, those of the last stretch."""
+    """Steps to the goal, or the least that there may be; where there are no obstacles, those of the last stretch."""
     if task.costs.steps.shape[0] == 0:
         ahead = snap_steps(snap_of(task.limits, task.goal, x, y, heading, 1.0))
         return float(min(ahead, snap_steps(snap_of(task.limits, task.goal, x, y, heading, -1.0))))
     cell = cell_of(task.costs.lattice, x, y, heading, mode)
     cost = np.float64(task.costs.steps[cell]) if cell >= 0 else np.inf
-    return cost if cost < np.inf else task.costs.far
+    if cost < np.inf:
+        return cost
+    (start_x, start_y), pace = task.costs.start, task.costs.pace
+    behind = pace * np.sqrt((x - start_x) ** 2 + (y - start_y) ** 2)
+    return max(task.costs.far - behind, pace * np.sqrt((x - task.goal.x) ** 2 + (y - task.goal.y) ** 2))
 
 
 @compiled

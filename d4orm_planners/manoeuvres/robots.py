@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.footprint_gaps import pair_gap, world_gap
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -44,12 +44,14 @@ class ManoeuvreScene(NamedTuple):
         area: The room that robots may use.
         arrays: The problem's arrays, of one type for all problems, with an index of all obstacles within reach.
         extra: Distance kept from everything [m].
+        bent: ``(K,)`` whether trailers have to be in a bend at the robot's goal.
     """
 
     problem: Problem
     area: Area
     arrays: ProblemArrays
     extra: float
+    bent: BoolArray
 
     @property
     def reach(self) -> float:
@@ -65,12 +67,13 @@ class ManoeuvreScene(NamedTuple):
 
 def scene_of(problem: Problem) -> ManoeuvreScene:
     """What all robots of a team share."""
-    team, extra = problem.team, distance_kept(problem)
+    team, bent = problem.team, must_bend(problem)
+    extra = distance_kept(problem, bent)
     index = problem.world.index(float(team.radius.max()) + extra, within=float(team.radius.max()) + extra)
     arrays = problem.arrays._replace(
         grid=index, turns_at_goals=None, goal_direction=None, squared_goal_chord=None, footprints=None
     )
-    return ManoeuvreScene(problem, area_of(problem), arrays, extra)
+    return ManoeuvreScene(problem, area_of(problem), arrays, extra, bent)
 
 
 def can_plan(problem: Problem) -> bool:
@@ -103,15 +106,35 @@ def area_of(problem: Problem) -> Area:
     return Area(low, high, largest / CELLS_PER_RADIUS)
 
 
-def distance_kept(problem: Problem) -> float:
-    """Distance that robots keep from everything [m]; less where starts or goals leave less room."""
+def distance_kept(problem: Problem, bent: BoolArray) -> float:
+    """Distance that robots keep from everything [m]; less where starts or goals leave less room, but for trailers that
+    are in a bend there.
+    """
     team, usual = problem.team, problem.margin + problem.rounding + CLEARANCE * problem.stride
+    goals = _at_goals(problem)
+    for robot, model in enumerate(team.robot_models):
+        if bent[robot]:
+            goals[robot, model.heading_index] = np.nan
+    return min(usual, 0.9 * min(_room(problem, problem.start, usual), _room(problem, goals, usual)))
+
+
+def _at_goals(problem: Problem) -> FloatArray:
+    """``(K, n)`` states in which robots are at their goals, trailers in line."""
     goals = np.zeros_like(problem.start)
     goals[:, :2] = problem.goal
-    for robot, model in enumerate(team.robot_models):
+    for robot, model in enumerate(problem.team.robot_models):
         if model.heading_index is not None:
             goals[robot, model.heading_index] = problem.goal_heading[robot]
-    return min(usual, 0.9 * min(_room(problem, problem.start, usual), _room(problem, goals, usual)))
+    return goals
+
+
+def must_bend(problem: Problem) -> BoolArray:
+    """``(K,)`` whether trailers in line would overlap with an obstacle or a bound at the robot's goal."""
+    team, poses, bent = problem.team, problem.team.body_poses(_at_goals(problem)), np.zeros(problem.num_robots, bool)
+    for body, pose in zip(team.bodies, poses, strict=True):
+        if team.robot_models[body.robot].trailers and not np.isnan(pose).any():
+            bent[body.robot] |= world_gap(problem.world, body.footprint, pose) <= 0
+    return bent
 
 
 def _room(problem: Problem, states: FloatArray, enough: float) -> float:
@@ -181,10 +204,11 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     start[3 : 3 + len(model.trailers)] = state[3 : 3 + len(model.trailers)]
     sectors = 1 if model.heading_index is None else SECTORS
     lattice = area.lattice(area.cell, float(start[2]), sectors, len(modes))
-    costs = Costs(lattice, np.zeros(0, np.float32), np.inf)
+    bent = bool(scene.bent[number])
+    costs = Costs(lattice, np.zeros(0, np.float32), np.inf, 0.0, (0.0, 0.0))
     if problem.world.num_obstacles or last.way in (NOWHERE, TOWING):
-        costs = costs_of(kind, area, body, start, goal, problem.num_robots)
-    curves = curves_of(kind.base) if model.trailers else NO_CURVES
+        costs = costs_of(kind, area, body, start, goal, problem.num_robots, bent)
+    curves = curves_of(kind.base, bent) if model.trailers else NO_CURVES
     mode = modes.index(kind.start)
     return Robot(number, model, start, mode, goal, last, curves, body, primitives, lattice, costs)
 

@@ -20,7 +20,7 @@ from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, docks_after, is_sweep
 from d4orm_planners.manoeuvres.nodes import Nodes, Task, add, cost_to_go, is_dominated, slot_of
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TOWING, Goal, Limits, Snap, snap_of
-from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, is_met, safe_since, safe_until, visits_of
+from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, met_until, safe_since, safe_until, visits_of
 
 NOTHING, PAUSED = -1, -2
 """Results of a search that ends without a motion, and of one that is to go on if there is time."""
@@ -42,13 +42,20 @@ def _has_traffic(traffic: Traffic, nodes: Nodes, count: int, since: int) -> bool
 
 
 @compiled
-def _meeting(task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int, likely: int) -> int:
-    """A step of a move in which another robot is met if it begins then, zero for none; the likely one first."""
+def _meeting(
+    task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int, likely: int
+) -> tuple[int, int]:  # fmt: skip
+    """A step of a move in which another robot is met if it begins then, zero for none, and the soonest departure at
+    which that one may be gone; the likely step first.
+    """
     for number in range(count + 1):
         step = number if number else likely
-        if step and is_met(task.body, traffic, depart + step, nodes.swept[step - 1], nodes.swept[step], nodes.buffer):
-            return step
-    return 0
+        if step:
+            before, after = nodes.swept[step - 1], nodes.swept[step]
+            until = met_until(task.body, traffic, depart + step, before, after, nodes.buffer)
+            if until > 0:
+                return step, until - step
+    return 0, depart
 
 
 @compiled
@@ -98,7 +105,7 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
         if not busy:
             add(task, nodes, pose, mode, depart + count, NEVER, node, move, depart)
             return
-        met = _meeting(task, nodes, traffic, count, depart, met)
+        met, gone = _meeting(task, nodes, traffic, count, depart, met)
         if met == 0:
             end = safe_until(task.body, traffic, depart + count, nodes.swept[count], nodes.buffer)
             if mode >= 0 or end == NEVER:
@@ -106,11 +113,9 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
             if end == NEVER:
                 return
             depart = max(depart, end - count)
-        elif depart > traffic.end:
-            return
         if not waits:
             return
-        depart += task.patience
+        depart += task.patience * max(1, -((depart - gone) // task.patience))
 
 
 @compiled
@@ -129,9 +134,9 @@ def _snaps(task: Task, nodes: Nodes, traffic: Traffic, node: int) -> None:
 
 @compiled
 def _soonest(task: Task, traffic: Traffic, nodes: Nodes) -> int:
-    """The step from which on the robot can stay at its goal; zero where it may face anywhere."""
+    """The step from which on the robot can stay at its goal; zero where it may face anywhere, or stands in a bend."""
     goal, pose = task.goal, nodes.swept[0]
-    if np.isnan(goal.heading):
+    if np.isnan(goal.heading) or task.curves.last > 0:
         return 0
     for i in range(3, POSE_SIZE):
         pose[i] = 0.0
@@ -168,8 +173,10 @@ def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode:
         cell = cell_of(task.lattice, x, y, heading, nodes.mode[node])
         if is_dominated(nodes, slot_of(nodes, cell, task.number), task.number, node, nodes.time[node] - 1):
             continue
-        ends = task.primitives.rests[nodes.mode[node]] and (task.limits.way != TOWING or nodes.mode[node] == 0)
-        if ends and nodes.until[node] == NEVER and reaches(task.goal, x, y, heading, 0.0, 1.0):
+        ends = task.primitives.rests[nodes.mode[node]] and nodes.until[node] == NEVER
+        if task.limits.way == TOWING and task.curves.last == 0:
+            ends = ends and nodes.mode[node] == 0
+        if ends and reaches(task.goal, x, y, heading, 0.0, 1.0):
             return node
         _snaps(task, nodes, traffic, node)
         begin, end = task.primitives.begin[nodes.mode[node]], task.primitives.begin[nodes.mode[node] + 1]

@@ -17,7 +17,7 @@ from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, curve_from, find_motion, snap_from, trace
 from d4orm_planners.manoeuvres.snapping import TOWING, snap_controls
-from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, traffic_of
+from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
 from d4orm_planners.mapf.lns import Odds
 
 MAX_NODES = 100_000
@@ -68,13 +68,20 @@ class TeamMotions:
     def __init__(self, scene: ManoeuvreScene, robots: list[Robot], should_stop: Callable[[], bool]) -> None:
         self.problem, self.robots, self.should_stop = scene.problem, robots, should_stop
         self._area, self._reach, problem = scene.area, scene.reach, scene.problem
-        self._nodes = Nodes.of(MAX_NODES, buffer_size(problem.team.all_footprint_arrays))
-        self._searches = 0
         size, horizon = problem.num_robots, problem.horizon
+        self._nodes, self._searches = self._room_for_nodes(), size
         self._poses = np.empty((size, horizon + 1, POSE_SIZE), np.float32)
         self._poses[:] = np.array([robot.start for robot in self.robots])[:, None]
         self.motions: list[Motion | None] = [None] * size
-        self.alone = [self._find(robot, (), {}) for robot in range(size)]
+        self.alone: list[Motion | None] = [None] * size
+        nobody = self._traffic((), {})
+
+        def find_alone(part: IntArray) -> None:
+            nodes = self._room_for_nodes()
+            for robot in range(part[0], part[1]):
+                self.alone[robot] = self._search(robot, nobody, nodes, 1 + robot, MAX_NODES)
+
+        Threads(available_cores()).over(size, find_alone)
 
     @classmethod
     def prepared(cls, problem: Problem, should_stop: Callable[[], bool]) -> TeamMotions | None:
@@ -158,7 +165,7 @@ class TeamMotions:
                 return
             others = [other for other, motion in enumerate(self.motions) if motion is not None and other != robot]
             later = {other: held.get(other, 0) for other in order[place + 1 :]}
-            self._take(robot, self._find(robot, others, later))
+            self._take(robot, self._find(robot, self._traffic(others, later)))
 
     def _drop(self, robot: int) -> None:
         self.motions[robot] = None
@@ -182,38 +189,32 @@ class TeamMotions:
                 last[other], gone[other] = 0, steps
         return traffic_of(self._poses, last, gone, self._area.low, self._area.high, self._reach)
 
-    def _find(self, number: int, others: Iterable[int], held: dict[int, int]) -> Motion | None:
-        """Look for a robot's motion among those of others, while those that are held stand where they start."""
+    def _room_for_nodes(self) -> Nodes:
+        return Nodes.of(MAX_NODES, buffer_size(self.problem.team.all_footprint_arrays))
+
+    def _find(self, number: int, traffic: Traffic) -> Motion | None:
+        """A robot's motion among others: that which it would take alone, or else one that is looked for."""
+        alone, team = self.alone[number], len(self.robots)
+        if alone is not None and meets_nobody(self.robots[number].body, traffic, alone.poses, self._nodes.buffer):
+            return alone
+        self._searches += 1
+        most = FIRST_NODES // team * (1 + self._searches // (4 * team))
+        return self._search(number, traffic, self._nodes, self._searches, most)
+
+    def _search(self, number: int, traffic: Traffic, nodes: Nodes, search: int, most: int) -> Motion | None:
+        """Look for a robot's motion in about so many nodes."""
         robot, problem = self.robots[number], self.problem
         patience = max(1, round(PATIENCE * float(problem.team.radius.max()) / problem.stride))
-        self._searches += 1
         task = Task(
             robot.body, robot.primitives, robot.limits, robot.curves, robot.goal, robot.lattice, robot.costs, WEIGHT,
-            patience, problem.horizon, self._searches,
+            patience, problem.horizon, search,
         )  # fmt: skip
-        self._nodes.filled[0] = 0
-        traffic, goes_on, node = self._traffic(others, held), False, PAUSED
-        team = len(self.robots)
-        most = MAX_NODES if self._searches <= team else FIRST_NODES // team * (1 + self._searches // (4 * team))
-        while node == PAUSED and self._nodes.filled[0] < most and not self.should_stop():
-            node = find_motion(task, traffic, self._nodes, robot.start, robot.mode, goes_on)
+        nodes.filled[0] = 0
+        goes_on, node = False, PAUSED
+        while node == PAUSED and nodes.filled[0] < most and not self.should_stop():
+            node = find_motion(task, traffic, nodes, robot.start, robot.mode, goes_on)
             goes_on = True
-        return None if node < 0 else self._motion(robot, task, node)
-
-    def _motion(self, robot: Robot, task: Task, node: int) -> Motion:
-        """The motion that ends in a node."""
-        nodes, chain = self._nodes, [node]
-        while nodes.parent[chain[-1]] >= 0:
-            chain.append(int(nodes.parent[chain[-1]]))
-        steps = int(nodes.time[node])
-        controls = np.zeros((steps, robot.model.control_size), np.float32)
-        for last in chain[:-1]:
-            since, until = int(nodes.depart[last]), int(nodes.time[last])
-            pose = nodes.pose[nodes.parent[last]].tolist()
-            controls[since:until] = _controls(robot, int(nodes.move[last]), pose)[: until - since]
-        poses = np.empty((steps + 1, POSE_SIZE), np.float32)
-        trace(task, nodes, node, poses)
-        return Motion(poses, controls)
+        return None if node < 0 else _motion(robot, task, nodes, node)
 
     def controls(self) -> FloatArray:
         """``(H, K, m)`` of the whole team; who has no motion stands."""
@@ -223,6 +224,22 @@ class TeamMotions:
             if motion is not None:
                 controls[: motion.steps, robot, : motion.controls.shape[1]] = motion.controls
         return controls
+
+
+def _motion(robot: Robot, task: Task, nodes: Nodes, node: int) -> Motion:
+    """The motion that ends in a node."""
+    chain = [node]
+    while nodes.parent[chain[-1]] >= 0:
+        chain.append(int(nodes.parent[chain[-1]]))
+    steps = int(nodes.time[node])
+    controls = np.zeros((steps, robot.model.control_size), np.float32)
+    for last in chain[:-1]:
+        since, until = int(nodes.depart[last]), int(nodes.time[last])
+        pose = nodes.pose[nodes.parent[last]].tolist()
+        controls[since:until] = _controls(robot, int(nodes.move[last]), pose)[: until - since]
+    poses = np.empty((steps + 1, POSE_SIZE), np.float32)
+    trace(task, nodes, node, poses)
+    return Motion(poses, controls)
 
 
 def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:

@@ -125,6 +125,15 @@ def _meets(
 
 
 @compiled
+def _steps_away(body: RobotBody, traffic: Traffic, other: Whole, step: Whole, pose: Floats) -> int:
+    """Steps, from one on, in which another robot cannot be too near to one that stands there."""
+    there = traffic.poses[other, min(step, traffic.last[other])]
+    dx, dy = there[0] - pose[0], there[1] - pose[1]
+    far = body.arrays.radius[body.robot] + body.arrays.radius[other] + body.extra + 2 * body.stride
+    return max(0, int((np.sqrt(dx * dx + dy * dy) - far) / body.stride))
+
+
+@compiled
 def _touches(
     body: RobotBody, other: Whole, pose: Pose, its_pose: Pose, dx: np.float32, dy: np.float32, buffer: FloatArray
 ) -> bool:
@@ -150,15 +159,20 @@ def _touches(
 
 
 @compiled
-def is_met(body: RobotBody, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray) -> bool:
-    """Check whether another robot is too near to this one in a step that ends at a number, between two poses of it."""
+def met_until(
+    body: RobotBody, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray
+) -> int:  # fmt: skip
+    """Where another robot is too near to this one in a step that ends at a number, between two poses of it: a later
+    step before which it does not go away; zero if there is none.
+    """
     begin, end = visits_of(traffic, after[0], after[1])
     for row in range(begin, end):
+        other = traffic.visits[row, 0]
         if traffic.visits[row, 1] <= step <= traffic.visits[row, 2] and _meets(
-            body, traffic, traffic.visits[row, 0], step, before, after, body.parts, buffer
+            body, traffic, other, step, before, after, body.parts, buffer
         ):
-            return True
-    return False
+            return int(traffic.gone[other]) if step > traffic.last[other] else int(step) + 1
+    return 0
 
 
 @compiled
@@ -170,11 +184,13 @@ def safe_until(body: RobotBody, traffic: Traffic, step: Whole, pose: Floats, buf
         other = traffic.visits[row, 0]
         since = max(step, traffic.visits[row, 1])
         # Who stands does not come nearer.
-        last = min(traffic.visits[row, 2], until - 1, max(traffic.last[other], since))
-        for at in range(since, last + 1):
-            if _meets(body, traffic, other, at, pose, pose, body.parts if at > step else 1, buffer):
+        last, at = min(traffic.visits[row, 2], until - 1, max(traffic.last[other], since)), since
+        while at <= last:
+            away = _steps_away(body, traffic, other, at, pose)
+            if away == 0 and _meets(body, traffic, other, at, pose, pose, body.parts if at > step else 1, buffer):
                 until = at
                 break
+            at += max(away, 1)
     return until
 
 
@@ -194,3 +210,13 @@ def safe_since(body: RobotBody, traffic: Traffic, pose: Floats, buffer: FloatArr
                 since = max(since, min(at + 1, NEVER))
                 break
     return since
+
+
+@cached_kernel(**OPTIONS)
+def meets_nobody(body: RobotBody, traffic: Traffic, poses: FloatArray, buffer: FloatArray) -> bool:
+    """Check whether no other robot comes too near to one that takes poses ``(T + 1, 6)``, and stays in the last."""
+    last = poses.shape[0] - 1
+    for step in range(last + 1):
+        if met_until(body, traffic, step, poses[max(step - 1, 0)], poses[step], buffer) > 0:
+            return False
+    return safe_until(body, traffic, last, poses[last], buffer) == NEVER
