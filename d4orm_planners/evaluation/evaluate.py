@@ -57,7 +57,7 @@ def evaluate(
             whatever else :func:`d4orm_planners.make_policy` takes. Or by label policies of your own and settings:
             ``{"mine": MyPolicy(), "f": my_function, "d4orm": {}, "d4orm, few": {"policy": "d4orm", "num_samples":
             128}}``. Without ``"policy"`` the label is the name. The store tells policies of your own apart by label
-            or import path, settings and the digest of their source file.
+            or import path, settings, attributes and the digest of their source file.
         scenarios: Scenarios as for :func:`d4orm_env.make_problem`, or problems.
         out: Folder to write to; made if it does not exist.
         seeds: Each seeds the scenario, the policy and the noise of a trial.
