@@ -88,8 +88,8 @@ class StudyOptions(ObservationOptions):
             "--policy",
             "--policies",
             "-p",
-            help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512; repeatable; "
-            "d4orm,go-to-goal by default.",
+            help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512 "
+            "(label=ours names it); repeatable; d4orm,go-to-goal by default.",
         ),
     ] = None
     scenario: Annotated[
@@ -202,18 +202,21 @@ def require_trials(rates: list[SuccessRate]) -> None:
 
 
 def _policies(texts: list[str]) -> dict[str, dict[str, object]]:
-    """Settings by label: a name stands for itself, and a configuration is called what was typed."""
-    chosen: dict[str, dict[str, object]] = {}
+    """Settings by label: a name stands for itself, a configuration for what was typed, or what it sets as label."""
+    labelled: list[tuple[str, dict[str, object]]] = []
     for text in texts:
         # The name ends where the first setting begins, for an import path has a colon too.
         policy, colon, _ = text.partition("=")[0].rpartition(":")
         if not colon or ("=" not in text and policy not in list_policies()):
-            chosen.update((name, {}) for name in names(text) or ())
+            labelled += [(name, {}) for name in names(text) or ()]
             continue
         if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), "--policy")):
             raise ValueError(f"--policy {text!r}: 'policy' is no setting; the name stands before the colon")
-        chosen[text] = {"policy": policy, **values}
-    return chosen
+        labelled.append((str(values.pop("label", text)), {"policy": policy, **values}))
+    for label, _ in labelled:
+        if [one for one, _ in labelled].count(label) > 1:
+            raise ValueError(f"--policy gives {label!r} twice; leave one out, or set a label, as in d4orm:label=ours")
+    return dict(labelled)
 
 
 def _with_settings(chosen: dict[str, dict[str, object]], settings: dict[str, object]) -> dict[str, dict[str, object]]:
