@@ -65,7 +65,8 @@ class SharedPolicy(Policy):
         for name, tensor in self._weights.state_dict().items():
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
-        return {"weights": digest.hexdigest()}
+        settings = getattr(self._predict, "keywords", {})  # of a partial
+        return {**settings, "normalized": self._normalized, "weights": digest.hexdigest()}
 
 
 def from_sb3(model: Model, deterministic: bool = True) -> SharedPolicy:
@@ -75,7 +76,7 @@ def from_sb3(model: Model, deterministic: bool = True) -> SharedPolicy:
         model: Result of ``PPO.load(path)`` or of the training.
         deterministic: Take the most likely action rather than draw one.
     """
-    return SharedPolicy(partial(_ask_sb3, model, deterministic), model.policy)
+    return SharedPolicy(partial(_ask_sb3, model, deterministic=deterministic), model.policy)
 
 
 def from_torch(module: Model, normalized: bool = False) -> SharedPolicy:
@@ -96,7 +97,7 @@ def from_torchrl(module: Model, observation_key: Key = "observation", action_key
         observation_key: Key of the observations.
         action_key: Key of the actions.
     """
-    return SharedPolicy(partial(_ask_torchrl, module, observation_key, action_key), module)
+    return SharedPolicy(partial(_ask_torchrl, module, observation_key=observation_key, action_key=action_key), module)
 
 
 def from_rllib(module: Model, normalized: bool = True) -> SharedPolicy:
@@ -109,7 +110,7 @@ def from_rllib(module: Model, normalized: bool = True) -> SharedPolicy:
     return SharedPolicy(partial(_ask_rllib, module), module, normalized)
 
 
-def _ask_sb3(model: Model, deterministic: bool, observations: FloatArray) -> ArrayLike:
+def _ask_sb3(model: Model, observations: FloatArray, *, deterministic: bool) -> ArrayLike:
     return model.predict(observations, deterministic=deterministic)[0]
 
 
@@ -118,7 +119,7 @@ def _ask_torch(module: Model, observations: FloatArray) -> ArrayLike:
         return module(torch.as_tensor(observations)).numpy()
 
 
-def _ask_torchrl(module: Model, observation_key: Key, action_key: Key, observations: FloatArray) -> ArrayLike:
+def _ask_torchrl(module: Model, observations: FloatArray, *, observation_key: Key, action_key: Key) -> ArrayLike:
     asked = tensordict.TensorDict({observation_key: torch.as_tensor(observations)}, batch_size=[len(observations)])
     with torch.no_grad(), tensordict_nn.set_interaction_type(tensordict_nn.InteractionType.DETERMINISTIC):
         return module(asked)[action_key].cpu().numpy()

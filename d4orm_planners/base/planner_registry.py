@@ -9,9 +9,10 @@ from typing import Any, TypeAlias, TypeVar
 from d4orm_env.core.arrays import duration, shown
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
 from d4orm_env.core.registry import load_reference, source_digest, written
+from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
-from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy, plain_attributes
+from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy
 from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
 RECOMMENDED = "hybrid"
@@ -183,7 +184,7 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
     elif not makes_policy(kind):
         _refuse_settings(config, owner)
         policy = as_policy(kind, owner)
-        settings = policy.identity() if isinstance(kind, Policy | Planner) else plain_attributes(kind)
+        settings = policy.identity() if isinstance(kind, Policy | Planner) else attributes(kind)
     elif (config_class := getattr(kind, "config_class", None)) is not None:
         checked = _policy_config(kind, config_class, config, owner)
         if isinstance(kind, type) and issubclass(kind, Policy):
@@ -192,7 +193,7 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
             settings = checked.keywords()
     else:
         _check_keywords(kind, config, owner)
-        settings = dict(config)
+        settings = {**attributes(kind), **config}
     code = written(kind.planner if isinstance(kind, OpenLoop) and kind.planner is not None else kind)
     foreign = code.__module__.partition(".")[0] != __name__.partition(".")[0]
     return {**settings, "source": source_digest(code)} if foreign else settings

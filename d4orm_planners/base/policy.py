@@ -6,7 +6,6 @@ import hashlib
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
@@ -17,6 +16,7 @@ from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.inputs import usable
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.driving import ATTRIBUTE, driven_alone
+from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.settings import CheckedSettings
@@ -89,26 +89,22 @@ class Policy(ABC):
     def identity(self) -> dict[str, object]:
         """Identity that a store of trials tells this instance by from others of its class, as JSON has it.
 
-        By default the settings in ``config``, if it has any, else its attributes that are numbers or text.
+        By default the settings in ``config``, if it has any, else its attributes, which are digests unless they are
+        numbers or text.
+
+        Raises:
+            ValueError: If one of these cannot be told from others of its kind, as an open file.
         """
         config = getattr(self, "config", None)
-        return self.identity_with(config) if isinstance(config, CheckedSettings) else plain_attributes(self)
+        if isinstance(config, CheckedSettings):
+            return self.identity_with(config)
+        episode = (ATTRIBUTE, "problem")  # what a reset has left
+        return {name: value for name, value in attributes(self).items() if name not in episode}
 
     @classmethod
     def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
         """The same of an instance with these settings; more than they are where they name what may change."""
         return config.keywords()
-
-
-def plain_attributes(thing: object) -> dict[str, object]:
-    """Attributes of an object that are numbers, truth values or text."""
-    if isinstance(thing, partial):
-        return {str(name): value for name, value in (*enumerate(thing.args), *thing.keywords.items()) if _plain(value)}
-    return {name: value for name, value in getattr(thing, "__dict__", {}).items() if _plain(value)}
-
-
-def _plain(value: object) -> bool:
-    return isinstance(value, bool | int | float | str)
 
 
 class StatePolicy(Policy):

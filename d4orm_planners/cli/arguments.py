@@ -74,18 +74,23 @@ def _add(values: dict[str, object], name: str, text: str, option: str, what: str
 
 
 def policies_by_label(texts: list[str], option: str = "--policy") -> dict[str, dict[str, object]]:
-    """``policy`` and settings by label: a name stands for itself, and a configuration is called what was typed."""
-    chosen: dict[str, dict[str, object]] = {}
+    """``policy`` and settings by label: a name stands for itself, a configuration for what was typed, or what it sets
+    as label.
+    """
+    labelled: list[tuple[str, dict[str, object]]] = []
     for text in texts:
         # The name ends where the first setting begins, for an import path has a colon too.
         policy, colon, _ = text.partition("=")[0].rpartition(":")
         if not colon or ("=" not in text and policy not in list_policies()):
-            chosen.update((name, {}) for name in names(text) or ())
+            labelled += [(name, {}) for name in names(text) or ()]
             continue
         if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), option)):
             raise ValueError(f"{option} {text!r}: 'policy' is no setting; the name stands before the colon")
-        chosen[text] = {"policy": policy, **values}
-    return chosen
+        labelled.append((str(values.pop("label", text)), {"policy": policy, **values}))
+    for label, _ in labelled:
+        if [one for one, _ in labelled].count(label) > 1:
+            raise ValueError(f"{option} gives {label!r} twice; leave one out, or set a label, as in d4orm:label=ours")
+    return dict(labelled)
 
 
 def refuse_options(context: typer.Context, options: Iterable[str], reason: str) -> None:

@@ -89,8 +89,8 @@ class StudyOptions(ObservationOptions):
             "--policy",
             "--policies",
             "-p",
-            help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512; repeatable; "
-            "d4orm,go-to-goal by default.",
+            help="Names or package.module:Name with commas, or one with settings, d4orm:num_samples=512 "
+            "(label=ours names it); repeatable; d4orm,go-to-goal by default.",
         ),
     ] = None
     scenario: Annotated[

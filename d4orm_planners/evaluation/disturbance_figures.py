@@ -25,6 +25,8 @@ KINDS = ("pdf", "svg", "png")
 """Files of a figure."""
 COLUMN, PAGE = 3.5, 7.16
 """Width of a column and of a page of two [inches]."""
+_LETTERS = 28
+"""Letters that fit over a map beside each other."""
 
 _STYLE = {
     "text.parse_math": False,  # no name is a formula
@@ -131,19 +133,20 @@ def draw_noise(groups: Mapping[str, Sequence[SuccessRate]]) -> Figure:
 
 
 @own_style(_STYLE)
-def draw_lines(title: str, rates: Sequence[SuccessRate]) -> Figure:
-    """Success against the level of every disturbance: a panel each, a line with confidence intervals per policy."""
+def draw_lines(rates: Sequence[SuccessRate]) -> Figure:
+    """Success against the level of every disturbance: a panel each, a line with confidence intervals per policy.
+
+    Without a title, as figures in a paper are. One or two panels are as wide as a column, four as a page.
+    """
     names, labels = (list(dict.fromkeys(all_of)) for all_of in zip(*((one.disturbance, one.label) for one in rates)))
     across = min(4, len(names))
-    width = PAGE * across / 4 if across > 1 else COLUMN
-    figure, axes = _grid(len(names), across, lambda rows: (width, 0.45 + 1.45 * rows), sharey=True)
+    width = PAGE * across / 4 if across > 2 else COLUMN
+    figure, axes = _grid(len(names), across, lambda rows: (width, 0.3 + 1.45 * rows), sharey=True)
     for number, (ax, name) in enumerate(zip(axes, names)):
         _draw_panel(ax, name, labels, [rate for rate in rates if rate.disturbance == name])
         ax.set_ylabel("success rate" if number % across == 0 else "")
-    figure.suptitle(title, fontsize=7)
-    figure.legend(
-        *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=min(4, len(labels)), frameon=False
-    )
+    lines = axes[0].get_legend_handles_labels()
+    figure.legend(*lines, loc="outside lower center", ncols=min(max(across, 2), len(labels)), frameon=False)
     return figure
 
 
@@ -165,32 +168,46 @@ def _draw_panel(ax: Axes, name: str, labels: Sequence[str], rates: Sequence[Succ
 
 
 @own_style(_STYLE)
-def draw_map(title: str, rates: Sequence[SuccessRate]) -> Figure:
-    """Success in percent: a row per level of every disturbance, the undisturbed one first, a column per policy."""
+def draw_map(rates: Sequence[SuccessRate]) -> Figure:
+    """Success in percent: a row per level of every disturbance, the undisturbed one first, a column per policy.
+
+    All rates are of one level of the execution noise, which the undisturbed one has too.
+    """
     labels = list(dict.fromkeys(rate.label for rate in rates))
     rows = list(dict.fromkeys(map(_row, sorted(rates, key=lambda rate: not rate.undisturbed))))
     shares = np.full((len(rows), len(labels)), np.nan)
     for rate in rates:
         shares[rows.index(_row(rate)), labels.index(rate.label)] = 100 * rate.rate
-    figure: Figure = figures.Figure(figsize=(COLUMN, 0.55 + 0.135 * len(rows)))
-    ax = figure.add_axes((0.5, 0.02, 0.48, 1 - 0.5 / figure.get_figheight()))
+    stretches = list(_stretches(name for name, _ in rows))
+    # The name of a disturbance has two lines, whether it has one row or several.
+    height = 0.22 if any(name and first == last for name, first, last in stretches) else 0.135
+    longest = max(map(len, labels))
+    upright = longest * len(labels) > _LETTERS
+    top = 0.12 + 0.06 * longest if upright else 0.25
+    whole = top + 0.03 + height * len(rows)
+    figure: Figure = figures.Figure(figsize=(COLUMN, whole))
+    ax = figure.add_axes((0.5, 0.03 / whole, 0.48, height * len(rows) / whole))
+    _draw_cells(ax, shares)
+    ax.set_yticks(range(len(rows)), ["" if name == "" else _shown(level) for name, level in rows], fontsize=6)
+    ax.set_xticks(range(len(labels)), labels, rotation=90 if upright else 0)
+    ax.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
+    noise = rates[0].control_noise_std
+    for name, first, last in stretches:
+        alone = f"noise {noise:g} alone" if noise else "undisturbed"
+        text = quantity_of(name).text.replace(" [", "\n[") if name else alone
+        ax.annotate(text, (0, (first + last) / 2), (-26 if name else -4, 0), ("axes fraction", "data"), "offset points",
+                    ha="right", va="center", fontsize=6)  # fmt: skip
+        ax.axhline(first - 0.5, color="white", linewidth=1.5)
+    return figure
+
+
+def _draw_cells(ax: Axes, shares: np.ndarray) -> None:
+    """Colours and numbers of a map; nothing where a share is NaN."""
     ax.imshow(shares, cmap="RdYlBu", vmin=0, vmax=100, aspect="auto")
     for (row, column), share in np.ndenumerate(shares):
         if np.isfinite(share):
             ink = "black" if 15 < share < 85 else "white"
             ax.text(column, row, f"{share:.0f}", ha="center", va="center", fontsize=6, color=ink)
-    ax.set_yticks(range(len(rows)), ["" if name == "" else _shown(level) for name, level in rows], fontsize=6)
-    ax.set_xticks(
-        range(len(labels)), labels, rotation=0 if len(labels) <= 3 else 30, ha="center" if len(labels) <= 3 else "left"
-    )
-    ax.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
-    for name, first, last in _stretches(name for name, _ in rows):
-        text = quantity_of(name).text.replace(" [", "\n[") if name else "undisturbed"
-        ax.annotate(text, (0, (first + last) / 2), (-26 if name else -4, 0), ("axes fraction", "data"), "offset points",
-                    ha="right", va="center", fontsize=6)  # fmt: skip
-        ax.axhline(first - 0.5, color="white", linewidth=1.5)
-    figure.text(0.5, 1 - 0.12 / figure.get_figheight(), f"success in %: {title}", ha="center", va="center")
-    return figure
 
 
 def _row(rate: SuccessRate) -> tuple[str, float | None]:

@@ -13,7 +13,8 @@ from pathlib import Path
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
-from d4orm_planners.evaluation.pool import ProcessWorker, run_here, run_jobs, run_on_ray
+from d4orm_planners.d_d4orm.ray_planner import import_ray
+from d4orm_planners.evaluation.pool import RAY_USE, ProcessWorker, run_here, run_jobs, run_on_ray
 from d4orm_planners.evaluation.robustness import write_disturbances
 from d4orm_planners.evaluation.store import STORE, Trial, TrialKey, TrialStore
 from d4orm_planners.evaluation.study import DisturbanceLevels, Policies, Scenarios, Study
@@ -57,15 +58,15 @@ def evaluate(
             whatever else :func:`d4orm_planners.make_policy` takes. Or by label policies of your own and settings:
             ``{"mine": MyPolicy(), "f": my_function, "d4orm": {}, "d4orm, few": {"policy": "d4orm", "num_samples":
             128}}``. Without ``"policy"`` the label is the name. The store tells policies of your own apart by label
-            or import path, settings and the digest of their source file.
+            or import path, settings, attributes and the digest of their source file.
         scenarios: Scenarios as for :func:`d4orm_env.make_problem`, or problems.
         out: Folder to write to; made if it does not exist.
         seeds: Each seeds the scenario, the policy and the noise of a trial.
         control_noise_std: Standard deviations of the Gaussian noise added to the controls, in their units.
-        disturbances: Levels of disturbances by name, as ``{"delay": [0, 1, 2], "push.speed": [0.2, 0.5]}``, from
-            harmless to bad; without an attribute behind the name it is the kind's first. Or by any label instances of
-            them, your own included, or lists of instances. One at a time, each with every level of noise. With them
-            come the files of :func:`~d4orm_planners.evaluation.robustness.write_disturbances` too.
+        disturbances: Levels of disturbances by name, as ``{"delay": [0, 1, 2], "push.speed": [0.2, 0.5]}``, with one
+            without effect, or from harmless to bad; without an attribute behind the name it is the kind's first. Or by
+            any label instances of them, your own included, or lists of instances. One at a time, each with every level
+            of noise. With them come the files of :func:`~d4orm_planners.evaluation.robustness.write_disturbances` too.
         num_robots: Team sizes for scenarios by name; ``None`` is the scenario's own.
         model: Robot models for scenarios by name; ``None`` is the scenario's own.
         scenario_settings: Further arguments of the scenarios by name, as ``{"corridor_width": 0.8}``; every one of them
@@ -135,6 +136,8 @@ def run_study(
     if workers is not None:
         whole_number(workers, "workers", 1)
     groups = study.groups()
+    if ray is not None:
+        import_ray(RAY_USE)  # before there is a store
     Path(out).mkdir(parents=True, exist_ok=True)
     store = TrialStore(Path(out) / STORE)
     for path in sorted(Path(out).glob(SHARD_STORES)):
@@ -143,7 +146,11 @@ def run_study(
     stored = {trial.key: trial for trial in store.trials()}
     return [
         TrialGroup(
-            group[0].policy.label, [stored[job.key(condition)] for job in group], condition.name, condition.level
+            group[0].policy.label,
+            # The same problem may have been stored under another name.
+            [replace(stored[job.key(condition)], scenario=job.scenario) for job in group],
+            condition.name,
+            condition.level,
         )
         for group in groups
         for condition in group[0].conditions

@@ -27,6 +27,8 @@ Result = TypeVar("Result")
 
 BEGUN = "begun"
 """Word of a process that it has begun a job; the results follow it."""
+RAY_USE = "running on a cluster"
+"""What Ray is for here, in the error without it."""
 QUEUED = 2
 """Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
 ENDING = 0.1
@@ -247,7 +249,7 @@ def run_on_ray(
         ImportError: If Ray is not installed.
         ConnectionError: If there is no cluster.
     """
-    connection = RayConnection(address, "running on a cluster")
+    connection = RayConnection(address, RAY_USE)
     try:
         cores = int(connection.ray.cluster_resources().get("CPU", 1))
         count = min(size or QUEUED * max(cores, 1), max(len(jobs), 1))

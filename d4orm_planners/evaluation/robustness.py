@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 
+from d4orm_env.core.arrays import shown
 from d4orm_env.render.style import own_style
+from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, draw_noise, quantity_of, write_figure
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
@@ -20,6 +23,15 @@ THRESHOLD = 0.9
 _PAIRS = """\
 Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
 succeeded; p is that of McNemar's exact test. Differences have 95% intervals by a paired bootstrap."""
+_NOT_RUN = "Success without a disturbance was *not run*: give one a level without effect, as in `push.speed=0,0.5`."
+_FIGURES = "Success against level with 95% intervals, and success in percent."
+
+
+def _check_given(given: object, kind: type, source: str) -> None:
+    """Refuse what is no list of so many results, at least one."""
+    listed = given if isinstance(given, Sequence) else ()
+    if not listed or not all(isinstance(one, kind) for one in listed):
+        raise ValueError(f"{shown(given)} is no list of {kind.__name__}; give the result of {source}")
 
 
 def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
@@ -34,8 +46,10 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
         The paths.
 
     Raises:
+        ValueError: If there is nothing to write, or what is given is something else.
         OSError: If the folder does not exist or cannot be written to.
     """
+    _check_given(rates, SuccessRate, "evaluate()")
     paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md", "png")]
     write_rates(paths[0], rates)
     with target(paths[1]) as path:
@@ -60,23 +74,36 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
         The paths; ``pairs.csv`` is not among them, and not written, where there is one policy only.
 
     Raises:
+        ValueError: If there is nothing to write, or what is given is something else.
         OSError: If the folder does not exist or cannot be written to.
     """
+    _check_given(groups, TrialGroup, "run_study() of a study with disturbances")
     rates = success_rates(groups)
+    places = _panels([rate for rate in rates if rate.disturbance])
+    if not places:
+        raise ValueError("no group of trials has a disturbance; run a study with disturbances")
     pairs = compare_pairs(groups)
+    captions = [
+        f"- `disturbances{suffix}`, `disturbance_map{suffix}`: {markdown_text(title)}"
+        for suffix, title in zip(_suffixes(places), places)
+    ]
+    blocks = [tolerance_tables(rates), "## Figures", _FIGURES, "\n".join(captions), *_pair_tables(rates, pairs)]
     paths = [Path(folder, name) for name in ("disturbances.md", "tolerance.csv")]
     with target(paths[0]) as path:
-        path.write_text("\n\n".join([tolerance_tables(rates), *_pair_tables(rates, pairs)]) + "\n", encoding="utf-8")
+        path.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
     write_csv(paths[1], [vars(one) for one in tolerances(rates)])
     if pairs:
         paths.append(Path(folder, "pairs.csv"))
         write_csv(paths[-1], [vars(pair) for pair in pairs])
-    places = _panels([rate for rate in rates if rate.disturbance])
-    for number, (title, group) in enumerate(places.items(), start=1):
-        suffix = f"-{number}" if len(places) > 1 else ""
-        paths += write_figure(Path(folder), f"disturbances{suffix}", draw_lines(title, group))
-        paths += write_figure(Path(folder), f"disturbance_map{suffix}", draw_map(title, group))
+    for suffix, (_, group) in zip(_suffixes(places), places.items()):
+        paths += write_figure(Path(folder), f"disturbances{suffix}", draw_lines(group))
+        paths += write_figure(Path(folder), f"disturbance_map{suffix}", draw_map(group))
     return paths
+
+
+def _suffixes(places: Sized) -> list[str]:
+    """What the names of the figures of each scenario, team and level of noise end with."""
+    return [f"-{number}" for number in range(1, len(places) + 1)] if len(places) > 1 else [""]
 
 
 def tolerance_tables(rates: Sequence[SuccessRate]) -> str:
@@ -86,10 +113,13 @@ def tolerance_tables(rates: Sequence[SuccessRate]) -> str:
         stood = tolerances(group)
         names = list(dict.fromkeys(one.disturbance for one in stood))
         cells = {(one.label, one.disturbance): one.text for one in stood}
-        undisturbed = {one.label: f"{one.undisturbed:.0%}" for one in reversed(stood)}
+        undisturbed = {one.label: one.undisturbed for one in stood}
+        if None in undisturbed.values():
+            blocks.append(_NOT_RUN)
         # Policies are few and disturbances many.
-        labels = list(dict.fromkeys(one.label for one in stood))
-        rows = [("undisturbed success", *(undisturbed[label] for label in labels))]
+        labels, noise = list(undisturbed), stood[0].control_noise_std
+        first = f"success with noise {noise:g} alone" if noise else "undisturbed success"
+        rows = [(first, *("not run" if rate is None else f"{rate:.0%}" for rate in undisturbed.values()))]
         rows += [(quantity_of(name).text, *(cells.get((label, name), "-") for label in labels)) for name in names]
         blocks.append(table(title, ("disturbance", *labels), rows))
     return "\n\n".join(blocks)
@@ -143,9 +173,10 @@ class Tolerance:
     The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
 
     Attributes:
-        stands: The last level before that, in the order in which they were given; ``None`` if it fails at the first.
-        fails: The first level with a success rate below the threshold; ``None`` if it tolerates all.
-        undisturbed: Success rate at the first level, which is the undisturbed one unless that is left out.
+        stands: The last level before that, from harmless to bad; ``None`` if it fails at the first.
+        fails: The first level with a success rate below the threshold; ``None`` if it tolerates all. Both are ``None``
+            where no level can be named: without an undisturbed success rate, or with one of 0.
+        undisturbed: Success rate without any disturbance but the noise; ``None`` if no level without effect was run.
         threshold: That share of it.
     """
 
@@ -157,37 +188,53 @@ class Tolerance:
     disturbance: str
     stands: float | None
     fails: float | None
-    undisturbed: float
-    threshold: float
+    undisturbed: float | None
+    threshold: float | None
 
     @property
     def text(self) -> str:
-        """Return the level as text: ``"4"``, ``"over 4"`` where it tolerates the last level, 4, or ``"-"`` if it never
-        succeeds.
-        """
-        if self.undisturbed == 0:
-            return "-"
-        return f"{self.fails:g}" if self.fails is not None else f"over {self.stands:g}"
+        """Return the level as text: ``"4"``, ``"over 4"`` where it tolerates the last level, 4, or ``"-"`` for none."""
+        if self.fails is not None:
+            return f"{self.fails:g}"
+        return "-" if self.stands is None else f"over {self.stands:g}"
 
 
-def tolerances(rates: Iterable[SuccessRate]) -> list[Tolerance]:
+def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
     """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
 
     Args:
-        rates: Those of one policy and disturbance from harmless to bad; those without a disturbance are passed over.
+        rates: In any order, if a disturbance has a level without effect, else its levels from harmless to bad. Those
+            without a disturbance only tell the undisturbed success.
+        share: Share of the undisturbed success rate that is asked for.
     """
     lines: dict[tuple[object, ...], list[SuccessRate]] = {}
+    undisturbed: dict[tuple[object, ...], float] = {}
     for rate in rates:
+        where = (rate.label, rate.scenario, rate.num_robots, rate.model, rate.control_noise_std)
+        if rate.undisturbed:
+            undisturbed[where] = rate.rate
         if rate.disturbance:
-            key = (rate.label, rate.scenario, rate.num_robots, rate.model, rate.control_noise_std, rate.disturbance)
-            lines.setdefault(key, []).append(rate)
-    return [_tolerance(line) for line in lines.values()]
+            lines.setdefault((*where, rate.disturbance), []).append(rate)
+    return [_tolerance(_from_harmless(line), undisturbed.get(where[:-1]), share) for where, line in lines.items()]
 
 
-def _tolerance(line: Sequence[SuccessRate]) -> Tolerance:
-    threshold = THRESHOLD * line[0].rate
-    failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
-    first = line[0]
+def _from_harmless(line: Sequence[SuccessRate]) -> Sequence[SuccessRate]:
+    """Rates by distance from the level without effect; as they are, where there is none."""
+    harmless = next((rate.level for rate in line if rate.undisturbed), None)
+    if harmless is None:
+        return line
+    # A range without limit is infinitely far from all others.
+    zero = harmless if isfinite(harmless) else 0.0
+    return sorted(line, key=lambda rate: abs((rate.level or 0.0) - zero), reverse=zero != harmless)
+
+
+def _tolerance(line: Sequence[SuccessRate], undisturbed: float | None, share: float) -> Tolerance:
+    first, threshold = line[0], None if undisturbed is None else share * undisturbed
+    stands = fails = None
+    if threshold:
+        levels = [rate.level for rate in line]
+        failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
+        stands, fails = ([None, *levels][failing], [*levels, None][failing])
     return Tolerance(
         label=first.label,
         scenario=first.scenario,
@@ -195,8 +242,8 @@ def _tolerance(line: Sequence[SuccessRate]) -> Tolerance:
         model=first.model,
         control_noise_std=first.control_noise_std,
         disturbance=first.disturbance,
-        stands=line[failing - 1].level if failing else None,
-        fails=line[failing].level if failing < len(line) else None,
-        undisturbed=first.rate,
+        stands=stands,
+        fails=fails,
+        undisturbed=undisturbed,
         threshold=threshold,
     )

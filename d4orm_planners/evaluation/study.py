@@ -120,7 +120,9 @@ class Study:
         cells = []
         named = False
         scenarios: tuple[Scenario, ...] = _several(self.scenarios)
-        for scenario in dict.fromkeys(scenarios):
+        # Problems are equal whatever they are called.
+        named_apart = {(one.name if isinstance(one, Problem) else None, one): one for one in scenarios}
+        for scenario in named_apart.values():
             if isinstance(scenario, Problem):
                 cells.append((scenario.name, [scenario] * len(seeds)))
             elif is_scenario_file(scenario):
@@ -133,6 +135,7 @@ class Study:
                         make_problem(scenario, size, seed, model=model, **self.scenario_settings) for seed in seeds
                     ]
                     cells.append((f"{problems[0].name} ({said})" if said else problems[0].name, problems))
+        _check_named_apart(cells)
         if not cells:
             raise ValueError("scenarios, num_robots or model is empty; give at least one of each")
         if not named and (said or any(given is not None for given in (*models, *sizes))):
@@ -152,8 +155,9 @@ def _labelled(policies: Policies) -> dict[str, tuple[PolicyLike, dict[str, objec
         label = policy if isinstance(policy, str) else getattr(policy, "__name__", type(policy).__name__)
         if not (isinstance(policy, str) or is_brought(policy)):
             _checked_label(policy)
-        if labelled.setdefault(label, (policy, {}))[0] is not policy and not isinstance(policy, str):
-            raise ValueError(f"two policies are called {label!r}; give a mapping that has a label for each")
+        if label in labelled:
+            raise ValueError(f"two policies are called {label!r}; leave one out, or give a mapping with labels")
+        labelled[label] = (policy, {})
     return labelled
 
 
@@ -182,6 +186,18 @@ def _check_distinct(chosen: Sequence[Configuration]) -> None:
         other = labels.setdefault((choice.policy, choice.config), choice.label)
         if other != choice.label:
             raise ValueError(f"{other!r} and {choice.label!r} are one policy with the same settings; leave one out")
+
+
+def _check_named_apart(cells: Sequence[tuple[str, list[Problem]]]) -> None:
+    """Refuse other problems of one name, team size and model, which tables could not tell apart."""
+    known: dict[tuple[str, int, tuple[str, ...]], list[Problem]] = {}
+    for name, problems in cells:
+        robots, models = problems[0].num_robots, tuple(sorted(set(problems[0].team.models)))
+        if known.setdefault((name, robots, models), problems) != problems:
+            raise ValueError(
+                f"two scenarios are called {name!r} and have {robots} robots, {'+'.join(models)}; give one another "
+                "name, as problem.replace(name='circle of 8 m'), or by name: in its file"
+            )
 
 
 def _load(path: Path) -> Problem:

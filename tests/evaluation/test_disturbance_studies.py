@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from io import BytesIO
+from itertools import combinations
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +22,13 @@ from d4orm_env import mujoco, navigation_v0
 from d4orm_env.disturbances import Delay, Intruder, LimitMismatch, Push, Stall
 from d4orm_planners import evaluate, run_episode
 from d4orm_planners.evaluation.comparison import compare_pairs
+from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map
 from d4orm_planners.evaluation.evaluate import run_shard, run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
-from d4orm_planners.evaluation.robustness import tolerances, write_disturbances
+from d4orm_planners.evaluation.robustness import tolerances, write_disturbances, write_robustness
 from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.evaluation.study import Study, conditions
-from d4orm_planners.evaluation.summary import TrialGroup, success_rates
+from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
 from d4orm_planners.evaluation.tables import markdown
 from d4orm_planners.evaluation.trials import Condition
 
@@ -160,7 +164,8 @@ def test_a_stalled_robot_does_not_spoil_the_trial(tmp_path: Path) -> None:
 
 
 def group(label: str, level: float | None, wins: str, disturbance: str = "delay", **changes: Any) -> TrialGroup:
-    """A group with a trial for every character, ``+`` for a success."""
+    """A group with a trial for every character, ``+`` for a success; without effect at level 0."""
+    changes.setdefault("disturbances", '[["delay", {}]]' if level else "[]")
     rows = [trial(seed, label=label, success=mark == "+", **changes) for seed, mark in enumerate(wins)]
     return TrialGroup(label, rows, disturbance, level)
 
@@ -173,8 +178,34 @@ def test_the_level_at_which_success_falls_below_90_percent_of_the_undisturbed() 
          group("d", 0, "-" * 10), group("d", 1, "-" * 10), group("e", 0, bad), group("e", 1, "+" * 7 + "-" * 3)]
     )  # fmt: skip
     assert [(one.label, one.stands, one.fails, one.text) for one in tolerances(rates)] == [
-        ("a", 1, 2, "2"), ("b", 1, None, "over 1"), ("c", 1, None, "over 1"), ("d", 1, None, "-"), ("e", 0, 1, "1")
+        ("a", 1, 2, "2"), ("b", 1, None, "over 1"), ("c", 1, None, "over 1"), ("d", None, None, "-"), ("e", 0, 1, "1")
     ]  # fmt: skip
+
+
+def test_the_undisturbed_success_is_that_without_effect_in_any_order() -> None:
+    good, bad = "+" * 10, "+" * 8 + "--"
+    groups = [group("a", 2, bad), group("a", 1, good), group("a", 0, good), group("a", 3, good, "push.speed"),
+              group("a", 5, bad, "push.speed")]  # fmt: skip
+    for order in (groups, groups[::-1]):
+        found = {one.disturbance: one for one in tolerances(success_rates(order))}
+        assert (found["delay"].text, found["delay"].stands, found["delay"].undisturbed) == ("2", 1, 1.0)
+        assert found["push.speed"].undisturbed == 1.0
+    ranges = [group("a", level, wins, "occlusion.range", disturbances="[]" if level == inf else "[[1]]")
+              for level, wins in ((1.0, bad), (2.0, good), (inf, good))]  # fmt: skip
+    assert [(one.stands, one.fails) for one in tolerances(success_rates(ranges))] == [(2.0, 1.0)]
+
+
+def test_without_a_level_without_effect_no_tolerance_is_named(tmp_path: Path) -> None:
+    groups = [group("a", level, "+++", control_noise_std=0.0) for level in (1, 2)]
+    (one,) = tolerances(success_rates(groups))
+    assert (one.undisturbed, one.threshold, one.stands, one.fails, one.text) == (None, None, None, None, "-")
+    write_disturbances(tmp_path, groups)
+    text = (tmp_path / "disturbances.md").read_text()
+    assert "| undisturbed success | not run |" in text
+    assert "give one a level without effect" in text
+    with (tmp_path / "tolerance.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["undisturbed"] == row["threshold"] == row["stands"] == row["fails"] == ""
 
 
 def test_pairs_are_compared_by_seed() -> None:
@@ -210,7 +241,8 @@ def test_the_files_of_a_study(tmp_path: Path) -> None:
             ("a", "delay", "1"), ("a", "push.speed", "1")
         ]  # fmt: skip
     text = (tmp_path / "disturbances.md").read_text()
-    assert "| undisturbed success | 100% | 100% |" in text
+    assert "| success with noise 0.1 alone | 100% | 100% |" in text
+    assert "- `disturbances`, `disturbance_map`: circle, 2 robots, holonomic2d, noise 0.1" in text
     assert "| speed of pushes \\[m/s\\] | 1 | 1 |" in text
     assert "| own thing | 1 | 1 |" in text
     # The undisturbed trials have one row for each policy.
@@ -219,6 +251,47 @@ def test_the_files_of_a_study(tmp_path: Path) -> None:
     again = [replace(trial, scenario="swap") for trial in groups[0].trials]
     names = {path.name for path in write_disturbances(tmp_path, [*groups, groups[0]._replace(trials=again)])}
     assert {"disturbances-1.pdf", "disturbances-2.pdf"} < names
+
+
+@pytest.mark.parametrize("write", [write_disturbances, write_robustness])
+@pytest.mark.parametrize("given", [[], [1, 2], 3, [group("a", 1, "+", "")]], ids=["none", "numbers", "one", "group"])
+def test_what_cannot_be_written_is_refused_before_anything_is(tmp_path: Path, write: Any, given: Any) -> None:
+    with pytest.raises(ValueError, match=r"give the result of|run a study with disturbances"):
+        write(tmp_path, given)
+    assert not list(tmp_path.iterdir())
+
+
+def rates_of(labels: Sequence[str], levels: Mapping[str, Sequence[float]], noise: float = 0.0) -> list[SuccessRate]:
+    return success_rates(
+        group(label, level, "++-", name, control_noise_std=noise)
+        for label in labels for name, steps in levels.items() for level in steps
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("labels", [["d4orm"], ["d4orm", "hybrid", "d4orm-c2f:refine=sync", "orca", "go-to-goal"]])
+@pytest.mark.parametrize("levels", [(0, 2), (0, 1, 2)])
+def test_labels_of_the_map_do_not_overlap_and_fit(labels: list[str], levels: tuple[int, ...]) -> None:
+    figure = draw_map(rates_of(labels, {"delay": levels, "push.speed": levels, "state_noise": levels}))
+    figure.savefig(BytesIO())
+    (ax,) = figure.axes
+    names = [text for text in ax.texts if not text.get_text().isdecimal()]
+    assert [name.get_text() for name in names] == [
+        "undisturbed", "control delay\n[time steps]", "speed of pushes\n[m/s]", "position noise\n[std, m]"
+    ]  # fmt: skip
+    for listed in (names, ax.get_xticklabels()):
+        boxes = [text.get_window_extent() for text in listed]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+        assert all(figure.bbox.containsx(box.x0) and figure.bbox.containsx(box.x1) for box in boxes)
+        assert all(figure.bbox.containsy(box.y0) and figure.bbox.containsy(box.y1) for box in boxes)
+
+
+def test_figures_for_a_paper_have_no_title_and_fit_its_columns() -> None:
+    names = ("delay", "push.speed", "state_noise", "stall")
+    figures = [draw_lines(rates_of(["a", "b"], dict.fromkeys(names[:count], (0, 1)))) for count in range(1, 5)]
+    assert [figure.get_figwidth() for figure in figures] == pytest.approx([3.5, 3.5, 5.37, 7.16])
+    assert not any(figure.get_suptitle() for figure in figures)
+    noisy = draw_map(rates_of(["a"], {"delay": (0, 1)}, noise=0.1))
+    assert "noise 0.1 alone" in [text.get_text() for text in noisy.axes[0].texts]
 
 
 def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:

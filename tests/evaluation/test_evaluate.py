@@ -140,6 +140,22 @@ def test_a_problem_with_two_names_runs_once(tmp_path: Path) -> None:
     assert [row.trials for row in rows] == [2, 2]
 
 
+def test_problems_of_one_name_are_told_apart_or_refused(tmp_path: Path) -> None:
+    near, far = (make_problem("circle", num_robots=1, diameter=diameter) for diameter in (5.0, 8.0))
+    options: dict[str, Any] = {"seeds": [1], "workers": 1, "out": tmp_path / "out"}
+    for scenarios in ([near, far], ["circle", far.replace(dt=0.05), far]):
+        with pytest.raises(ValueError, match=r"two scenarios are called 'circle' and have 1 robots.*replace\(name="):
+            evaluate("go-to-goal", scenarios, num_robots=1 if "circle" in scenarios else None, **options)
+    assert not (tmp_path / "out").exists()
+    evaluate("go-to-goal", far, **options)
+    # Under the name that it has now, though it was stored under another, and the same problem under two names twice.
+    named = [near, far.replace(name="far"), far.replace(name="farther")]
+    rows = evaluate("go-to-goal", named, disturbances={"delay": [0, 1]}, **options)
+    assert [row.scenario for row in rows] == ["circle"] * 2 + ["far"] * 2 + ["farther"] * 2
+    with (tmp_path / "out" / "tolerance.csv").open(newline="") as file:
+        assert [row["scenario"] for row in csv.DictReader(file)] == ["circle", "far", "farther"]
+
+
 def test_the_time_limit_reaches_planners_without_one(tmp_path: Path) -> None:
     policies = {"d4orm": {**QUICK, "improve": True, "max_iterations": 10_000}, "go-to-goal": {}}
     rows = evaluate(policies, out=tmp_path, time_limit=0.05, **TINY)
@@ -554,6 +570,15 @@ def test_bad_input_to_the_leaderboard(d4orm, tmp_path: Path, arguments: tuple[st
     assert not list((tmp_path / "empty").iterdir())
 
 
+def test_a_label_names_a_policy_on_the_command_line(d4orm, tmp_path: Path) -> None:
+    chosen = ("-p", "orca:time_horizon=3,label=Hasty ORCA", "-p", "go-to-goal:label=1")
+    assert d4orm("evaluate", *chosen, "-k", "1", "-n", "1", "-j", "1", "-q")[0] == 0
+    with (tmp_path / "evaluation" / "table.csv").open(newline="") as file:
+        assert [(row["label"], row["policy"]) for row in csv.DictReader(file)] == [
+            ("Hasty ORCA", "orca"), ("1", "go-to-goal")
+        ]  # fmt: skip
+
+
 def test_evaluating_nothing_but_errors_ends_with_status_one(d4orm, tmp_path: Path) -> None:
     arguments = ("-k", "2", "-n", "2", "-j", "1", "-m", "unicycle", "--out", "out")
     status, out, err = d4orm("evaluate", "-p", "ppo", *arguments)
@@ -615,6 +640,8 @@ BAD = [
     (("-n", "9223372036854775808"), "--seeds '9223372036854775808' asks for more than 1000000 seeds"),
     (("-n", "0-1000000"), "--seeds '0-1000000' asks for more than"),
     (("-j", "0"), "workers is 0"),
+    (("-p", "d4orm,d4orm"), "--policy gives 'd4orm' twice; leave one out, or set a label"),
+    (("-p", "orca:time_horizon=3,label=x", "-p", "d4orm:label=x"), "--policy gives 'x' twice"),
     (("--time-limit", "0"), "time_limit is 0"),
     (("--time-limit", "1", "-p", "go-to-goal"), "none of the policies is one"),
     (("--trial-timeout", "-1"), "trial_timeout is -1"),
@@ -642,6 +669,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
     ("changes", "message"),
     [
         ({"policies": []}, "policies is empty"),
+        ({"policies": ["orca", "orca"]}, "two policies are called 'orca'; leave one out"),
         (
             {"policies": {"orca": {}, "same": {"policy": "orca"}}},
             "'orca' and 'same' are one policy with the same settings",
@@ -669,11 +697,12 @@ def test_bad_arguments(tmp_path: Path, changes: dict[str, Any], message: str) ->
 # Ray.
 
 
-def test_without_ray_the_error_says_what_to_install(d4orm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_the_error_says_what_to_install(d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "--ray", "auto")
     assert status == 2
     assert err == "d4orm: running on a cluster needs ray; install it with: pip install 'd4orm-env[distributed]'\n"
+    assert not (tmp_path / "evaluation" / STORE).exists()
 
 
 def test_a_cluster_gives_the_same_rows(tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ def test_stable_baselines3() -> None:
     for observation, action in zip(observed, actions):
         np.testing.assert_allclose(action, model.predict(observation, deterministic=True)[0], rtol=1e-5, atol=1e-6)
     assert from_sb3(model).identity() == from_sb3(model).identity() != from_sb3(other).identity()
+    assert from_sb3(model, deterministic=False).identity() != from_sb3(model).identity()
 
 
 def test_a_module_of_torch() -> None:
@@ -48,6 +49,7 @@ def test_a_module_of_torch() -> None:
     observed, actions, _ = first_actions(from_torch(module))
     wanted = module(torch.as_tensor(observed)).detach().numpy()
     np.testing.assert_allclose(actions, limit_controls(PROBLEM, wanted), rtol=1e-5, atol=1e-6)
+    assert from_torch(module).identity() != from_torch(module, normalized=True).identity()
 
 
 def test_torchrl() -> None:

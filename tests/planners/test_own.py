@@ -291,7 +291,7 @@ def test_policies_without_labels_have_their_own_names(tmp_path: Path) -> None:
     rows = compare([Push, push, Duck(), "go-to-goal"], tmp_path)
     assert [row.label for row in rows] == ["Push", "push", "Duck", "go-to-goal"]
     assert [row.label for row in compare(push_one, tmp_path)] == ["push_one"]
-    with pytest.raises(ValueError, match="two policies are called 'Push'; give a mapping"):
+    with pytest.raises(ValueError, match="two policies are called 'Push'; leave one out, or give a mapping"):
         compare([Push(), Push(2.0)], tmp_path)
     with pytest.raises(ValueError, match=r"policies\['go-to-goal'\] has the name of another policy"):
         compare({"go-to-goal": Push()}, tmp_path)
