@@ -41,6 +41,8 @@ from d4orm_env.dynamics.source_digest import bytecode, pieces
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
 _DIGEST_SIZE = hashlib.sha256().digest_size
+_NAMING = "structs by their fields"
+"""What tells functions in kernels apart by name; those named otherwise must not be loaded beside these."""
 _ROOM = 2**24
 """Bytes that all kernels of the package take, more or less."""
 
@@ -190,7 +192,7 @@ class _SourceKeyedCache(FunctionCache):
     @cached_property
     def _source_key(self) -> str:
         """SHA-256 over all code that the kernel is made of."""
-        content = repr([self._key, *pieces(self._function, bytecode)])
+        content = repr([_NAMING, self._key, *pieces(self._function, bytecode)])
         return hashlib.sha256(content.encode()).hexdigest()
 
     def _index_key(self, sig: Signature, codegen: JITCPUCodegen) -> tuple[object, ...]:
