@@ -2,7 +2,8 @@
 
 A reference is data and a guide, which says what velocity is wanted next: from point to point
 (:func:`straight_kernel`), along a route as others let it pass
-(:mod:`~d4orm_planners.tracking.path_drives`), or by the clock (:mod:`~d4orm_planners.tracking.timed_path`).
+(:mod:`~d4orm_planners.tracking.path_drives`), by the clock (:mod:`~d4orm_planners.tracking.timed_path`), or beside
+positions and velocities in time (:mod:`~d4orm_planners.tracking.reference_drives`).
 """
 
 from __future__ import annotations
