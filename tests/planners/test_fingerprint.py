@@ -117,7 +117,7 @@ PAIRS: tuple[tuple[Any, Any], ...] = (
 ALL = "[np.arange(3), {'a': {'x', 'y', 'z'}}, Gains(1.0), Path('a'), closed_over, Held]"
 
 
-@pytest.mark.parametrize("pair", PAIRS, ids=repr)
+@pytest.mark.parametrize("pair", PAIRS)
 def test_attributes_of_all_kinds_tell_policies_apart(pair: tuple[Any, Any]) -> None:
     for make in HOLDERS:
         first, second = (policy_settings(make(held)) for held in pair)
