@@ -192,9 +192,9 @@ def _move_follower(model: Model) -> Callable[..., int]:
 
 @inlined
 def _add_path(new: Beam, at: Whole, state: Row, velocity: Row, cost: float, bound: float, faults: float) -> None:
-    for axis in range(new.velocities.shape[1]):
+    for axis in range(len(velocity)):
         new.velocities[at, axis] = velocity[axis]
-    for i in range(new.states.shape[1]):
+    for i in range(len(state)):  # a mixed team's rows may be longer
         new.states[at, i] = state[i]
     new.costs[at], new.bounds[at], new.faults[at] = cost, bound, faults
 
