@@ -115,7 +115,7 @@ def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Measureme
     """Seconds of control loops of D4orm-C2F for ten robots, and of :meth:`Plan.sample` at 100 Hz for as many.
 
     The loops run at their own pace, because refining and planning anew go on beside them. Once a second all robots are
-    moved by up to a radius, and those that are far from the coarse plan then are planned for anew.
+    moved by up to one and a half radii, and those that are far from the coarse plan then are planned for anew.
     """
     problem = make_problem("circle", num_robots=CONTROLLED, goal_speed=0.1, horizon=150)
     plan = make_planner().solve(problem, seed=0)
@@ -124,7 +124,7 @@ def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Measureme
     replanned = held = 0
     for seed in range(min(repetitions, 3)):
         timeout = 0.9 * problem.dt
-        with Controller("d4orm-c2f", mode=mode, reserve=0.0, timeout=timeout, replan_distance=1.2) as controller:
+        with Controller("d4orm-c2f", mode=mode, reserve=0.0, timeout=timeout, replan_distance=2.0) as controller:
             steps = _driven(problem, controller, seed)
         seconds += [taken for taken, _ in steps[WARMUP:]]
         held += sum(was_held for _, was_held in steps)
@@ -152,7 +152,7 @@ def _driven(problem: Problem, controller: Controller, seed: int) -> list[tuple[f
         steps.append((time.perf_counter() - begin, setpoint.held))
         states = np.hstack([setpoint.position, setpoint.velocity]).astype(np.float32)
         if len(steps) % round(1 / problem.dt) == 0:
-            reach = problem.team.largest_radius
+            reach = 1.5 * problem.team.largest_radius
             states[:, : problem.dimension] += random.uniform(-reach, reach, problem.goal.shape)
         time.sleep(max(start + now + problem.dt - time.perf_counter(), 0.0))
     return steps
