@@ -22,12 +22,11 @@ from torch import nn
 from torch.distributions import Normal
 
 import d4orm_env  # noqa: F401 - its environments are registered by the import
+from d4orm_planners.rl.features import Features
 
 WORLDS, HORIZON = 256, 32
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.98, 0.95, 0.2, 4, 4
 ENTROPY, VALUE, LEARNING_RATE = 1e-3, 0.5, 1e-3
-REACH = 5.0
-"""Observations are cut off beyond this and taken in its measure: they are in metres, metres per second and seconds."""
 
 
 class Agent(nn.Module):
@@ -75,17 +74,19 @@ class Robots:
             num_robots=num_robots, reward="training", max_cycles=100, autoreset_mode="SameStep", num_instances=512,
         )  # fmt: skip
         observations, infos = self.env.reset(seed=seed)
-        self.limits = torch.as_tensor(self.env.single_action_space.high).reshape(num_robots, -1)[0]
+        self.limits = np.tile(self.env.single_action_space.high, (WORLDS, 1)).reshape(WORLDS * num_robots, -1)
+        # Seen from a robot that faces its goal: with observations as they come teams of four get half as far.
+        self.features = Features.of(self.env.unwrapped.layout, "holonomic2d")
         self.num_robots, self.acting = num_robots, ~infos["arrived"]
         self.seen = self._rows(observations)
 
     def _rows(self, observations: np.ndarray) -> Any:
-        rows = torch.as_tensor(observations).reshape(WORLDS * self.num_robots, -1)
-        return rows.clamp(-REACH, REACH) / REACH
+        rows, self.frames = self.features.encode(observations.reshape(WORLDS * self.num_robots, -1))
+        return torch.as_tensor(rows)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, list[bool]]:
         """Rewards, whether episodes of robots ended and whether they acted ``(rows,)``; how worlds that ended did."""
-        controls = (actions.clamp(-1, 1) * self.limits).reshape(WORLDS, -1).numpy()
+        controls = self.features.decode(actions.numpy(), self.frames, self.limits).reshape(WORLDS, -1)
         observations, _, terminated, truncated, infos = self.env.step(controls)
         acted, ended = self.acting, terminated | truncated
         arrived, successes = infos["arrived"], []
@@ -155,7 +156,7 @@ def main() -> None:
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the layers are too small to be shared
     robots = Robots(arguments.num_robots, seed=0)
-    agent = Agent(robots.seen.shape[1], len(robots.limits))
+    agent = Agent(robots.seen.shape[1], robots.limits.shape[1])
     optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE, eps=1e-5)
     rows, begin, done = [], time.perf_counter(), 0
     for part in np.array_split(np.arange(updates), parts):
