@@ -263,7 +263,7 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
                 raise ValueError(f"{path}, line {reader.line_num}: {row['id']} is at two places at {time:g} s")
     times = np.unique([time for track in people.values() for time in track])
     if len(times) < 2:
-        raise ValueError(f"{path} has rows of {len(times)} times; it takes two at least")
+        raise ValueError(f"{path} has rows at {len(times)} different times; give two at least")
     places = np.full((len(times), len(people), 2), np.nan)
     for number, track in enumerate(people.values()):
         own = np.array(sorted(track))

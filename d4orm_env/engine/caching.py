@@ -42,7 +42,7 @@ P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
 _DIGEST_SIZE = hashlib.sha256().digest_size
 _NAMING = "structs by their fields"
-"""What tells functions in kernels apart by name; those named otherwise must not be loaded beside these."""
+"""Rule by which names in kernels differ; kernels named by another must not be loaded beside these."""
 _ROOM = 2**24
 """Bytes that all kernels of the package take, more or less."""
 

@@ -252,7 +252,6 @@ def _spread(
                 continue
         nodes.done[n] = True
         _pass_on(space, lattice, reach, nodes, n, a, place_of(points, a), _kept(a, own_goal, reach), values[a], heap)
-    anchor[~nodes.done] = NOBODY
     return points[:used].copy(), values[:used].copy(), parents[:used].copy(), own_goal
 
 
@@ -267,4 +266,5 @@ def spread(space: Space, lattice: Lattice, reach: float, goal: Floats) -> Front:
         done=np.zeros(count, np.bool_),
         tried=np.empty(len(lattice.moves), np.int32),
     )
-    return Front(nodes.anchor, *_spread(space, lattice, reach, goal, nodes))
+    found = _spread(space, lattice, reach, goal, nodes)
+    return Front(np.where(nodes.done, nodes.anchor, NOBODY), *found)

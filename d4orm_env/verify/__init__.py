@@ -164,18 +164,12 @@ class _Course:
         size = max(1, MAX_NUMBERS // numbers)
         return (slice(first, min(first + size, horizon)) for first in range(0, horizon, size))
 
-    def _last_moving(self) -> int:
-        """Number of steps until all robots are at rest for good."""
-        motion, headings = self._motion, self._motion.end_headings
-        moving = ((motion.pace > 0) | (motion.bend > 0) | (np.diff(self.ends, axis=0) != 0).any(axis=2)).any(axis=1)
-        moving[1:] |= (np.diff(headings, axis=0) != 0).any(axis=1)
-        return int(np.flatnonzero(moving).max(initial=0)) + 1
-
     def stretches(self, docking: Docking, num_pairs: int) -> Iterator[Stretch]:
         """All steps, up to the first at which all are at rest, with a body for every reading of every robot."""
         horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
         stop = np.minimum(docking.steps, horizon)
-        horizon = min(horizon, int(docking.steps.max()) + 1, self._last_moving() + 1)
+        moving = np.flatnonzero(self._motion.moving).max(initial=-1) + 1
+        horizon = min(horizon, int(docking.steps.max()) + 1, int(moving) + 1)
         docked = self.ends[stop, robot]
         for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
             displacement, place = self._displacement(steps), self.ends[:-1][steps]

@@ -45,6 +45,7 @@ class Integrated:
         sizes: ``(H, R, m)`` limit plus what is cut off of each component.
         pace: ``(H, R)`` speed after each step [m/s].
         bend: ``(H, R)`` acceleration within each step [m/s^2].
+        moving: ``(H, R)`` whether the state changes within the step: at rest when it begins it stays so.
         end_headings: ``(H, R, 1 + trailers)`` headings after each step [rad]; zero for a model without one.
         step_error: ``(H, R)`` what one step of Runge-Kutta per control step is off by [m].
     """
@@ -64,7 +65,7 @@ class Integrated:
         self.sizes: Floats = self.limits + np.moveaxis(np.abs(asked - self._commands), 0, 2)
         states = self._states(start[robots, : model.state_size].T)
         self._begins = states[:, :-1]
-        self._moving: NDArray[np.bool_] = (self._slope(self._begins, self._commands) != 0).any(axis=0)
+        self.moving: NDArray[np.bool_] = (self._slope(self._begins, self._commands) != 0).any(axis=0)
         self._known: tuple[slice, int, list[Floats]] | None = None
         self.end_headings = self._headings(states[:, 1:])
         velocity = self._call(model.functions.velocity, states[:, 1:], self._commands)
@@ -185,7 +186,7 @@ class Integrated:
         known. Who is at rest when a step begins is so until it ends.
         """
         if self._known is None or self._known[:2] != (steps, sub_steps):
-            x, moving = self._begins[:, steps], self._moving[steps]
+            x, moving = self._begins[:, steps], self.moving[steps]
             own, u = x[:, moving], self._commands[:, steps][:, moving]
             limits = tuple(np.broadcast_to(limit, moving.shape)[moving] for limit in self._limits)
             states = [x]

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.verify.geometry import Floats, norm
@@ -126,6 +127,15 @@ class TeamMotion:
             speed = np.clip(speed + self._thrust[step] * dt, -self.max_speed, self.max_speed)
             self.pace[step] = np.where(self.wheeled, np.abs(speed), np.minimum(pace, self.max_speed))
         self._heading = np.cumsum(np.concatenate([heading[None], self._turn_rate * dt]), axis=0)
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """``(H,)`` steps in which any robot moves, even if it ends a step as it began it."""
+        parts = (self._velocity, self._acceleration, self._speed, self._thrust, self._turn_rate)
+        moving: NDArray[np.bool_] = np.any([(part != 0).reshape(len(part), -1).any(axis=1) for part in parts], axis=0)
+        for group in self.groups:
+            moving |= group.moving.any(axis=1)
+        return moving
 
     def displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S+1, K, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""

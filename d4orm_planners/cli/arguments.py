@@ -84,8 +84,9 @@ def policies_by_label(texts: list[str], option: str = "--policy") -> dict[str, d
         if not colon or ("=" not in text and policy not in list_policies()):
             labelled += [(name, {}) for name in names(text) or ()]
             continue
-        if "policy" in (values := parse_settings(text.removeprefix(policy + colon).split(","), option)):
-            raise ValueError(f"{option} {text!r}: 'policy' is no setting; the name stands before the colon")
+        values = parse_settings(text.removeprefix(policy + colon).split(","), option)
+        if reserved := {"policy", "name"} & values.keys():
+            raise ValueError(f"{option} {text!r}: {min(reserved)!r} is no setting; the name stands before the colon")
         labelled.append((str(values.pop("label", text)), {"policy": policy, **values}))
     for label, _ in labelled:
         if [one for one, _ in labelled].count(label) > 1:

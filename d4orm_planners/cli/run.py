@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -82,12 +82,13 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
     def chosen(self) -> tuple[Problem, Policy]:
         """The problem, and what acts in it."""
         if self.plan_file is None:
-            preset = {} if self.preset is None else {"preset": self.preset}
-            named = _made([RECOMMENDED if self.policy is None else self.policy], "--policy", **preset)
+            named = policies_by_label([RECOMMENDED if self.policy is None else self.policy])
             if len(named) > 1:
                 raise ValueError(f"--policy {self.policy!r} names several; give one, or all of them to --compare")
-            (policy,) = named.values()
-            return self.problem(), policy
+            ((label, settings),) = named.items()
+            if self.preset is not None and settings.setdefault("preset", self.preset) != self.preset:
+                raise ValueError(f"--preset {self.preset} and {label!r} name two presets; give one")
+            return self.problem(), _made(label, settings)
         refuse_options(
             self.context,
             {"policy", "preset", "compare", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
@@ -97,10 +98,10 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
         return plan.problem, OpenLoop(plan=plan)
 
 
-def _made(texts: list[str], option: str, **settings: object) -> dict[str, Policy]:
-    """The policies that an option names, by label."""
-    chosen = policies_by_label(texts, option)
-    return {label: make_policy(str(given.pop("policy", label)), **given, **settings) for label, given in chosen.items()}
+def _made(label: str, settings: Mapping[str, object]) -> Policy:
+    """The policy of a label of :func:`policies_by_label`."""
+    own = {name: value for name, value in settings.items() if name != "policy"}
+    return make_policy(str(settings.get("policy", label)), **own)
 
 
 @takes(RunOptions)
@@ -130,7 +131,8 @@ def compare(options: RunOptions, texts: list[str]) -> None:
         raise ValueError("--compare needs --out, the replay to write, as --out compare.html")
     alone = {"policy", "preset", "picture", "animation", "plan_file"}
     refuse_options(options.context, alone, f"does not go with --compare {','.join(texts)}; run that policy alone")
-    problem, makers = options.problem(), _made(texts, "--compare")
+    problem, chosen = options.problem(), policies_by_label(texts, "--compare")
+    makers = {label: _made(label, settings) for label, settings in chosen.items()}
     episodes = {}
     for name, policy in makers.items():
         episodes[name] = options.execute(problem, policy, options.disturbances())

@@ -67,24 +67,23 @@ def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> 
         repetitions: Calls at most, at least one.
         time_limit: No further call begins once the counted ones have taken this long [s].
     """
-    work()
-    seconds: list[float] = []
-    while not seconds or (len(seconds) < repetitions and sum(seconds) < time_limit):
-        begin = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - begin)
-    return Spread.of(seconds)
+    return Spread.of(_repeated((work,), repetitions, time_limit)[0])
 
 
 def in_turn(
     first: Callable[[], object], second: Callable[[], object], repetitions: int, time_limit: float
 ) -> tuple[list[float], list[float]]:
     """Seconds that each of two things takes, done in turn after once that does not count; see :func:`measure`."""
-    first()
-    second()
-    seconds: tuple[list[float], list[float]] = [], []
+    one, other = _repeated((first, second), repetitions, time_limit)
+    return one, other
+
+
+def _repeated(works: Sequence[Callable[[], object]], repetitions: int, time_limit: float) -> list[list[float]]:
+    for work in works:
+        work()
+    seconds: list[list[float]] = [[] for _ in works]
     while not seconds[0] or (len(seconds[0]) < repetitions and sum(map(sum, seconds)) < time_limit):
-        for work, taken in zip((first, second), seconds, strict=True):
+        for work, taken in zip(works, seconds, strict=True):
             begin = time.perf_counter()
             work()
             taken.append(time.perf_counter() - begin)

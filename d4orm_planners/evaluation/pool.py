@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 BEGUN = "begun"
 """Word of a process that it has begun a job; the results follow it."""
 RAY_USE = "running on a cluster"
-"""What Ray is for here, in the error without it."""
+"""Use of Ray here, for the error without it."""
 QUEUED = 2
 """Jobs under way per core of the cluster: one that runs, and one that need not be waited for."""
 ENDING = 0.1

@@ -102,7 +102,7 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
 
 
 def _suffixes(places: Sized) -> list[str]:
-    """What the names of the figures of each scenario, team and level of noise end with."""
+    """Ends of the names of figures, one for each scenario, team and level of noise."""
     return [f"-{number}" for number in range(1, len(places) + 1)] if len(places) > 1 else [""]
 
 

@@ -42,9 +42,7 @@ def _has_traffic(traffic: Traffic, nodes: Nodes, count: int, since: int) -> bool
 
 
 @compiled
-def _meeting(
-    task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int, likely: int
-) -> tuple[int, int]:  # fmt: skip
+def _meeting(task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int, likely: int) -> tuple[int, int]:
     """A step of a move in which another robot is met if it begins then, zero for none, and the soonest departure at
     which that one may be gone; the likely step first.
     """

@@ -159,11 +159,9 @@ def _touches(
 
 
 @compiled
-def met_until(
-    body: RobotBody, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray
-) -> int:  # fmt: skip
-    """Where another robot is too near to this one in a step that ends at a number, between two poses of it: a later
-    step before which it does not go away; zero if there is none.
+def met_until(body: RobotBody, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray) -> int:
+    """Return zero if no other robot is too near to this one in a step that ends at a number, between two poses of it;
+    else a later step, before which that one does not go away.
     """
     begin, end = visits_of(traffic, after[0], after[1])
     for row in range(begin, end):

@@ -1,5 +1,5 @@
-"""What a beam search is asked for, and the paths that it has found so far, compiled with numba: those in the beam, and
-all that ever were.
+"""Queries of a beam search, and the paths that it has found so far, compiled with numba: those in the beam, and all
+that ever were.
 """
 
 from __future__ import annotations

@@ -245,6 +245,8 @@ BAD = [
     (("run", "--policy", "orca", "--preset", "paper"), "'preset' is no setting of policy 'orca'"),
     (("run", "--policy", "orca,d4orm"), "--policy 'orca,d4orm' names several; give one, or all of them to --compare"),
     (("run", "--policy", "d4orm:nope=1"), "'nope' is no setting of planner 'd4orm'"),
+    (("run", "--policy", "d4orm:name=1"), "'name' is no setting; the name stands before the colon"),
+    (("run", "--policy", "d4orm:preset=paper", "--preset", "authors"), "'d4orm:preset=paper' name two presets"),
     (("plan", "--num-robots", "2", "-k", "3"), "--num-robots is given 2 times; give it once"),
     (("export", "whole.npz", "--format", "crazyswarm2", "--rate", "10", "-o", "a"), "--rate 10 would count"),
     (("demo", "--out", "good.yaml"), "good.yaml"),

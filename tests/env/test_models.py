@@ -380,3 +380,15 @@ def test_a_car_cannot_start_with_its_wheels_turned_too_far() -> None:
 def test_a_car_that_turns_too_fast_for_its_time_step_is_refused() -> None:
     with pytest.raises(ValueError, match="use a smaller dt, max_steering or max_speed"):
         Problem(Team(("car",), own_limits={"wheelbase": 0.2}), [[0, 0, 0, 0, 0]], [[2, 0]], dt=1.0)
+
+
+def test_a_robot_that_swings_and_ends_as_it_began_moves() -> None:
+    start = np.zeros((2, 5), np.float32)
+    start[1, :2] = 3.0
+    problem = Problem(Team(("unicycle2", "holonomic2d")), start=start, goal=start[:, :2] + 1, dt=0.5, horizon=8)
+    controls = np.zeros((8, 2, 2))
+    # Its turn rate is -0.25, 0.25, -0.25 and 0 after these steps: from the second on it is turned as far after each.
+    controls[1:5, 0, 1] = -0.5, 1.0, -1.0, 0.5
+    motion = TeamMotion(problem, controls)
+    assert motion.end_headings[1, 0] == pytest.approx(motion.end_headings[2, 0], abs=1e-9)
+    assert motion.moving.tolist() == [False, True, True, True, True, False, False, False]

@@ -119,8 +119,8 @@ def test_pedestrians_are_read_from_a_file(tmp_path: Path) -> None:
         ("id,time,x\na,0,0\n", "has no column y; it needs a header with id, time, x and y"),
         ("id,time,x,y\na,0,0,zero\n", "line 2: time, x and y must be numbers"),
         ("id,time,x,y\na,0,0,0\na,0,1,0\n", "line 3: a is at two places at 0 s"),
-        ("id,time,x,y\na,0,0,0\n", "people.csv has rows of 1 times; it takes two at least"),
-        ("id,time,x,y\n", "people.csv has rows of 0 times; it takes two at least"),
+        ("id,time,x,y\na,0,0,0\n", "people.csv has rows at 1 different times; give two"),
+        ("id,time,x,y\n", "people.csv has rows at 0 different times; give two"),
     ],
 )
 def test_a_bad_file_is_an_error(tmp_path: Path, text: str, message: str) -> None:
