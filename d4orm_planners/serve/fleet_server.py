@@ -21,6 +21,7 @@ from d4orm_planners.serve.wire import (
     TRAJECTORY,
     TWIST,
     RosSession,
+    Subscriber,
     diagnostics,
     full_state,
     heading_of,
@@ -88,9 +89,9 @@ class FleetServer:
     ``/diagnostics``.
 
     Nobody moves before all have been heard, nor while one has been silent for longer than the deadline, nor after an
-    emergency stop until that is taken back. When that is over the controller begins anew from where robots are. So it
-    does for a new goal, after all have braked: each goes on along its arc, slower by the same share as all others, so
-    that who would have passed whom still does, and a command that is lost changes little.
+    emergency stop (passed on as it comes) until it is taken back. When that is over the controller begins anew from
+    where robots are. So it does for a new goal, after all have braked: each goes on along its arc, slower by the same
+    share as all others, so that who would have passed whom still does, and a lost command changes little.
 
     Args:
         session: The network.
@@ -125,8 +126,6 @@ class FleetServer:
         self._odometry = session.subscriber("*/odom", ODOMETRY)
         self._poses = session.subscriber("*/pose", POSE)
         self._goal = session.subscriber("*/goal", POSE)
-        self._e_stop = session.subscriber("e_stop", BOOL)
-        self._inputs = self._odometry, self._poses, self._goal, self._e_stop
         self._commands = [session.publisher(f"{name}/cmd_vel", TWIST) for name in names]
         self._setpoints = [session.publisher(f"{name}/setpoint", TRAJECTORY) for name in names]
         self._diagnostics = session.publisher("diagnostics", DIAGNOSTICS)
@@ -135,6 +134,9 @@ class FleetServer:
         self._setpoint: ControlSetpoint | None = None
         self._pace, self._braking = 1.0, _braking(problem)
         self._emergency = self._replan = False
+        self._commanding = threading.RLock()
+        self._e_stop = session.subscriber("e_stop", BOOL, self._mind)
+        self._inputs = self._odometry, self._poses, self._goal, self._e_stop
         self.state, self._told, self.loops, self.refusal = WAITING, -np.inf, [0.0], ""
 
     def run(self, over: threading.Event) -> None:
@@ -160,12 +162,12 @@ class FleetServer:
             if before != DRIVING:
                 for robot in self._robots:
                     robot.stand = None
-            self._setpoint, self._pace = self._controller.step(self._states(now), now), 1.0
-            self._drive(self._setpoint)
+            self._drive(self._controller.step(self._states(now), now))
             # The horizon is over, and somebody has not arrived.
             self._replan |= self._controller.over and not self._controller.arrived.all()
         elif self.state == BRAKING:
-            self._brake()
+            with self._commanding:
+                self._brake()
         else:
             self._stand()
         if self.state != before or now - self._told >= TELL:
@@ -203,8 +205,16 @@ class FleetServer:
             number = self._by_name.get(topic.partition("/")[0])
             if number is not None:
                 self._take_goal(number, message.pose.position)
-        for _, message in self._e_stop.take():
-            self._emergency = bool(message.data)
+        self._mind(self._e_stop)
+
+    def _mind(self, e_stop: Subscriber) -> None:
+        """Stop everybody as soon as that is asked for, whatever the loop is at; it finds them standing then."""
+        with self._commanding:
+            for _, message in e_stop.take():
+                self._emergency = bool(message.data)
+                if self._emergency:
+                    self._replan, self._pace = True, 0.0
+                    self._stand()
 
     def _hear(self, topic: str, pose: Any, velocity: Floats, now: float) -> None:
         number = self._by_name.get(topic.partition("/")[0])
@@ -232,11 +242,19 @@ class FleetServer:
         return np.stack([robot.state if now - robot.heard <= lost else missing for robot in self._robots])
 
     def _drive(self, setpoint: ControlSetpoint) -> None:
-        reference = zip(setpoint.position, setpoint.velocity, setpoint.acceleration, setpoint.heading)
-        for number, (robot, (position, velocity, acceleration, heading)) in enumerate(zip(self._robots, reference)):
-            self._setpoints[number].publish(full_state(robot.name, position, velocity, acceleration, heading))
-            robot.command = twist(self._problem, number, robot.state, setpoint.control[number], robot.heading)
-            self._commands[number].publish(robot.command)
+        commands = [
+            twist(self._problem, number, robot.state, setpoint.control[number], robot.heading)
+            for number, robot in enumerate(self._robots)
+        ]
+        with self._commanding:
+            if self._emergency:  # it came while these were thought out
+                return
+            self._setpoint, self._pace = setpoint, 1.0
+            points = zip(setpoint.position, setpoint.velocity, setpoint.acceleration, setpoint.heading)
+            for number, (robot, command, point) in enumerate(zip(self._robots, commands, points)):
+                robot.command = command
+                self._commands[number].publish(command)
+                self._setpoints[number].publish(full_state(robot.name, *point))
 
     def _brake(self) -> None:
         """Have everybody go on as it last did, slower by the same share than a period ago."""
@@ -255,12 +273,13 @@ class FleetServer:
     def _stand(self) -> None:
         """Have everybody stand where it was when that began."""
         still, d = np.zeros(self._problem.dimension), self._problem.dimension
-        for robot, command, setpoint in zip(self._robots, self._commands, self._setpoints):
-            command.publish(ros.twist(np.zeros(3)))
-            if robot.stand is None and np.isfinite(robot.state).all():
-                robot.stand = robot.state[:d].astype(np.float64)
-            if robot.stand is not None:
-                setpoint.publish(full_state(robot.name, robot.stand, still, still, robot.heading))
+        with self._commanding:
+            for robot, command, setpoint in zip(self._robots, self._commands, self._setpoints):
+                command.publish(ros.twist(np.zeros(3)))
+                if robot.stand is None and np.isfinite(robot.state).all():
+                    robot.stand = robot.state[:d].astype(np.float64)
+                if robot.stand is not None:
+                    setpoint.publish(full_state(robot.name, robot.stand, still, still, robot.heading))
 
     def _diagnosis(self, now: float) -> Any:
         silent, refused = self._silent(now), sum(topic.refused for topic in self._inputs)

@@ -11,6 +11,8 @@ import math
 import secrets
 import struct
 import time
+from collections import deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,13 +89,16 @@ class RosSession:
         drop = zenoh.CongestionControl.DROP
         return Publisher(self._session.declare_publisher(key, congestion_control=drop, express=True))
 
-    def subscriber(self, topic: str, kind: str) -> Subscriber:
-        """A subscriber to messages of a type; ``*`` in the topic is any one part of a name."""
-        zenoh = load(_zenoh)
+    def subscriber(self, topic: str, kind: str, heard: Callable[[Subscriber], None] | None = None) -> Subscriber:
+        """A subscriber to messages of a type; ``*`` in the topic is any one part of a name.
+
+        ``heard`` is called with it, in a thread of the network's, as soon as there is a message to take.
+        """
         self._declare("MS", topic.replace("*", "robots"), kind)
         # Whatever the hash: ROS 2 Humble has none.
-        key = _key(self._domain, topic, kind).rpartition("/")[0] + "/*"
-        return Subscriber(self._session.declare_subscriber(key, zenoh.handlers.RingChannel(DEPTH)), kind)
+        key, subscriber = _key(self._domain, topic, kind).rpartition("/")[0] + "/*", Subscriber(kind, heard)
+        self._open.append(self._session.declare_subscriber(key, subscriber.hear))
+        return subscriber
 
     def _declare(self, entity: str, topic: str = "", kind: str = "") -> None:
         parts = ["@ros2_lv", str(self._domain), str(self._session.zid()), "0", str(self._tokens), entity]
@@ -125,13 +130,21 @@ class Subscriber:
         refused: Messages that could not be read.
     """
 
-    def __init__(self, subscriber: Any, kind: str) -> None:
-        self._subscriber, self._kind, self.refused = subscriber, kind, 0
+    def __init__(self, kind: str, heard: Callable[[Subscriber], None] | None = None) -> None:
+        self._kind, self._heard, self.refused = kind, heard, 0
+        self._samples: deque[Any] = deque(maxlen=DEPTH)
+
+    def hear(self, sample: Any) -> None:
+        """Keep a message until it is taken."""
+        self._samples.append(sample)
+        if self._heard is not None:
+            self._heard(self)
 
     def take(self) -> list[Received]:
         """Return the messages since the last call, oldest first."""
         received = []
-        while (sample := self._subscriber.try_recv()) is not None:
+        while self._samples:
+            sample = self._samples.popleft()
             try:
                 message = ros.message_types().deserialize_cdr(sample.payload.to_bytes(), self._kind)
             except Exception:  # whatever bytes a stranger sends

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import socket
 import struct
@@ -226,13 +227,20 @@ class Memory:
     def __init__(self) -> None:
         self.sent: dict[str, list[Any]] = {}
         self.inbox: dict[str, list[Any]] = {}
+        self.heard: dict[str, Any] = {}
 
     def publisher(self, topic: str, kind: Any) -> Any:
         return SimpleNamespace(publish=self.sent.setdefault(topic, []).append)
 
-    def subscriber(self, topic: str, kind: Any) -> Any:
+    def subscriber(self, topic: str, kind: Any, heard: Any = None) -> Any:
         inbox = self.inbox.setdefault(topic, [])
-        return SimpleNamespace(refused=0, take=lambda: [inbox.pop(0) for _ in range(len(inbox))])
+        subscriber = SimpleNamespace(refused=0, take=lambda: [inbox.pop(0) for _ in range(len(inbox))])
+        self.heard[topic] = heard and functools.partial(heard, subscriber)
+        return subscriber
+
+    def say(self, topic: str, message: Any) -> None:
+        self.inbox[topic].append((topic, message))
+        self.heard[topic]()
 
 
 def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
@@ -267,6 +275,44 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
     said = [sent.points[0].transforms[0].translation.x for sent in session.sent["robot_1/setpoint"]]
     assert said[begun - 1] < said[begun] < said[begun + 5] < said[begun + 8]
     assert said[-1] == said[begun + 9]
+
+
+def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
+    session, thinking, go_on = Memory(), threading.Event(), threading.Event()
+    with Controller("go-to-goal", mode="measured") as controller:
+        server = FleetServer(session, problem(), controller, ("robot_0", "robot_1"), DEADLINE)  # type: ignore[arg-type]
+        command, period, end = session.sent["robot_0/cmd_vel"], 0, time.monotonic() + 600
+
+        def tick() -> None:
+            nonlocal period
+            period += 1
+            for number, place in enumerate(problem().start[:, :2].astype(float)):
+                session.inbox["*/odom"].append((f"robot_{number}/odom", odometry_of(place)))
+            server.tick(DT * period)
+
+        while not (command and command[-1].linear.x > 0):
+            tick()
+            time.sleep(0.01)  # a thread plans, and kernels may have to be compiled for it
+            assert time.monotonic() < end
+        step = controller.step
+
+        def slow(*arguments: Any) -> Any:
+            thinking.set()
+            go_on.wait()
+            return step(*arguments)
+
+        controller.step = slow  # type: ignore[method-assign]
+        loop = threading.Thread(target=tick)
+        loop.start()
+        thinking.wait()
+        session.say("e_stop", ros.make(BOOL, True))
+        told = len(command)
+        assert command[-1].linear.x == 0
+        go_on.set()
+        loop.join()
+        tick()
+        assert {sent.linear.x for sent in command[told:]} == {0}
+        assert server.state == "stopped"
 
 
 def test_velocities_are_taken_from_poses() -> None:
