@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from d4orm_env.core.registry import Registry
+from d4orm_env.core.registry import Registry, installed
 from d4orm_env.dynamics.models import MODEL_CODES
 
 
@@ -16,12 +16,17 @@ def forgetting(*tables: Registry) -> Iterator[None]:
     before = [dict(each) for each in dictionaries]
     for table in tables:
         table._admitted.clear()
-        vars(table).pop("_entry_points", None)
+    _read_anew(tables)
     try:
         yield
     finally:
         for each, content in zip(dictionaries, before):
             each.clear()
             each.update(content)
-        for table in tables:
-            vars(table).pop("_entry_points", None)
+        _read_anew(tables)
+
+
+def _read_anew(tables: tuple[Registry, ...]) -> None:
+    installed.cache_clear()
+    for table in tables:
+        vars(table).pop("_entry_points", None)

@@ -125,9 +125,15 @@ class Registry(Mapping[str, T]):
     @functools.cached_property
     def _entry_points(self) -> dict[str, list[EntryPoint]]:
         found: dict[str, list[EntryPoint]] = {}
-        for entry in entry_points(group=self.group):
+        for entry in installed().select(group=self.group):
             found.setdefault(entry.name, []).append(entry)
         return found
+
+
+@functools.cache
+def installed() -> Any:
+    """``EntryPoints`` of all packages, read once for all registries, from a file of each package."""
+    return entry_points()
 
 
 def load_reference(text: str) -> object:

@@ -1,31 +1,24 @@
 """Compiled kernels on disk, invalidated by any change of the sources they are made of.
 
-A wheel may bring kernels, compiled for the levels of x86-64 (``make warm-wheel``): they are looked for first. A plan
-has the same bits on every processor, so that a level is all that such a kernel has to know of one.
+Those that a wheel brings are looked for first.
 """
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import importlib.metadata
 import os
-import pickle
 import stat
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from functools import cache, cached_property, partial
-from io import BytesIO
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numba
-from llvmlite.binding import get_host_cpu_features
 from numba.core.caching import (
     CompileResultCacheImpl,
     FunctionCache,
-    IndexDataCacheFile,
     InTreeCacheLocator,
     UserProvidedCacheLocator,
 )
@@ -35,12 +28,11 @@ from numba.core.runtime.nrt import rtsys
 from numba.core.typing.templates import Signature
 from numba.misc.appdirs import AppDirs
 
-from d4orm_env.core.files import replaced_when_done
 from d4orm_env.dynamics.source_digest import bytecode, pieces
+from d4orm_env.engine.kernel_files import KernelFiles, ShippedFiles, shipped_folder
 
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)
-_DIGEST_SIZE = hashlib.sha256().digest_size
 _NAMING = "structs by their fields"
 """Rule by which names in kernels differ; kernels named by another must not be loaded beside these."""
 _ROOM = 2**24
@@ -58,97 +50,6 @@ class Kernel(Protocol[P, R_co]):
     def signatures(self) -> Sequence[tuple[object, ...]]: ...
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
-
-
-class _Files(IndexDataCacheFile):
-    """numba's index and data files, with a digest of the content and of what it depends on behind it.
-
-    What a power cut, a full disk or another version has left counts as missing: it is neither unpickled nor executed.
-    """
-
-    def load(self, key: tuple[object, ...]) -> Any:
-        """Return what is kept under a key, or ``None``."""
-        kept = super().load(key)
-        # Two processes that add to an index at once may have given the same file to different keys.
-        return kept[1] if kept is not None and kept[0] == key else None
-
-    def save(self, key: tuple[object, ...], data: object) -> None:
-        """Keep it."""
-        super().save(key, (key, data))
-
-    def _load_index(self) -> dict[tuple[object, ...], str]:
-        return self._if_whole(self._index_path, super()._load_index) or {}
-
-    def _load_data(self, name: str) -> Any:
-        return self._if_whole(self._data_path(name), partial(super()._load_data, name))
-
-    def _if_whole(self, path: str, load: Callable[[], Any]) -> Any:
-        # ImportError, AttributeError: another version of this package kept types that are gone.
-        with suppress(OSError, ImportError, AttributeError):
-            content = Path(path).read_bytes()
-            if content[-_DIGEST_SIZE:] == self._digest(content[:-_DIGEST_SIZE]):
-                return load()
-        return None
-
-    @contextmanager
-    def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:
-        with BytesIO() as content, replaced_when_done(Path(filepath)) as temporary:
-            yield content
-            # What is behind a pickle is no part of it.
-            temporary.write_bytes(content.getvalue() + self._digest(content.getvalue()))
-
-    def _digest(self, content: bytes) -> bytes:
-        return hashlib.sha256(repr((self._version, self._source_stamp)).encode() + content).digest()
-
-
-LEVELS = {
-    "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
-    "x86-64-v3": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"),
-    "x86-64-v2": ("sse4.2", "popcnt", "ssse3"),
-}
-"""Levels of x86-64, the newest first, and what a processor must have for each beyond the next."""
-SHIPPED = Path(__file__).parents[1] / "kernels"
-"""Folder of a wheel with one of kernels for each level; a checkout has none."""
-_SHIPPED_STAMP = "shipped"
-"""In place of the time of a source file, which is that of the installation."""
-
-
-def levels_here() -> tuple[str, ...]:
-    """The levels that this processor is of, the newest first."""
-    has, levels = get_host_cpu_features(), tuple(LEVELS)
-    missing = [level for level in levels if not all(has.get(feature) for feature in LEVELS[level])]
-    return levels[levels.index(missing[-1]) + 1 :] if missing else levels
-
-
-@cache
-def _shipped_folder() -> Path | None:
-    """The folder of this processor's kernels, if there is one and kernels are not to be compiled for another."""
-    if not SHIPPED.is_dir() or os.environ.get("NUMBA_CPU_NAME"):
-        return None
-    return next((SHIPPED / level for level in levels_here() if (SHIPPED / level).is_dir()), None)
-
-
-@cache
-def _record() -> Mapping[Path, str]:
-    """Digests of the kernels that the wheel's own record lists."""
-    files = importlib.metadata.files("d4orm-env") or []
-    return {
-        Path(str(file.locate())).resolve(): file.hash.value for file in files if file.hash and "kernels" in file.parts
-    }
-
-
-class _ShippedFiles(_Files):
-    """Index and data files of a level. What the wheel's record does not list, as it is, counts as missing."""
-
-    def __init__(self, folder: Path, filename_base: str) -> None:
-        super().__init__(str(folder), filename_base, _SHIPPED_STAMP)
-
-    def _if_whole(self, path: str, load: Callable[[], Any]) -> Any:
-        with suppress(OSError, ImportError, AttributeError):
-            digest = hashlib.sha256(Path(path).read_bytes()).digest()
-            if _record().get(Path(path).resolve()) == base64.urlsafe_b64encode(digest).decode().rstrip("="):
-                return load()
-        return None
 
 
 class _Place(CompileResultCacheImpl):
@@ -187,7 +88,7 @@ class _SourceKeyedCache(FunctionCache):
     def __init__(self, function: Callable[..., object], key: str) -> None:
         super().__init__(function)
         self._function, self._key = function, key
-        self._cache_file = _Files(self.cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
+        self._cache_file: KernelFiles = KernelFiles(self.cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
 
     @cached_property
     def _source_key(self) -> str:
@@ -212,9 +113,9 @@ class _SourceKeyedCache(FunctionCache):
         return self._impl.rebuild(target_context, shipped) if shipped else super()._load_overload(sig, target_context)
 
     @property
-    def _shipped(self) -> _ShippedFiles | None:
-        folder = _shipped_folder()
-        return None if folder is None else _ShippedFiles(folder, self._impl.filename_base)
+    def _shipped(self) -> ShippedFiles | None:
+        folder = shipped_folder()
+        return None if folder is None else ShippedFiles(folder, self._impl.filename_base)
 
     def save_overload(self, sig: Signature, data: CompileResult) -> None:
         """Keep a kernel where there is room for it; elsewhere the next process compiles it anew."""
@@ -224,7 +125,7 @@ class _SourceKeyedCache(FunctionCache):
     def is_kept(self) -> bool:
         """True if anything is kept, for the sources as they are now."""
         return any(
-            key[-1] == self._source_key and files.load(key) is not None
+            key[-1] == self._source_key and files.holds(key)
             for files in (self._shipped, self._cache_file)
             if files is not None
             for key in files._load_index()
@@ -281,16 +182,3 @@ def has_to_be_compiled(kernel: Kernel[..., object]) -> bool:
     """Check whether a kernel of :func:`cached_kernel` could be kept on disk and is not yet, for the present sources."""
     cache = getattr(kernel, "_cache", None)
     return isinstance(cache, _SourceKeyedCache) and not cache.is_kept()
-
-
-def ship(cache: Path, folder: Path) -> None:
-    """Put all kernels that are kept below one folder into that of a wheel, under keys without the processor."""
-    for index in cache.rglob("*.nbi"):
-        with index.open("rb") as file:
-            _, (stamp, _) = pickle.load(file), pickle.load(file)
-        kept, shipped = (
-            _Files(str(place), index.stem, mark) for place, mark in ((index.parent, stamp), (folder, _SHIPPED_STAMP))
-        )
-        for key in kept._load_index():
-            sig, _, source_key = key
-            shipped.save((sig, source_key), kept.load(key))

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 import typer
 
 from d4orm_env import render, scenarios
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.scenarios.problems import is_scenario_file
-from d4orm_planners.base.episode import physics_module
 from d4orm_planners.cli.arguments import check_target, names, parse_settings, refuse_options
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 
 T = TypeVar("T")
+_episode: Any = LazyModule("d4orm_planners.base.episode")
 
 
 Model = Annotated[
@@ -110,7 +111,7 @@ class ObservationOptions:
 
 
 def _imported(physics: str) -> str:
-    physics_module(physics)  # before SciPy, as crazyflow must be
+    _episode.physics_module(physics)  # before SciPy, as crazyflow must be
     return physics
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from numba.core import config
 
-from d4orm_env.engine import caching
+from d4orm_env.engine import kernel_files
 from d4orm_env.engine.caching import has_to_be_compiled
 
 KERNEL = """
@@ -98,9 +98,9 @@ def record_digest(content: bytes) -> str:
 def test_levels_of_a_processor(
     monkeypatch: pytest.MonkeyPatch, missing: tuple[str, ...], levels: tuple[str, ...]
 ) -> None:
-    features = {feature: feature not in missing for level in caching.LEVELS.values() for feature in level}
-    monkeypatch.setattr(caching, "get_host_cpu_features", lambda: features)
-    assert caching.levels_here() == levels
+    features = {feature: feature not in missing for level in kernel_files.LEVELS.values() for feature in level}
+    monkeypatch.setattr(kernel_files, "get_host_cpu_features", lambda: features)
+    assert kernel_files.levels_here() == levels
 
 
 class TestKernelCache:
@@ -224,21 +224,21 @@ class TestKernelCache:
     @pytest.fixture
     def shipped(self, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         """The folder of a wheel that has the kernel, recorded as what it is, with nothing kept elsewhere."""
-        if not caching.levels_here() or "NUMBA_CPU_NAME" in os.environ:
+        if not kernel_files.levels_here() or "NUMBA_CPU_NAME" in os.environ:
             pytest.skip("wheels have kernels for x86-64 only, and none where a processor is named")
         self.hits(path)
         kernels = tmp_path / "kernels"
-        folder = kernels / caching.levels_here()[0]
+        folder = kernels / kernel_files.levels_here()[0]
         folder.mkdir(parents=True)
-        caching.ship(path.parent, folder)
+        kernel_files.ship(path.parent, folder)
         record = {file: record_digest(file.read_bytes()) for file in folder.iterdir()}
-        monkeypatch.setattr(caching, "SHIPPED", kernels)
-        monkeypatch.setattr(caching, "_record", lambda: record)
-        caching._shipped_folder.cache_clear()
+        monkeypatch.setattr(kernel_files, "SHIPPED", kernels)
+        monkeypatch.setattr(kernel_files, "_record", lambda: record)
+        kernel_files.shipped_folder.cache_clear()
         for file in path.parent.glob("__pycache__/*"):
             file.unlink()
         yield folder
-        caching._shipped_folder.cache_clear()
+        kernel_files.shipped_folder.cache_clear()
 
     def test_a_wheels_kernels_are_taken(self, path: Path, shipped: Path) -> None:
         assert not has_to_be_compiled(self.module(path).twice)
@@ -259,8 +259,8 @@ class TestKernelCache:
         assert self.hits(path) == 0
 
     def test_nor_those_of_another_processor(self, path: Path, shipped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(caching, "get_host_cpu_features", dict)
-        caching._shipped_folder.cache_clear()
+        monkeypatch.setattr(kernel_files, "get_host_cpu_features", dict)
+        kernel_files.shipped_folder.cache_clear()
         assert self.hits(path) == 0
 
     def test_without_compiling_nothing_works_and_it_is_said(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,11 +52,8 @@ class Offered:
         points = [
             importlib.metadata.EntryPoint(name.rstrip("_"), target, SCENARIOS.group) for name, target in targets.items()
         ]
-
-        def select(**wanted: str) -> list[importlib.metadata.EntryPoint]:
-            return [point for point in points if all(getattr(point, key) == value for key, value in wanted.items())]
-
-        monkeypatch.setattr("d4orm_env.core.registry.entry_points", select)
+        offered = importlib.metadata.EntryPoints(points)
+        monkeypatch.setattr("d4orm_env.core.registry.installed", lambda: offered)
 
 
 def test_a_callable_gets_seed_team_and_settings_and_gives_its_name() -> None:

@@ -17,7 +17,7 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-from d4orm_env.engine.caching import SHIPPED, levels_here, ship
+from d4orm_env.engine.kernel_files import SHIPPED, levels_here, ship
 
 
 def compile_kernels(package: Path, level: str) -> None:
