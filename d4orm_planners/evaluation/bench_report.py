@@ -1,94 +1,23 @@
-"""Repeated wall-clock measurements, and benchmark results as JSON and as Markdown tables."""
+"""Benchmark results as JSON and as Markdown tables."""
 
 from __future__ import annotations
 
 import json
 import os
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, TypeAlias
-
-import numpy as np
+from typing import Any
 
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.engine.choice import resolve_engine
 from d4orm_planners.base.machine import commit, describe_machine, versions
 from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
+from d4orm_planners.evaluation.measuring import Measurement, Spread
 from d4orm_planners.evaluation.tables import table
-
-Measurement: TypeAlias = dict[str, Any]
-"""Measurement of one case, by column: numbers, texts and :class:`Spread`."""
-
-
-@dataclass(frozen=True)
-class Spread:
-    """A sample of measurements in five numbers, in the unit of what was measured."""
-
-    median: float
-    lower_quartile: float
-    upper_quartile: float
-    smallest: float
-    largest: float
-    count: int
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
-        """The spread of some values.
-
-        Raises:
-            ValueError: If there are none.
-        """
-        if not len(values):
-            raise ValueError("there are no measurements to summarise; measure at least once")
-        smallest, lower, median, upper, largest = (float(v) for v in np.percentile(values, [0, 25, 50, 75, 100]))
-        return cls(median, lower, upper, smallest, largest, len(values))
-
-    def times(self, factor: float) -> Spread:
-        """The same measurements in another unit.
-
-        Raises:
-            ValueError: If the factor is not positive, which would turn the order around.
-        """
-        if not factor > 0:
-            raise ValueError(f"factor is {factor:g}; it must be positive")
-        return replace(self, **{name: value * factor for name, value in vars(self).items() if name != "count"})
-
-
-def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> Spread:
-    """Seconds that ``work`` takes, after one call that does not count.
-
-    Args:
-        work: Function to time.
-        repetitions: Calls at most, at least one.
-        time_limit: No further call begins once the counted ones have taken this long [s].
-    """
-    return Spread.of(_repeated((work,), repetitions, time_limit)[0])
-
-
-def in_turn(
-    first: Callable[[], object], second: Callable[[], object], repetitions: int, time_limit: float
-) -> tuple[list[float], list[float]]:
-    """Seconds that each of two things takes, done in turn after once that does not count; see :func:`measure`."""
-    one, other = _repeated((first, second), repetitions, time_limit)
-    return one, other
-
-
-def _repeated(works: Sequence[Callable[[], object]], repetitions: int, time_limit: float) -> list[list[float]]:
-    for work in works:
-        work()
-    seconds: list[list[float]] = [[] for _ in works]
-    while not seconds[0] or (len(seconds[0]) < repetitions and sum(map(sum, seconds)) < time_limit):
-        for work, taken in zip(works, seconds, strict=True):
-            begin = time.perf_counter()
-            work()
-            taken.append(time.perf_counter() - begin)
-    return seconds
-
 
 jax: Any = LazyModule("jax")
 

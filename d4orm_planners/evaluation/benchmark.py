@@ -19,7 +19,6 @@ from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
-from d4orm_planners.evaluation.bench_report import Measurement, Spread, in_turn, measure
 from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
 from d4orm_planners.evaluation.env_steps import (
     DISTURBANCES,
@@ -32,6 +31,7 @@ from d4orm_planners.evaluation.env_steps import (
     measure_rooms,
     measure_worlds,
 )
+from d4orm_planners.evaluation.measuring import Measurement, Spread, in_turn, measure
 from d4orm_planners.evaluation.probes import (
     BOXES,
     Where,

@@ -14,8 +14,8 @@ from d4orm_env.disturbances import Delay, Dropout, StateNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.evaluation.bench_report import Measurement, Spread, measure
 from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
+from d4orm_planners.evaluation.measuring import Measurement, Spread, measure
 from d4orm_planners.evaluation.probes import boxed_problem
 
 if TYPE_CHECKING:

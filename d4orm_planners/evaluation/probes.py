@@ -23,7 +23,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
 from d4orm_planners.base.planner_registry import make_planner, make_policy
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
-from d4orm_planners.evaluation.bench_report import Measurement, Spread, in_turn, measure
+from d4orm_planners.evaluation.measuring import Measurement, Spread, in_turn, measure
 
 _FIRST_PLAN = """
 import json, sys, time

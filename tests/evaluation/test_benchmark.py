@@ -17,10 +17,10 @@ from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN, get_mod
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.machine import commit, describe_machine
 from d4orm_planners.cli import app as cli
-from d4orm_planners.evaluation import bench_report
-from d4orm_planners.evaluation.bench_report import Spread, measure
+from d4orm_planners.evaluation import bench_report, measuring
 from d4orm_planners.evaluation.benchmark import parts, run_parts, thread_counts
 from d4orm_planners.evaluation.benchmark_settings import MODELS, QUICK, SECTIONS, BenchmarkSettings
+from d4orm_planners.evaluation.measuring import Spread, measure
 from d4orm_planners.evaluation.probes import measure_startup
 
 sys.path.append(str(Path(__file__).parents[1] / "release"))
@@ -89,7 +89,7 @@ def test_measure_leaves_the_first_call_out_and_stops(
 ) -> None:
     clock = [0.0]
     calls = iter([100.0, *ticks])
-    monkeypatch.setattr(bench_report.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(measuring.time, "perf_counter", lambda: clock[0])
 
     def work() -> None:
         clock[0] += next(calls)
