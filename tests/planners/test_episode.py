@@ -16,6 +16,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Episode, OpenLoop, make_policy, run_episode
+from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 
@@ -195,6 +196,12 @@ def test_a_bad_seed_is_refused(seed: Any) -> None:
     env = navigation_v0.parallel_env(problem=make_problem("circle", num_robots=2))
     with pytest.raises(ValueError, match="seed"):
         run_episode(env, make_policy("go-to-goal"), seed=seed)
+
+
+def test_a_range_without_rays_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"ray_range is 3\.0, and robots have no rays; give observed_rays too"):
+        open_env(hop_problem(), ray_range=3.0)
+    assert open_env(hop_problem(), ray_range=3.0, observed_rays=4).unwrapped.options.ray_range == 3.0
 
 
 @pytest.mark.parametrize("cycles", [None, 20])
