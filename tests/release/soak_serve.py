@@ -61,12 +61,12 @@ def new_goals(fleet: Fleet, goals: np.ndarray, rng: np.random.Generator) -> int:
 def soak(minutes: float, server: int) -> dict[str, object]:
     fleet, rng = Fleet(ENDPOINT, START, loss=0.1, watchdog=WATCHDOG), np.random.default_rng(0)
     fleet.heading = np.zeros(NUM_ROBOTS)
-    goals, gap, given, stops, memory = START.copy(), math.inf, 0, [], []
+    goals, gap, given, stops, memory = START.copy(), (math.inf, ""), 0, [], []
     try:
         until(lambda: fleet.diagnosis[-1] == "driving", 300)
         begin = stopped = time.monotonic()
         while time.monotonic() - begin < 60 * minutes:
-            gap = min(gap, least_gap(fleet.position))
+            gap = min(gap, (least_gap(fleet.position), fleet.diagnosis[-1]))
             given += new_goals(fleet, goals, rng) if fleet.diagnosis[-1] == "driving" else 0
             if time.monotonic() - stopped > 60 and (fleet.velocity != 0).any():
                 fleet.e_stop(True)
@@ -80,7 +80,7 @@ def soak(minutes: float, server: int) -> dict[str, object]:
     finally:
         fleet.close()
     return {
-        "minutes": minutes, "goals": given, "least gap [m]": gap,
+        "minutes": minutes, "goals": given, "least gap [m], while": gap,
         "stops": len(stops), "stop [s]: median, longest": [float(np.median(stops)), max(stops)] if stops else None,
         "memory [MB]": memory,
     }  # fmt: skip
