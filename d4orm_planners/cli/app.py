@@ -13,12 +13,14 @@ import sys
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from d4orm_env.scenarios.settings import Settings
 from d4orm_planners.base.display import one_line
 from d4orm_planners.cli import on_signals
 
@@ -179,8 +181,12 @@ def _message(error: Exception) -> str:
     return str(error)
 
 
-def _given(error: BaseException) -> str:
-    """What was given, which Typer leaves out where a type does not fit."""
+def _given(error: Any) -> str:
+    """What was given, which Typer leaves out where a type does not fit, and how arguments of scenarios are given."""
+    name = getattr(error, "option_name", "").lstrip("-").replace("-", "_")
+    known = {option for parameter in error.ctx.command.params for option in parameter.opts} if name else ()
+    if "--scenario-set" in known and name in (field.name for field in fields(Settings)):
+        return f"; arguments of scenarios go by --scenario-set {name}=..."
     errors = getattr(error.__cause__, "errors", None)
     return f", not {errors()[0]['input']!r}" if errors is not None else ""
 

@@ -228,6 +228,7 @@ BAD = [
     (("plan", "--scenario", f"{'x' * 9999}.yaml"), "File name too long"),
     (("plan", "--picture", "plan.bmp"), "must end in .png"),
     (("plan", "--no-such-option",), "--no-such-option"),
+    (("plan", "--height", "1"), "arguments of scenarios go by --scenario-set height=..."),
     (("run", "truncated.npz"), "truncated.npz is not a readable plan"),
     (("run", "absent.npz"), "absent.npz"),
     *(
