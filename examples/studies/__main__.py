@@ -28,15 +28,18 @@ SHARED = ("comparisons",)
 """Modules that are no studies."""
 NAMES = tuple(sorted({*COMPARISONS, "paper", *(path.stem for path in FOLDER.glob("[a-z]*.py"))} - {*SHARED}))
 WITH_TRIALS = (
-    "ablation", "amswarm_gaps", "arrivals", "contact_penalty", "credit_by_update", "disturbance_study", "dynobench",
-    "fewer_samples", "gradient_dilution", "head_to_head", "imitate_expert", "independent_noise", "jerk_limits",
-    "lifelong", "multimodality", "paper_differences", "policy_rates", "scaling", "solve_rates", "tune_learners",
-    "tuned_rivals", "warm_start", "zero_shot",
+    "ablation", "against_mmd", "amswarm_gaps", "arrivals", "authors_code", "contact_penalty", "credit_by_update",
+    "disturbance_study", "dynobench", "fewer_samples", "gradient_dilution", "head_to_head", "imitate_expert",
+    "independent_noise", "jerk_limits", "lifelong", "multimodality", "paper_differences", "policy_rates", "scaling",
+    "solve_rates", "tune_learners", "tuned_rivals", "warm_start", "zero_shot",
 )  # fmt: skip
 """Studies whose trials are in a file of their name."""
 TIMED = ("big-teams", "coarseness", "ipopt")
 """Figures of the paper that were measured on a machine that did nothing else."""
 FIGURES = ("amswarm", "nodes", "noise-schedule", "robustness", "selections", "team-size", *TIMED)
+
+PRESETS = {"algorithm_4": ("big-teams", "coarseness"), "ipopt_preset": ("ipopt",)}
+"""Further trials of these, on a machine that did other work: of the paper's presets, few."""
 
 
 def run(name: str, *arguments: object) -> None:
@@ -60,9 +63,9 @@ def make_all() -> None:
     for figure in FIGURES:
         times = () if figure in TIMED else ("--no-times",)
         run("paper", figure, "--trials", DATA / f"{figure}.parquet", *times, "--out", out)
-    older = ("--trials", DATA / "algorithm_4.parquet", "--no-times", "--out", out / "algorithm_4")
-    for figure in ("big-teams", "coarseness"):
-        run("paper", figure, *older)
+    for name, figures in PRESETS.items():
+        for figure in figures:
+            run("paper", figure, "--trials", DATA / f"{name}.parquet", "--no-times", "--out", out / name)
     d4orm(["leaderboard", str(DATA / "leaderboard.parquet"), "--out", str(out / "leaderboard.md")])
 
 

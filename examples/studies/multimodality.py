@@ -12,17 +12,20 @@ robot goes round.
 
 With ``--team`` a whole team changes places on a circle, the appendix's harder problem: robots meet pairwise, and pass
 each other on one side or the other. A plan's class is the sign of the angle that each robot sweeps around each other
-one, 28 signs with eight robots. The table has how many seeds were solved, how many classes the solutions are of, how
-many pairs of solutions are of the same class, and how far apart two solutions are (root mean square distance of the
-robots' places over time, mean over all pairs). The plot has all solutions along the directions in which they differ
-most.
+one, 28 signs with eight robots. The table has how many seeds were solved, how many classes the solutions are of, and
+ten of them drawn at random, which does not grow with the seeds (rarefaction); how many pairs of solutions are of the
+same class, and how far apart two are (root mean square distance of the robots' places over time, mean over all pairs).
+Slow plans differ more, so the last two rows have plans of equal travel times only. The plot has all solutions along the
+directions in which they differ most.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import combinations
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -41,6 +44,9 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "d4orm, preset paper": ("d4orm", {"preset": "paper"}),
     "ipopt": ("ipopt", {}),
 }
+
+COMPARED, DRAWN = ("d4orm, preset paper", "ipopt"), 10
+"""Planners that the paper compares, and how many plans are drawn of each."""
 
 CLASSES: dict[Signature, tuple[str, str]] = {
     (-1, -1, -1): ("1 over O over 0", "#0072B2"),
@@ -176,9 +182,14 @@ def team_signature(positions: np.ndarray) -> tuple[bool, ...]:
     return tuple(winding(positions[:, second] - positions[:, first]) > 0 for first, second in pairs)
 
 
-def row_of(label: str, rows: Sequence[Row]) -> dict[str, Any]:
-    """The table's row of a planner."""
-    plans = solutions(rows, label)
+def rarefied(classes: Sequence[object], size: int) -> float:
+    """Expected number of classes among so many plans, drawn of those whose classes are given (Hurlbert, 1971)."""
+    total = comb(len(classes), size)
+    return sum(1 - comb(len(classes) - number, size) / total for number in Counter(classes).values())
+
+
+def row_of(label: str, plans: Sequence[Row], trials: int) -> dict[str, Any]:
+    """The table's row of a planner's solutions."""
     paths = [path_of(plan) for plan in plans]
     classes, pairs = [team_signature(path) for path in paths], list(combinations(range(len(plans)), 2))
     same = sum(classes[one] == classes[other] for one, other in pairs)
@@ -186,12 +197,25 @@ def row_of(label: str, rows: Sequence[Row]) -> dict[str, Any]:
     times = [plan["travel_time"] for plan in plans]
     return {
         "planner": label,
-        "solved": f"{len(plans)} of {sum(row['planner'] == label for row in rows)}",
+        "solved": f"{len(plans)} of {trials}",
         "classes": len(set(classes)),
+        f"classes of {DRAWN} plans": f"{rarefied(classes, DRAWN):.2f}" if len(plans) >= DRAWN else "-",
         "pairs of one class": f"{same / len(pairs):.0%}" if pairs else "-",
         "distance [m]": f"{np.mean(apart):.2f}" if pairs else "-",
         "travel time [s]": f"{np.mean(times):.2f}" if times else "-",
     }
+
+
+def team_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """A row per planner; and of the paper's two once more with the plans of travel times that both have."""
+    found = {label: solutions(rows, label) for label in PLANNERS}
+    table = [row_of(label, plans, sum(row["planner"] == label for row in rows)) for label, plans in found.items()]
+    times = [[plan["travel_time"] for plan in found[label]] for label in COMPARED if found[label]]
+    first, last = max(map(min, times), default=1.0), min(map(max, times), default=0.0)
+    for label in COMPARED:
+        if alike := [plan for plan in found[label] if first <= plan["travel_time"] <= last]:
+            table.append(row_of(f"{label}, {first:.2f} to {last:.2f} s", alike, len(found[label])))
+    return table
 
 
 def draw_components(axes: Any, groups: Sequence[Sequence[np.ndarray]], styles: Sequence[dict[str, Any]]) -> list[Any]:
@@ -229,7 +253,7 @@ def main() -> None:
         problem = make_problem("paper_circle", num_robots=num_robots)
         plans = partial(solve, problem, seeds, max_iterations=20, time_limit=120)
         rows = study_rows(arguments, "multimodality_team", plans)
-        save_table([row_of(label, rows) for label in PLANNERS], arguments.out / "multimodality_team.csv")
+        save_table(team_table(rows), arguments.out / "multimodality_team.csv")
         draw_teams(rows, arguments.out)
         return
     seeds = min(arguments.seeds, 8) if arguments.quick else arguments.seeds

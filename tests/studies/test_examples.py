@@ -12,6 +12,7 @@ import sys
 import warnings
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
+from itertools import combinations
 from pathlib import Path
 from types import ModuleType
 
@@ -277,6 +278,94 @@ def test_jerk_is_smaller_where_it_is_limited(tmp_path: Path) -> None:
     assert limited <= 16 < free
 
 
+def test_smoothness_and_seconds_are_set_beside_mmd(tmp_path: Path) -> None:
+    completed("against_mmd", tmp_path / "out")
+    rows = {row["planner"]: row for row in table(tmp_path / "out" / "against_mmd.csv")}
+    assert [row["solved"] for row in rows.values()] == ["1 of 1"] * 3
+    # MMD's motions are sums of sines.
+    jerk = {label: float(row["jerk [m²/s⁶]"]) for label, row in rows.items()}
+    assert jerk["d4orm"] > 10 * max(jerk["mmd"], jerk["mmd, ours"])
+
+
+STUB = """
+from dataclasses import dataclass
+import numpy as np
+from d4orm_env import make_problem
+from d4orm_planners import make_planner
+
+class Envs:
+    @staticmethod
+    def get_env(name, robots):
+        from types import SimpleNamespace
+        angle = np.linspace(0, 2 * np.pi, robots, endpoint=False)
+        start = 2.5 * np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], axis=-1)
+        return SimpleNamespace(x0=start.ravel(), xg=SHIFT - start.ravel())
+
+class d4orm:
+    envs = Envs
+
+@dataclass
+class Args:
+    seed: int
+    Nagent: int
+    Hsample: int
+    Nsample: int
+    Niteration: int
+
+def make_reverse_once_naive(*, sigmas):
+    return sigmas
+
+def plan_joint_naive(args, sigma, warm_up=False):
+    assert not warm_up
+    # By 0.25 both drive straight, into each other; by its root they do not.
+    if sigma == 0.25:
+        controls = np.tile([-2.0, 0.0, 2.0, 0.0], (args.Hsample, 1))
+    else:
+        problem = make_problem("paper_circle", num_robots=args.Nagent)
+        controls = make_planner("d4orm").solve(problem, seed=args.seed).controls.reshape(args.Hsample, -1)
+    return controls, None, None, [0.5], True, 1
+
+def run_diffusion(args):
+    print("noise of the program")
+    sigma = make_reverse_once_naive(sigmas=0.25)
+    plan_joint_naive(args, sigma, warm_up=True)
+    plan_joint_naive(args, sigma)
+"""
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_the_authors_code_runs_from_a_checkout(tmp_path: Path, shift: float) -> None:
+    package = tmp_path / "checkout" / "d4orm"
+    (package / "planners").mkdir(parents=True)
+    for folder in (package, package / "planners"):
+        (folder / "__init__.py").write_text("")
+    (package / "planners" / "multi_planner.py").write_text(STUB.replace("SHIFT", str(shift)))
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("d4orm", "d4orm.planners", "d4orm.planners.multi_planner"):
+            patch.setitem(sys.modules, name, None)
+            del sys.modules[name]
+        if shift:
+            with pytest.raises(ValueError, match="is not 'paper_circle'"):
+                run("authors_code", out, "--checkout", package.parent)
+            return
+        completed("authors_code", out, "--checkout", str(package.parent))
+    rows = {row["planner"]: row for row in table(out / "authors_code.csv")}
+    assert list(rows) == ["their code", "their code, the paper's deviations", "d4orm, authors", "d4orm, paper"]
+    # The stub's word is that it solved; what the controls do says otherwise where robots do not give way.
+    assert {label: (row["solved"], row["verified"]) for label, row in rows.items()} == {
+        "their code": ("1 of 1", "0 of 1"), "their code, the paper's deviations": ("1 of 1", "1 of 1"),
+        "d4orm, authors": ("1 of 1", "1 of 1"), "d4orm, paper": ("1 of 1", "1 of 1"),
+    }  # fmt: skip
+    completed("authors_code", tmp_path / "again", "--trials", str(out / "authors_code.parquet"))
+    assert table(tmp_path / "again" / "authors_code.csv") == list(rows.values())
+
+
+def test_the_authors_code_needs_a_checkout(tmp_path: Path) -> None:
+    assert "give a clone of proroklab/d4orm" in run("authors_code", tmp_path, "--checkout", tmp_path).stderr
+    assert "give --checkout" in run("authors_code", tmp_path).stderr
+
+
 def test_contacts_are_charged_by_every_credit(tmp_path: Path) -> None:
     out = tmp_path / "out"
     completed("contact_penalty", out)
@@ -498,7 +587,9 @@ def test_planners_find_several_kinds_of_solution_for_a_team(tmp_path: Path) -> N
     out = tmp_path / "out"
     completed("multimodality", out, "--team", "8")
     rows = {row["planner"]: row for row in table(out / "multimodality_team.csv")}
-    assert list(rows) == ["d4orm", "d4orm, preset paper", "ipopt"]
+    planners, alike = list(rows)[:3], list(rows)[3:]
+    assert planners == ["d4orm", "d4orm, preset paper", "ipopt"]
+    assert {label.rsplit(", ", 1)[0] for label in alike} in (set(), set(planners[1:])), "both, or none"
     assert rows["d4orm"]["solved"] == "4 of 4", "every seed solves so easy a problem"
     assert all(1 <= int(row["classes"]) <= int(row["solved"].split()[0]) for row in rows.values())
     assert (out / "multimodality_team.png").read_bytes().startswith(PNG)
@@ -670,6 +761,13 @@ def test_robots_that_weave_have_one_of_the_two_other_signatures(multimodality: M
     first = np.array([(3, 0), (2.5, 0), (2, 0), (2, 0), (2, 0), (1, -1), (-1, -1), (-3, 0)], float)
     assert multimodality.signature(np.stack([first, second], axis=1)) == (-1, -1, 1)
     assert multimodality.CLASSES[-1, -1, 1][0] == "0 over 1 over O over 0"
+
+
+def test_classes_among_drawn_plans_are_those_of_all_draws(multimodality: ModuleType) -> None:
+    classes = ["a", "a", "a", "b", "c"]
+    draws = [len(set(drawn)) for drawn in combinations(classes, 3)]
+    assert multimodality.rarefied(classes, 3) == pytest.approx(np.mean(draws))
+    assert multimodality.rarefied(classes, 5) == 3
 
 
 def test_principal_components_are_distances_of_plans(multimodality: ModuleType) -> None:

@@ -44,6 +44,7 @@ def main(given: Sequence[str] | None = None) -> int:
     parser.add_argument("--section", "-s", action="append", default=[], help="only this panel; repeatable")
     parser.add_argument("--policy", "-p", action="append", default=[], help="only the policy of this label; repeatable")
     parser.add_argument("--no-times", action="store_true", help="leave seconds out, of a machine that did other work")
+    parser.add_argument("--time-limit", type=float, help="seconds of a planner, in place of a panel's own limit")
     arguments = parser.parse_args(given)
     if arguments.figure is None:
         for figure in FIGURES.values():
@@ -51,6 +52,8 @@ def main(given: Sequence[str] | None = None) -> int:
         return 0
     try:
         chosen = FIGURES[arguments.figure].only(arguments.section, arguments.policy)
+        if arguments.time_limit is not None:
+            chosen = chosen.limited(arguments.time_limit)
         measure(chosen.without_times() if arguments.no_times else chosen, arguments)
     except (ValueError, OSError, ImportError) as error:
         parser.exit(2, f"{error}\n")

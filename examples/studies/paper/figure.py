@@ -123,6 +123,12 @@ class Figure:
         remarks = ("Quick version: tiny teams and few samples, whose numbers say nothing.", *self.remarks)
         return replace(self, sections=tuple(section.quick() for section in self.sections), seeds=1, remarks=remarks)
 
+    def limited(self, seconds: float) -> Figure:
+        """The figure with another limit where planners have one."""
+        sections = (section if section.time_limit is None else replace(section, time_limit=seconds)
+                    for section in self.sections)  # fmt: skip
+        return replace(self, sections=tuple(sections))
+
     def without_times(self) -> Figure:
         """The version that says nothing of seconds, for trials of a machine that did other work too."""
         dropped = TIMES if self.compared_by == "first_steps" else TIMES | EFFORTS
