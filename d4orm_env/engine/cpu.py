@@ -31,6 +31,7 @@ from d4orm_env.engine.tiles import STRIDE, allocate_boxes, pose_rows
 from d4orm_env.engine.types import ObservationInputs, StepResult, WorldBatch, checked_controls
 from d4orm_env.engine.world_tiles import WorldArrays
 
+
 class WorldKernels(NamedTuple):
     """The kernels that step and observe teams of some models."""
 
