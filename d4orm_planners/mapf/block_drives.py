@@ -40,7 +40,7 @@ _TOUCH = 100.0
 BlockDriver: TypeAlias = Callable[[ProblemArrays, Whole, Moves, Beam, Whole, Whole, Whole, FloatArray], None]
 """``(arrays, robot, moves, beam, first, count, steps, lanes)`` drives the robot for so many steps along ``count`` of
 the paths that go on from those in the beam by its moves, from number ``first`` on, which is in the first lane."""
-PathReader: TypeAlias = Callable[[ProblemArrays, Whole, Whole, Whole, Whole, FloatArray], tuple[Row, Row, bool, float]]
+PathReader: TypeAlias = Callable[[ProblemArrays, Whole, Whole, Whole, FloatArray], tuple[Row, Row, bool, float]]
 """``(arrays, robot, lane, first, lanes)`` gives state, velocity, arrival and cost [s] of a path whose block began at
 step ``first``."""
 
