@@ -19,13 +19,14 @@ from d4orm_env.engine.tiles import (
     DOCKED,
     STRIDE,
     RobotMover,
+    allocate_boxes,
     measure_goal_distance,
     motion_reader,
     pose_rows,
     robot_mover,
 )
 from d4orm_env.engine.types import MOVED, RESET, SKIP, STEP, WorldBatch
-from d4orm_env.engine.world_tiles import allocate_boxes, check_contacts, load, load_world, store_world
+from d4orm_env.engine.world_tiles import check_contacts, load, load_world, store_world
 
 
 @compiled

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, IntArray, Whole
 from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
@@ -143,28 +143,62 @@ def place_team(f: FootprintArrays | None, num_robots: int, w: FloatArray) -> Non
             place_bodies(f, k, w[k * STRIDE + STATE * TILE : (k + 1) * STRIDE], w, POSE * TILE, num_robots * STRIDE)
 
 
+class TeamBoxes(NamedTuple):
+    """Boxes round the places of a team's robots in a tile, for all pairs but those near to each other to be left out.
+
+    Attributes:
+        corners: ``(K, 2, d)`` float32 lowest and highest places [m]; ``(0, 2, d)`` for a team that is not big.
+        order: ``(K,)`` int64 numbers of the robots, of a big team by where its boxes begin along the first axis.
+    """
+
+    corners: FloatArray
+    order: IntArray
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def allocate_boxes(arrays: ProblemArrays) -> TeamBoxes:
+    """Make room for the boxes of a team; see :func:`enclose_team`."""
+    num_robots, dimension = arrays.goal.shape
+    corners = np.empty((num_robots if num_robots >= BIG_TEAM else 0, 2, dimension), np.float32)
+    return TeamBoxes(corners, np.arange(num_robots))
+
+
 @compiled
-def enclose_team(count: int, w: FloatArray, boxes: FloatArray) -> None:
+def enclose_team(count: int, w: FloatArray, boxes: TeamBoxes) -> None:
     """Find the lowest and the highest places of robots in the first worlds of a tile, if it is a big team.
 
-    In moments of one world, which are near to each other, most pairs are so seen to be apart. ``boxes`` ``(K, 2, d)``
-    is output, ``(0, 2, d)`` for a smaller team.
+    In moments of one world, which are near to each other, most pairs are so seen to be apart. ``boxes`` are output.
     """
-    for k in range(boxes.shape[0]):
-        for axis in range(boxes.shape[2]):
+    corners = boxes.corners
+    for k in range(corners.shape[0]):
+        for axis in range(corners.shape[2]):
             first = k * STRIDE + (STATE + axis) * TILE
             low = high = w[first]
             for s in range(1, count):
                 low, high = min(low, w[first + s]), max(high, w[first + s])
-            boxes[k, 0, axis], boxes[k, 1, axis] = low, high
+            corners[k, 0, axis], corners[k, 1, axis] = low, high
+    _sort_boxes(corners, boxes.order)
+
+
+@compiled
+def _sort_boxes(corners: FloatArray, order: IntArray) -> None:
+    """Sort the numbers of boxes by where these begin, quickly if they nearly are (Shell, 1959)."""
+    stride = corners.shape[0] // 2
+    while stride > 0:
+        for place in range(stride, corners.shape[0]):
+            k, at = order[place], place
+            while at >= stride and corners[order[at - stride], 0, 0] > corners[k, 0, 0]:
+                order[at], at = order[at - stride], at - stride
+            order[at] = k
+        stride //= 2
 
 
 @inlined
-def _is_apart(boxes: FloatArray, k: int, other: int, reach: np.float32) -> bool:
+def _is_apart(corners: FloatArray, k: Whole, other: Whole, reach: np.float32) -> bool:
     """Check whether two robots' boxes are farther apart than ``reach``."""
     apart = False
-    for axis in range(boxes.shape[2]):
-        gap = max(boxes[k, 0, axis] - boxes[other, 1, axis], boxes[other, 0, axis] - boxes[k, 1, axis])
+    for axis in range(corners.shape[2]):
+        gap = max(corners[k, 0, axis] - corners[other, 1, axis], corners[other, 0, axis] - corners[k, 1, axis])
         apart |= gap > WIDER * reach
     return apart
 
@@ -175,21 +209,29 @@ def mark_pairs(
     extra: np.float32,
     w: FloatArray,
     buffer: FloatArray,
-    boxes: FloatArray,
+    boxes: TeamBoxes,
     near: NDArray[np.uint64],
 ) -> None:
     """Flag every two robots closer than their footprints plus ``extra``; ``buffer`` is two rows to overwrite.
 
     ``boxes`` are those of :func:`enclose_team`.
     """
-    f, poses = arrays.footprints, arrays.radius.shape[0] * STRIDE
-    for k in range(1, arrays.radius.shape[0]):
-        for other in range(k):
-            reach = arrays.radius[k] + arrays.radius[other] + extra
-            if boxes.shape[0] > 0 and _is_apart(boxes, k, other, reach):
-                continue
-            a, b, dimension = k * STRIDE, other * STRIDE, arrays.goal.shape[1]
-            touch = near_pair(reach, a, b, dimension, w)
+    f, poses, dimension = arrays.footprints, arrays.radius.shape[0] * STRIDE, arrays.goal.shape[1]
+    corners, order, largest = boxes.corners, boxes.order, ZERO
+    for k in range(arrays.radius.shape[0]):
+        largest = max(largest, arrays.radius[k])
+    for place in range(order.shape[0]):
+        for later in range(place + 1, order.shape[0]):
+            k, other = max(order[place], order[later]), min(order[place], order[later])
+            if corners.shape[0] > 0:
+                # Those that begin even later are as far apart.
+                end = WIDER * (arrays.radius[order[place]] + largest + extra)
+                if corners[order[later], 0, 0] - corners[order[place], 1, 0] > end:
+                    break
+                if _is_apart(corners, k, other, arrays.radius[k] + arrays.radius[other] + extra):
+                    continue
+            a, b = k * STRIDE, other * STRIDE
+            touch = near_pair(arrays.radius[k] + arrays.radius[other] + extra, a, b, dimension, w)
             touch = refine_pair(f, k, other, touch, extra, dimension, w, a, b, w, POSE * TILE, poses, buffer)
             near[k, ROBOT] |= touch
             near[other, ROBOT] |= touch

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Whole
@@ -13,11 +12,10 @@ from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import transition
 from d4orm_env.engine import obstacles
-from d4orm_env.engine.compiling import ONE, OPTIONS, ZERO, compiled, inlined
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.footprint_contacts import POSE, meets_body, refine_static
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
-    BIG_TEAM,
     BUFFER,
     CONTROL,
     DISTANCE2,
@@ -29,6 +27,7 @@ from d4orm_env.engine.tiles import (
     ROWS,
     STATE,
     STRIDE,
+    TeamBoxes,
     enclose_team,
     mark_pairs,
     place_team,
@@ -138,13 +137,6 @@ def _mark_bodies(
                     near[k, DYNAMIC] |= np.uint64(1) << np.uint64(s)
 
 
-@register_jitable(nogil=True, **OPTIONS)
-def allocate_boxes(arrays: ProblemArrays) -> FloatArray:
-    """Make room for the boxes of a team; see :func:`~d4orm_env.engine.tiles.enclose_team`."""
-    num_robots, dimension = arrays.goal.shape
-    return np.empty((num_robots if num_robots >= BIG_TEAM else 0, 2, dimension), np.float32)
-
-
 @inlined
 def _bit(mask: np.uint64, s: int) -> np.uint64:
     return (mask >> np.uint64(s)) & np.uint64(1)
@@ -156,12 +148,12 @@ def check_contacts(
     worlds: WorldArrays | WorldBatch,
     first: int,
     w: FloatArray,
-    boxes: FloatArray,
+    boxes: TeamBoxes,
     near: NDArray[np.uint64],
 ) -> None:
     """Complete the flags of contacts and margin violations of the worlds of a tile, then compute the rewards.
 
-    ``boxes`` of :func:`allocate_boxes` are overwritten, and so is ``near`` ``(K, 3)``.
+    ``boxes`` of :func:`~d4orm_env.engine.tiles.allocate_boxes` are overwritten, and so is ``near`` ``(K, 3)``.
     """
     num_robots, count = arrays.radius.shape[0], min(TILE, worlds.state.shape[0] - first)
     place_team(arrays.footprints, num_robots, w)

@@ -100,7 +100,7 @@ class WorkingPlan:
             rounding decides to one. And ``(R,)`` the step of the first fault, for those that have any.
         """
         index = np.asarray(robots)
-        costs, first = self._costs(index, self.states[:, index, None], self.arrived[index, None])
+        costs, first = self._costs(index, self.positions[:, index].swapaxes(0, 1)[:, None], self.arrived[index, None])
         refused = self.refused[index]
         return np.floor(costs[:, 0]) + (refused <= self.problem.horizon), np.minimum(first[:, 0], refused)
 
@@ -113,23 +113,34 @@ class WorkingPlan:
             or_longer: Take it even if it takes longer, as long as it has no more faults.
         """
         for i, robot in enumerate(np.asarray(robots).tolist()):
-            costs, _ = self._costs([robot], paths.states[:, [i]], paths.arrived[[i]])
-            present, _ = self._costs([robot], self.states[:, [robot], None], self.arrived[[robot], None])
+            costs = self._costs_beside(robot, np.moveaxis(paths.positions[:, i], 1, 0), paths.arrived[i])
             if self.refused[robot] <= self.problem.horizon:
-                present += 1
-                costs[0] += (paths.states[:, i] == self.states[:, robot, None, : paths.states.shape[3]]).all(
+                costs[0] += 1
+                costs[1:] += (paths.states[:, i] == self.states[:, robot, None, : paths.states.shape[3]]).all(
                     axis=(0, 2)
                 )
-            best = int(costs[0].argmin())
-            before = np.floor(present[0, 0]) + 1 if or_longer else present[0, 0]
-            if costs[0, best] < before:
+            present, best = costs[0], int(costs[1:].argmin())
+            if costs[1 + best] < (np.floor(present) + 1 if or_longer else present):
                 self.move([robot], paths.controls[:, [i], best], paths.states[:, [i], best], paths.arrived[[i], best])
 
-    def _costs(self, robots: ArrayLike, states: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:
-        """``(R, V)`` faults of paths, plus the share of the horizon that they take, less than one; and the step of the
-        first fault.
+    def _costs_beside(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Costs:
+        """``(1 + V,)`` costs of what a robot does and of its paths ``(V, H+1, d)``; all zero if these are just that."""
+        places = np.concatenate([self.positions[None, :, robot], paths])
+        arrives = np.append(self.arrived[robot], arrived)
+        # Most turn to their goals when they head there anyhow: what is done before costs as much again.
+        alike = (places[:, None] == places[:2]).all(axis=(2, 3)) & (arrives[:, None] == arrives[:2])
+        same = np.where(alike.any(axis=1), alike.argmax(axis=1), np.arange(len(places)))
+        different, which = np.unique(same, return_inverse=True)
+        if len(different) == 1:
+            return np.zeros(len(places))
+        costs: Costs = self._costs([robot], places[None, different], arrives[None, different])[0][0, which]
+        return costs
+
+    def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:
+        """``(R, V)`` faults of paths ``(R, V, H+1, d)``, plus the share of the horizon that they take, less than one;
+        and the step of the first fault.
         """
-        paths, horizon = np.ascontiguousarray(np.moveaxis(states, 0, 2)), self.problem.horizon
+        paths, horizon = np.ascontiguousarray(paths), self.problem.horizon
         checked = paths[:, :, :: self._interval]
         met, meeting = self._checked.count_meetings(robots, checked)
         touching, moves, unsure = path_index.check_alone(self.problem.arrays, robots, paths)

@@ -248,5 +248,7 @@ def is_unsure(arrays: ProblemArrays, place: FloatArray, goal: FloatArray) -> boo
         gap = np.float64(place[axis]) - np.float64(goal[axis])
         gap2 += gap * gap
         extent = max(extent, abs(np.float64(place[axis])))
+    if gap2 > 8 * np.float64(arrays.squared_goal_radius) + extent * extent * 2.0**-18:
+        return False  # Mostly it is much farther away than that.
     goal_radius = np.sqrt(np.float64(arrays.squared_goal_radius))
     return abs(np.sqrt(gap2) - goal_radius) < _DOUBT * goal_radius + _ROUNDING * extent

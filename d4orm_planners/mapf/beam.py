@@ -107,6 +107,7 @@ class BeamSpace(NamedTuple):
         counted: ``(N,)`` bool, those of which it is known whom they meet in the last block.
         ever: All ever kept.
         did: ``(B,)`` the moves of the path found, the last first.
+        lanes: Workspace of :mod:`~d4orm_planners.mapf.block_drives`.
     """
 
     beam: Beam
@@ -116,6 +117,7 @@ class BeamSpace(NamedTuple):
     counted: BoolArray
     ever: PathTree
     did: IntArray
+    lanes: FloatArray
 
 
 def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
@@ -125,14 +127,14 @@ def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
     )  # fmt: skip
 
 
-def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int) -> BeamSpace:
-    """Space for a beam of so many paths, moves and blocks of steps."""
+def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int, lanes: int) -> BeamSpace:
+    """Space for a beam of so many paths, moves and blocks of steps, and a workspace of so many lanes' numbers."""
     before, moves = np.empty((2, width * num_blocks), np.int64)
     most = width * num_moves
     return BeamSpace(
         _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, block),
         np.empty(most, np.int64), np.empty(most, np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
-        np.empty(num_blocks, np.int64),
+        np.empty(num_blocks, np.int64), np.zeros(lanes, np.float32),
     )  # fmt: skip
 
 

@@ -14,16 +14,14 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics import transition
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import SPEED, Model, TimeStep
+from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import WITHOUT_ARRAYS, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, compiled, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.obstacles import is_closed, touches_static
-from d4orm_env.engine.stepping import Docking, Row, docking_of, models_key
-from d4orm_planners.engine.path_index import is_unsure
+from d4orm_env.engine.simd import TILE
+from d4orm_env.engine.stepping import Row, models_key
 from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
 from d4orm_planners.mapf.beam import (
     Beam,
@@ -36,15 +34,9 @@ from d4orm_planners.mapf.beam import (
     sink,
     trace_back,
 )
-from d4orm_planners.mapf.motion_primitives import Moves, aiming
-from d4orm_planners.tracking.tracker import tracker, velocity_step
-
-_AHEAD = np.float32(0.5)
-"""Distance ahead of a robot from which the rest of its path is measured [s]."""
-
-_TOUCH = 100.0
-"""Robots that are met rather than an obstacle touched for a step."""
-
+from d4orm_planners.mapf.block_drives import block_driver, count_faults, path_reader
+from d4orm_planners.mapf.motion_primitives import Moves, aiming, frame_at
+from d4orm_planners.tracking.tracker import tracker
 
 Ending: TypeAlias = tuple[float, Whole, Whole]
 """Cost of the best path that arrives [s], the path that it goes on from, and its last move; -1 if there is none."""
@@ -132,45 +124,6 @@ def _count_passing(
     return count + _count_beside(table, robot, others, r, path, last, len(table.places))
 
 
-def _block_driver(model: Model) -> Callable[..., tuple[Row, Row, bool, float, float]]:
-    """Function that drives a robot by a move for a block: state, velocity, arrival, cost [s] and robots met."""
-    approach, velocity_of = inlined(model.functions.approach), inlined(model.functions.velocity)
-    step_towards, (aim_of, slowed) = velocity_step(model), aiming(model)
-    n, d, no_control = model.state_size, model.dimension, (ZERO,) * model.control_size
-
-    @inlined
-    def drive_block(
-        arrays: ProblemArrays, moves: Moves, number: int, states: FloatArray, faults: float, goal: FloatArray, at: Row,
-        limits: Row, docking: Docking, reach: np.float32, steps: tuple[Whole, Whole],
-        path: FloatArray,
-    ) -> tuple[Row, Row, bool, float, float]:  # fmt: skip
-        dt, closed, goal_radius = arrays.time_step, is_closed(arrays), np.sqrt(arrays.squared_goal_radius)
-        h, (first, last) = transition.TimeStep(dt[0], dt[1], dt[2], dt[3]), steps
-        state, control, at_goal = to_fixed_tuple(states, n), no_control, False
-        aim, end = aim_of(states, state, limits, goal, goal_radius, moves, number), first
-        for t in range(first, last):
-            if not transition.stands(at_goal, arrays.docks):
-                velocity = slowed(approach(state, aim, limits, h, OPS), moves.pace[number])
-                control, state, at_goal = step_towards(state, velocity, limits, at, docking, h)
-                end = t
-            for axis in range(d):
-                path[t - first, axis] = state[axis]
-            if end == t and is_unsure(arrays, path[t - first], goal):
-                faults += 1.0
-            if closed and touches_static(arrays, reach, path[t - first]):
-                faults += _TOUCH
-        velocity, cost = velocity_of(state, control, limits, OPS), end * dt[0]
-        if not at_goal:
-            rest2 = 0.0
-            for axis in range(d):
-                gap = goal[axis] - (state[axis] + _AHEAD * velocity[axis])
-                rest2 += gap * gap
-            cost = end * dt[0] + max(np.sqrt(rest2) - goal_radius, ZERO) / limits[SPEED]
-        return state, velocity, at_goal, cost, faults
-
-    return drive_block
-
-
 def _move_follower(model: Model) -> Callable[..., int]:
     """Function that drives a robot along the moves of a path."""
     approach, (aim_of, slowed) = inlined(model.functions.approach), aiming(model)
@@ -184,7 +137,7 @@ def _move_follower(model: Model) -> Callable[..., int]:
         block = step // BLOCK - begin
         number = did[did.shape[0] - 1 - block] if block < did.shape[0] else 0
         if step % BLOCK == 0:
-            aim = aim_of(states[step], state, limits, goal, goal_radius, moves, number)
+            aim = aim_of(frame_at(states[step], goal), state, limits, goal, goal_radius, moves, number)
         return slowed(approach(state, aim, limits, h, OPS), moves.pace[number]), aim, True
 
     return tracker(model, by_moves)
@@ -203,27 +156,27 @@ def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
     """Function that goes on from every path in the beam by every move for a block: how many paths are new, and the best
     one that arrives.
     """
-    drive_block = _block_driver(model)
-    d, num_limits = model.dimension, len(model.limit_names)
+    drive_block, read_path = block_driver(model), path_reader(model)
 
     @inlined
     def grow_paths(
         arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, r: int,
         space: BeamSpace, size: Whole, block: Whole, ending: Ending,
     ) -> tuple[Whole, Ending]:  # fmt: skip
-        beam, new, numbers = space.beam, space.new, space.numbers
-        robot, steps, last_busy = queries.robots[r], steps_of(table, block), _last_busy(table)
-        goal, limits = arrays.goal[robot], to_fixed_tuple(arrays.limits[robot], num_limits)
-        docking, reach = docking_of(arrays, robot), arrays.radius[robot] + arrays.margin
-        at, count = to_fixed_tuple(goal, d), np.int64(0)
+        beam, new, numbers, lanes = space.beam, space.new, space.numbers, space.lanes
+        robot, (begin, end), last_busy = queries.robots[r], steps_of(table, block), _last_busy(table)
+        count, num_moves = np.int64(0), moves.pace.shape[0]
         best, best_number, best_move = ending
-        for node in range(size):
-            for number in range(moves.pace.shape[0]):
+        for first in range(0, size * num_moves, TILE):
+            together = min(TILE, size * num_moves - first)
+            drive_block(arrays, robot, moves, beam, first, together, end - begin, lanes)
+            for lane in range(together):
+                node, number = (first + lane) // num_moves, (first + lane) % num_moves
+                state, velocity, at_goal, cost = read_path(arrays, robot, lane, begin, lanes)
+                if rules.contact * beam.faults[node] + cost >= best:
+                    continue
                 path = new.paths[count]
-                state, velocity, at_goal, cost, faults = drive_block(
-                    arrays, moves, number, beam.states[node], beam.faults[node], goal, at, limits, docking, reach,
-                    steps, path,
-                )  # fmt: skip
+                faults = beam.faults[node] + count_faults(arrays, robot, lane, end - begin, lanes, path)
                 if rules.contact * faults + cost >= best:
                     continue
                 if at_goal:

@@ -14,6 +14,7 @@ from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
 from d4orm_planners.mapf.beam import BeamRules, OtherAgents, Queries, make_space
 from d4orm_planners.mapf.beam_search import search_kernel
+from d4orm_planners.mapf.block_drives import LANES
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives, Moves
 from d4orm_planners.tracking.steering import Rollouts, by_model
 
@@ -71,7 +72,8 @@ def _search(
     waiting = iter(range(len(u)))
 
     def look(_: IntArray) -> None:
-        space = make_space(rules.width, len(moves.pace), len(table.first), BLOCK, x.shape[2], team.problem.dimension)
+        d, num_blocks = team.problem.dimension, len(table.first)
+        space = make_space(rules.width, len(moves.pace), num_blocks, BLOCK, x.shape[2], d, LANES)
         for number in waiting:
             if team.search.should_stop():
                 break

@@ -70,7 +70,7 @@ class MotionPrimitives:
 
 
 @compiled
-def _frame(place: FloatArray, goal: FloatArray) -> Row:
+def frame_at(place: FloatArray, goal: FloatArray) -> Row:
     """Unit vectors from a place to its goal, across in the plane, and upright to both, one after the other."""
     x, y, z = goal[0] - place[0], goal[1] - place[1], ZERO
     if goal.shape[0] == 3:
@@ -113,26 +113,26 @@ def _slowed_3(v: Row, pace: np.float32) -> Row:
     return v[0] * pace, v[1] * pace, v[2] * pace
 
 
-AimOf: TypeAlias = Callable[[FloatArray, Row, Row, FloatArray, np.float32, Moves, Whole], Row]
+AimOf: TypeAlias = Callable[[Row, Row, Row, FloatArray, np.float32, Moves, Whole], Row]
 SlowedTo: TypeAlias = Callable[[Row, np.float32], Row]
 
 
 def aiming(model: Model) -> tuple[AimOf, SlowedTo]:
-    """Compiled ``(place, at, limits, goal, goal_radius, moves, number) -> aim``, the position that a robot of this
+    """Compiled ``(frame, at, limits, goal, goal_radius, moves, number) -> aim``, the position that a robot of this
     model heads for in a move, and ``(velocity, pace) -> velocity`` at that share of it.
 
-    ``place`` is an array, ``at`` a tuple of the same numbers.
+    ``frame`` is :func:`frame_at` the robot's place, with which ``at`` begins.
     """
     d = model.dimension
     turned, slowed = (_turned_2, _slowed_2) if d == 2 else (_turned_3, _slowed_3)
 
     @inlined
     def aim_of(
-        place: FloatArray, at: Row, limits: Row, goal: FloatArray, goal_radius: np.float32, moves: Moves, number: Whole
+        frame: Row, at: Row, limits: Row, goal: FloatArray, goal_radius: np.float32, moves: Moves, number: Whole
     ) -> Row:
         turn = to_fixed_tuple(moves.turns[number], 3)
         if moves.homewards[number]:
-            return turned(to_fixed_tuple(goal, d), goal_radius, turn, _frame(place, goal))
-        return turned(at, _FAR * limits[SPEED], turn, _frame(place, goal))
+            return turned(to_fixed_tuple(goal, d), goal_radius, turn, frame)
+        return turned(at, _FAR * limits[SPEED], turn, frame)
 
     return aim_of, slowed

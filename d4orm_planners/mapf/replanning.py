@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from typing import NamedTuple
 
 import numpy as np
@@ -10,96 +9,13 @@ from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_env.paths.spaces import Space, is_free_line
+from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_planners.mapf import near_neighbours
-from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, bucket_of, last_passage, sort_boxes
+from d4orm_planners.mapf.beam import sink
+from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, last_passage, sort_boxes
 from d4orm_planners.mapf.roadmap import Footprints, Roadmap
 from d4orm_planners.mapf.safe_intervals import Intervals, free_intervals, interval_at
-
-
-@compiled
-def _meets(others: Others, i: Whole, block: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """Check whether a robot that drives straight from one position to another is near robot ``i`` in a block."""
-    boxes, need = others.boxes[block], others.need[i]
-    if (
-        need <= 0.0
-        or boxes[0, i] - need > max(tail[0], head[0])
-        or boxes[3, i] + need < min(tail[0], head[0])
-        or boxes[1, i] - need > max(tail[1], head[1])
-        or boxes[4, i] + need < min(tail[1], head[1])
-        or boxes[2, i] - need > max(tail[2], head[2])
-        or boxes[5, i] + need < min(tail[2], head[2])
-    ):
-        return False
-    for step in range(max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)):
-        share, place = (step - depart) / (arrive - depart), others.positions[step, i]
-        dx = tail[0] + share * (head[0] - tail[0]) - place[0]
-        dy = tail[1] + share * (head[1] - tail[1]) - place[1]
-        dz = tail[2] + share * (head[2] - tail[2]) - place[2]
-        if dx * dx + dy * dy + dz * dz < need * need:
-            return True
-    return False
-
-
-@compiled
-def _is_line_free(others: Others, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """Check whether none is near a robot that drives straight from one position to another between two steps."""
-    for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
-        for i in range(others.need.shape[0]):
-            if _meets(others, i, block, tail, head, depart, arrive):
-                return False
-    return True
-
-
-@compiled
-def _is_edge_free(others: Others, buckets: Buckets, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """The same of a short line."""
-    for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
-        bucket = bucket_of(buckets, block, (tail[0] + head[0]) / 2, (tail[1] + head[1]) / 2)
-        for number in range(buckets.first[bucket], buckets.first[bucket + 1]):
-            if _meets(others, buckets.items[number], block, tail, head, depart, arrive):
-                return False
-    return True
-
-
-@cached_kernel(variant="straighten", **OPTIONS)
-def straighten(
-    roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, path: IntArray
-) -> int:
-    """Leave out nodes of a path where the straight line is free of obstacles and of others.
-
-    Args:
-        roadmap: The roadmap.
-        bodies: The robots.
-        space: The world; ``None`` where there are no obstacles.
-        others: Their motions.
-        k: The robot.
-        reach: Distance that it keeps from obstacles [m].
-        path: ``(n, 3)`` of :func:`find_path`, changed in place.
-
-    Returns:
-        How many are left.
-    """
-    nodes, goal, docked, count, i = roadmap.nodes, bodies.goals[k], bodies.docked + bodies.slack, 1, 0
-    while i + 1 < path.shape[0]:
-        j = i + 1
-        depart, tail = path[j, 1], nodes[path[i, 0]]
-        while j + 1 < path.shape[0]:
-            head = nodes[path[j + 1, 0]]
-            near = near_neighbours.squared_gap(nodes, goal, nodes, path[i, 0], nodes, path[j + 1, 0])
-            if bodies.docks and path[j + 1, 0] != goal and near < docked * docked:
-                break
-            # Nested, because the compiler leaves out what is never reached.
-            if space is not None:  # noqa: SIM102
-                if not is_free_line(space, reach, tail, head):
-                    break
-            if not _is_line_free(others, tail, head, depart, path[j + 1, 2]):
-                break
-            j += 1
-        path[count, 0], path[count, 1], path[count, 2] = path[j, 0], depart, path[j, 2]
-        count, i = count + 1, j
-    return count
+from d4orm_planners.mapf.straightening import is_edge_free
 
 
 class Trip(NamedTuple):
@@ -130,6 +46,22 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
         found[count, 0], found[count, 1], found[count, 2] = tree[walk, 0], tree[walk, 1], tree[walk, 2]
         walk = tree[walk, 3]
     return found
+
+
+class _Tree(NamedTuple):
+    """Where a search has come so far, with room for more.
+
+    Attributes:
+        entries: ``(N, 5)`` int64 nodes, departures for them, arrivals, entries that they were come to from, intervals.
+        costs: ``(N,)`` steps from the start through each to the goal, at least.
+        heap: ``(N,)`` int64 numbers of those that nothing has been tried from, the soonest at the goal first.
+        sizes: ``(2,)`` int64 how many there are of both.
+    """
+
+    entries: IntArray
+    costs: Floats
+    heap: IntArray
+    sizes: IntArray
 
 
 class _Search(NamedTuple):
@@ -201,37 +133,38 @@ def _departure(
     return depart, depart, np.int64(-1)
 
 
-@register_jitable(nogil=True, **OPTIONS)
+@compiled
+def _add_entry(tree: _Tree, head: Whole, depart: Whole, until: Whole, entry: Whole, there: Whole, cost: float) -> None:
+    entries, heap, number, place = tree.entries, tree.heap, tree.sizes[0], tree.sizes[1]
+    entries[number, 0], entries[number, 1], entries[number, 2] = head, depart, until
+    entries[number, 3], entries[number, 4], tree.costs[number] = entry, there, cost
+    # It has the highest number, so it rises above what costs more only.
+    while place > 0 and tree.costs[heap[(place - 1) // 2]] > cost:
+        heap[place], place = heap[(place - 1) // 2], (place - 1) // 2
+    heap[place] = number
+    tree.sizes[0], tree.sizes[1] = number + 1, tree.sizes[1] + 1
+
+
+@inlined
 def _follow_edge(
-    search: _Search,
-    roadmap: Roadmap,
-    e: Whole,
-    left: float,
-    trip: Trip,
-    dock: Whole,
-    tree: IntArray,
-    entry: Whole,
-    used: int,
-    heap: list[tuple[float, np.int64]],
-) -> tuple[IntArray, int]:
-    """Enter whatever is come to from an entry by an edge, see :func:`_departure`; the tree, and its entries in use."""
-    nodes, node, head, depart = roadmap.nodes, tree[entry, 0], np.int64(roadmap.heads[e]), tree[entry, 2]
+    search: _Search, roadmap: Roadmap, e: Whole, left: float, trip: Trip, dock: Whole, tree: _Tree, entry: Whole
+) -> None:
+    """Enter whatever is come to from an entry by an edge, see :func:`_departure`."""
+    nodes, entries = roadmap.nodes, tree.entries
+    node, head, depart = entries[entry, 0], np.int64(roadmap.heads[e]), entries[entry, 2]
     steps, failures = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0
     while True:
-        depart, until, there = _departure(search, tree, entry, head, steps, left, trip, dock, depart)
+        depart, until, there = _departure(search, entries, entry, head, steps, left, trip, dock, depart)
         if there < 0:
-            return tree, used
-        if not _is_edge_free(search.others, search.buckets, nodes[node], nodes[head], depart, until):
+            return
+        if not is_edge_free(search.others, search.buckets, nodes[node], nodes[head], depart, until):
             # Whoever stands in the way often does so for long.
             failures += 1
             depart += 1 + failures // 4
             continue
-        if used == tree.shape[0]:
-            tree = np.concatenate((tree, np.empty((used, 5), np.int64)))
-        tree[used, 0], tree[used, 1], tree[used, 2] = head, depart, until
-        tree[used, 3], tree[used, 4], search.came[there] = entry, there, used
-        heapq.heappush(heap, (until + left, np.int64(used)))
-        used, depart = used + 1, depart + 1
+        search.came[there] = tree.sizes[0]
+        _add_entry(tree, head, depart, until, entry, there, until + left)
+        depart += 1
 
 
 @compiled
@@ -255,6 +188,56 @@ def _begin(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, trip:
     return _Search(others, buckets, safe, np.full(safe.begins.shape[0], -1, np.int32), dock)
 
 
+@compiled
+def _room_needed(roadmap: Roadmap, safe: Intervals, node: Whole) -> Whole:
+    """Entries that may be made from one at a node, at most: one for every interval of every neighbour."""
+    most = np.int64(0)
+    for e in range(roadmap.first[node], roadmap.first[node + 1]):
+        head = np.int64(roadmap.heads[e])
+        most += safe.first[head + 1] - safe.first[head]
+    return most
+
+
+@compiled
+def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip: Trip, tree: _Tree) -> Whole:
+    """Search until an entry is at the goal for good, which is returned; -1 if there is none, -2 if room is short."""
+    goal, costs, passing = bodies.goals[k], bodies.costs[k], Trip(trip.stride, trip.launch, trip.latest, np.int64(-1))
+    root, entries, heap, sizes = np.int64(0), tree.entries, tree.heap, tree.sizes
+    while sizes[1] > 0:
+        entry = heap[0]
+        node = entries[entry, 0]
+        if sizes[0] + _room_needed(roadmap, search.safe, node) > entries.shape[0]:
+            return np.int64(-2)
+        sizes[1] -= 1
+        heap[0] = heap[sizes[1]]
+        sink(tree.costs, heap, root, sizes[1])
+        if search.came[entries[entry, 4]] != entry:
+            continue
+        if node == goal and entries[entry, 2] > search.dock:
+            return entry
+        if node == goal and bodies.docks:
+            continue
+        for e in range(roadmap.first[node], roadmap.first[node + 1]):
+            if _is_way(roadmap, bodies, k, node, e):
+                head = np.int64(roadmap.heads[e])
+                motion = trip if head == goal else passing
+                dock, left = search.dock if head == goal and bodies.docks else np.int64(-1), costs[head] / trip.stride
+                _follow_edge(search, roadmap, e, left, motion, dock, tree, entry)
+    return np.int64(-1)
+
+
+@register_jitable(nogil=True, **OPTIONS)
+def _with_room(tree: _Tree, room: Whole) -> _Tree:
+    """The tree, with room for so many entries more."""
+    entries, costs = np.concatenate((tree.entries, np.empty((room, 5), np.int64))), np.empty(room)
+    return _Tree(
+        entries,
+        np.concatenate((tree.costs, costs)),
+        np.concatenate((tree.heap, np.empty(room, np.int64))),
+        tree.sizes,
+    )
+
+
 @cached_kernel(variant="path", **OPTIONS)
 def find_path(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> IntArray:
     """The soonest path of a robot to its goal among all others: safe interval path planning.
@@ -271,28 +254,15 @@ def find_path(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, tr
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no path.
     """
-    goal, start, costs = bodies.goals[k], np.int64(roadmap.starts[k]), bodies.costs[k]
-    search, passing = (
-        _begin(roadmap, bodies, others, k, trip),
-        Trip(trip.stride, trip.launch, trip.latest, np.int64(-1)),
-    )
-    tree, used = np.empty((1024, 5), np.int64), 1
-    tree[0, 0], tree[0, 1], tree[0, 2], tree[0, 3], tree[0, 4] = start, 0, 0, -1, search.safe.first[start]
-    search.came[search.safe.first[start]] = 0
-    heap = [(float(costs[start]) / trip.stride, np.int64(0))]
-    while len(heap) > 0:
-        _, entry = heapq.heappop(heap)
-        node = tree[entry, 0]
-        if search.came[tree[entry, 4]] != entry:
-            continue
-        if node == goal and tree[entry, 2] > search.dock:
-            return _followed_back(tree, entry)
-        if node == goal and bodies.docks:
-            continue
-        for e in range(roadmap.first[node], roadmap.first[node + 1]):
-            if _is_way(roadmap, bodies, k, node, e):
-                head = np.int64(roadmap.heads[e])
-                motion = trip if head == goal else passing
-                dock, left = search.dock if head == goal and bodies.docks else np.int64(-1), costs[head] / trip.stride
-                tree, used = _follow_edge(search, roadmap, e, left, motion, dock, tree, entry, used, heap)
-    return np.empty((0, 3), np.int64)
+    start, search = np.int64(roadmap.starts[k]), _begin(roadmap, bodies, others, k, trip)
+    tree = _Tree(np.empty((1024, 5), np.int64), np.empty(1024), np.empty(1024, np.int64), np.zeros(2, np.int64))
+    zero, interval = np.int64(0), search.safe.first[start]  # a literal would compile what it is passed to once more
+    search.came[interval] = 0
+    _add_entry(tree, start, zero, zero, zero - 1, interval, float(bodies.costs[k, start]) / trip.stride)
+    while True:
+        entry = _grow(roadmap, bodies, search, k, trip, tree)
+        if entry >= 0:
+            return _followed_back(tree.entries, entry)
+        if entry == -1:
+            return np.empty((0, 3), np.int64)
+        tree = _with_room(tree, len(tree.costs))

@@ -18,8 +18,9 @@ from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.occupancy import Occupancy, Others, find_meetings
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
-from d4orm_planners.mapf.replanning import Trip, find_path, straighten
+from d4orm_planners.mapf.replanning import Trip, find_path
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
+from d4orm_planners.mapf.straightening import straighten
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 

@@ -56,6 +56,17 @@ def test_a_mixed_team_is_rerouted_model_by_model() -> None:
     assert team.arrived.all()
 
 
+def test_a_path_costs_what_it_costs_whichever_paths_it_is_compared_with() -> None:
+    """What a robot does at present, the same again, standing still, another robot's path, and that again."""
+    team = rerouted(make_problem("random", num_robots=10, seed=1))
+    own, other = (team.positions[:, robot] for robot in (3, 4))
+    paths, arrived = np.stack([own, np.repeat(own[:1], len(own), axis=0), other, other]), np.array([1, 0, 1, 1], bool)
+    alone = [team._costs([3], path[None, None], arrived[None, [i]])[0][0, 0] for i, path in enumerate(paths)]
+    assert team._costs_beside(3, paths, arrived).tolist() == [alone[0], *alone]
+    assert len(set(alone)) == 3
+    assert team._costs_beside(3, paths[:1], arrived[:1]).tolist() == [0.0, 0.0]
+
+
 def test_who_cannot_pass_waits() -> None:
     """In a lane too narrow to pass in, one robot docks on the way of another, and so must come after it."""
     start = [[0, 0, 0, 0], [2.0, -2.0, 0, 0]]
