@@ -10,6 +10,7 @@ that arrives ends the episode for all, and nobody else ever learns to.
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -18,7 +19,7 @@ from examples.outputs import argument_parser, count, require, save_table
 
 require("rl", "torchrl")
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import MultiAgentMLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
@@ -28,23 +29,13 @@ from d4orm_env.integrations.torchrl import TorchRLNavigation
 
 WORLDS, HORIZON = 256, 32
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES, LEARNING_RATE = 0.98, 0.95, 0.2, 4, 4, 1e-3
-REACH = 5.0
-"""Observations are cut off beyond this and taken in its measure: they are in metres, metres per second and seconds."""
-
-SEEN, ACTION, REWARD, VALUE = (("robots", name) for name in ("seen", "action", "reward", "state_value"))
-
-
-def scaled() -> TensorDictModule:
-    """Return a module that scales observations for the networks."""
-    return TensorDictModule(
-        lambda observation: observation.clamp(-REACH, REACH) / REACH, [("robots", "observation")], [SEEN]
-    )
+SEEN, ACTION, REWARD, VALUE = (("robots", name) for name in ("observation", "action", "reward", "state_value"))
 
 
 def network(env: TorchRLNavigation, outputs: int, centralised: bool) -> MultiAgentMLP:
     """One for all robots, of what each sees or of what all see."""
     return MultiAgentMLP(
-        n_agent_inputs=env.observation_spec["robots", "observation"].shape[-1], n_agent_outputs=outputs,
+        n_agent_inputs=env.observation_spec[SEEN].shape[-1], n_agent_outputs=outputs,
         n_agents=len(env.group_map["robots"]), centralised=centralised, share_params=True, depth=2, num_cells=64,
         activation_class=torch.nn.Tanh,
     )  # fmt: skip
@@ -56,7 +47,7 @@ def make_actor(env: TorchRLNavigation) -> ProbabilisticActor:
     parameters = [("robots", "loc"), ("robots", "scale")]
     means = torch.nn.Sequential(network(env, 2 * limits.high.shape[-1], False), NormalParamExtractor())
     return ProbabilisticActor(
-        TensorDictSequential(scaled(), TensorDictModule(means, [SEEN], parameters)), in_keys=parameters,
+        TensorDictModule(means, [SEEN], parameters), in_keys=parameters,
         out_keys=[ACTION], distribution_class=TanhNormal, return_log_prob=True, log_prob_key=("robots", "log_density"),
         distribution_kwargs={"low": limits.low[0], "high": limits.high[0]},
     )  # fmt: skip
@@ -91,18 +82,19 @@ def with_advantages(data: Any, advantages: GAE) -> Any:
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
     parser.add_argument("--updates", type=count, default=200, help="of 8192 steps of teams each")
     arguments = parser.parse_args()
     updates, parts = (60, 3) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the layers are too small to be shared
     env = TorchRLNavigation(
-        WORLDS, "random", arguments.num_robots, seed=0, reward="training", max_cycles=100, num_instances=512
-    )
+        WORLDS, "random", arguments.num_robots, seed=0, reward="training", egocentric=True, goal_speed=math.inf,
+        max_cycles=100, num_instances=512,
+    )  # fmt: skip
     state = env.reset()
     actor = make_actor(env)
-    critic = TensorDictSequential(scaled(), TensorDictModule(network(env, 1, True), [SEEN], [VALUE]))
+    critic = TensorDictModule(network(env, 1, True), [SEEN], [VALUE])
     loss = ClipPPOLoss(actor, critic, clip_epsilon=CLIP, entropy_coeff=1e-3, normalize_advantage=False)
     names = {"done": ("robots", "done"), "terminated": ("robots", "terminated")}
     loss.set_keys(action=ACTION, reward=REWARD, value=VALUE, sample_log_prob=("robots", "log_density"), **names)
