@@ -213,7 +213,7 @@ class Features:
         """Frames ``(N, 2)`` turned to the nearest rays, and rays ``(N, R)`` from these on, counter-clockwise."""
         xp, directions = namespace(frame), self.slices.ray_directions
         first = (frame @ directions.T).argmax(axis=1)
-        order = (first[:, None] + xp.arange(len(directions))) % len(directions)
+        order = (first[:, None] + xp.arange(len(directions))[None]) % len(directions)
         return xp.asarray(directions)[first], xp.take_along_axis(rays, order, axis=1)
 
     def _neighbors(self, frame: FloatArray, observations: FloatArray) -> FloatArray:
@@ -281,12 +281,16 @@ def _unit(vectors: NDArray[np.floating]) -> FloatArray:
 def _into(frame: FloatArray, vectors: FloatArray) -> FloatArray:
     """Turn ``(..., d)`` vectors of the world, about the vertical axis, into frames ``(..., 2)``."""
     cos, sin, x, y = frame[..., 0], frame[..., 1], vectors[..., 0], vectors[..., 1]
-    xp = namespace(vectors)
-    plane = xp.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-    turned: FloatArray = xp.concatenate([plane, vectors[..., 2:]], axis=-1) if vectors.shape[-1] > 2 else plane
+    ahead, left = cos * x + sin * y, cos * y - sin * x
+    if not isinstance(vectors, np.ndarray):
+        xp = namespace(vectors)
+        turned: FloatArray = xp.concatenate([xp.stack([ahead, left], axis=-1), vectors[..., 2:]], axis=-1)
+        return turned
+    turned = vectors.copy()  # several times quicker than stacking
+    turned[..., 0], turned[..., 1] = ahead, left
     return turned
 
 
 def _out_of(frame: FloatArray, vectors: FloatArray) -> FloatArray:
     """The reverse of :func:`_into`."""
-    return _into(namespace(frame).stack([frame[..., 0], -frame[..., 1]], axis=-1), vectors)
+    return _into(namespace(frame).concatenate([frame[..., :1], -frame[..., 1:]], axis=-1), vectors)

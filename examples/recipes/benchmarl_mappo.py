@@ -6,13 +6,13 @@ python -m examples.recipes.benchmarl_mappo
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from examples.outputs import argument_parser, count, require, save_table
+from examples.recipes.task import WORLD
 
 require("rl", "torchrl")
 try:
@@ -63,8 +63,7 @@ def main() -> None:
     arguments = parser.parse_args()
     iterations, parts = (60, 3) if arguments.quick else (arguments.iterations, 10)
     torch.set_num_threads(1)  # the layers are too small to be shared
-    own = {"num_robots": arguments.num_robots, "reward": "training", "egocentric": True, "goal_speed": math.inf}
-    own |= {"max_cycles": 100, "num_instances": 512}
+    own = {"num_robots": arguments.num_robots, "num_instances": 512, **WORLD}
     counted, folder = Successes(), arguments.out / "benchmarl"
     folder.mkdir(parents=True, exist_ok=True)
     model = MlpConfig.get_from_yaml()

@@ -9,14 +9,13 @@ arrived is left out of the learning.
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from examples.outputs import argument_parser, count, require, save_table
-from examples.recipes.unseen import solved
+from examples.recipes.task import WORLD, solved
 
 require("rl", "torch")
 import torch
@@ -73,8 +72,7 @@ class Robots:
     def __init__(self, num_robots: int, seed: int) -> None:
         self.env = gymnasium.make_vec(
             "d4orm/Navigation-v0", num_envs=WORLDS, vectorization_mode="vector_entry_point", scenario="random",
-            num_robots=num_robots, reward="training", egocentric=True, goal_speed=math.inf, max_cycles=100,
-            autoreset_mode="SameStep", num_instances=512,
+            num_robots=num_robots, autoreset_mode="SameStep", num_instances=512, **WORLD,
         )  # fmt: skip
         observations, infos = self.env.reset(seed=seed)
         self.num_actions = self.env.single_action_space.shape[0] // num_robots

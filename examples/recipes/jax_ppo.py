@@ -8,7 +8,6 @@ program runs there.
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from examples.outputs import argument_parser, count, require, save_table
-from examples.recipes.unseen import solved
+from examples.recipes.task import WORLD, solved
 
 require("jaxrl", "optax")
 
@@ -164,10 +163,7 @@ def main() -> None:
     parser.add_argument("--updates", type=count, default=150, help="of 8192 steps of teams each")
     arguments = parser.parse_args()
     num_updates, rows = (80, 4) if arguments.quick else (arguments.updates, 10)
-    env = FunctionalEnv(
-        "random", num_robots=arguments.num_robots, reward="training", egocentric=True, goal_speed=math.inf,
-        max_cycles=100, num_instances=512,
-    )  # fmt: skip
+    env = FunctionalEnv("random", num_robots=arguments.num_robots, num_instances=512, **WORLD)
     network, counts = jax.jit(partial(train, env, num_updates))(jax.random.key(0))
     table = [
         {

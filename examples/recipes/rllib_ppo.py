@@ -6,13 +6,12 @@ python -m examples.recipes.rllib_ppo
 
 from __future__ import annotations
 
-import math
 import sys
 from typing import Any
 
 import numpy as np
 from examples.outputs import argument_parser, count, save_table
-from examples.recipes.unseen import solved
+from examples.recipes.task import WORLD, solved
 
 try:
     from ray.rllib.algorithms.ppo import PPOConfig
@@ -55,8 +54,7 @@ def main() -> None:
     parser.add_argument("--iterations", type=count, default=200, help="of 2048 steps of teams each")
     arguments = parser.parse_args()
     iterations, parts = (45, 3) if arguments.quick else (arguments.iterations, 10)
-    world = {"scenario": "random", "num_robots": arguments.num_robots, "reward": "training", "max_cycles": 100}
-    algorithm = settings(world | {"egocentric": True, "goal_speed": math.inf}).build_algo()
+    algorithm = settings({"scenario": "random", "num_robots": arguments.num_robots, **WORLD}).build_algo()
     results = [algorithm.train()["env_runners"] for _ in range(iterations)]
     rows = []
     for part in np.array_split(np.arange(iterations), parts):

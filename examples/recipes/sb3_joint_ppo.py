@@ -7,12 +7,11 @@ It knows one size of team only, and every robot is paid for what all do: teams l
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any
 
 from examples.outputs import argument_parser, count, require
-from examples.recipes.unseen import SEEDS
+from examples.recipes.task import SEEDS, WORLD
 
 require("rl", "stable_baselines3")
 import gymnasium
@@ -41,8 +40,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # the layers are too small to be shared
     register_environments()
-    world = {"scenario": "random", "num_robots": arguments.num_robots, "reward": "training", "max_cycles": 100}
-    world |= {"egocentric": True, "goal_speed": math.inf}
+    world = {"scenario": "random", "num_robots": arguments.num_robots, **WORLD}
     model = PPO(
         "MlpPolicy", make_vec_env(ENV_ID, n_envs=16, seed=0, env_kwargs=world), n_steps=128, batch_size=256, n_epochs=6,
         gamma=0.98, learning_rate=5e-4, policy_kwargs={"log_std_init": -0.5, "net_arch": [128, 128]}, device="cpu",

@@ -9,11 +9,10 @@ in one compiled call.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from examples.outputs import argument_parser, count, require
-from examples.recipes.unseen import solved
+from examples.recipes.task import WORLD, solved
 
 require("rl", "supersuit", "stable_baselines3")
 import supersuit
@@ -27,9 +26,7 @@ from d4orm_planners.base.adapters import from_sb3
 
 def train(num_robots: int, worlds: int, steps: int, path: Path) -> PPO:
     """Train, and save SB3's own zip."""
-    env = navigation_v0.parallel_env(
-        "random", num_robots=num_robots, reward="training", egocentric=True, goal_speed=math.inf, max_cycles=100
-    )
+    env = navigation_v0.parallel_env("random", num_robots=num_robots, **WORLD)
     # Agents leave when they arrive; SB3 needs their number to stay the same, so SuperSuit sends zeros for them.
     vector = supersuit.pettingzoo_env_to_vec_env_v1(supersuit.black_death_v3(env))
     envs = supersuit.concat_vec_envs_v1(vector, worlds, num_cpus=0, base_class="stable_baselines3")
