@@ -91,8 +91,8 @@ class SharedPolicy(Policy):
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
         settings = getattr(self._predict, "keywords", {})  # of a partial
-        own = {"normalized": self._normalized, "egocentric": self._egocentric}
-        return {**settings, **own, "weights": digest.hexdigest()}
+        own = {"egocentric": True} if self._egocentric else {}
+        return {**settings, **own, "normalized": self._normalized, "weights": digest.hexdigest()}
 
 
 def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False) -> SharedPolicy:
