@@ -82,7 +82,7 @@ class TorchRLNavigation(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        spaces = self.worlds.single_observation_space, self.worlds.single_action_space
+        spaces: tuple[Any, Any] = self.worlds.single_observation_space, self.worlds.single_action_space
         seen, acted = (self._box(*(end.reshape(self._shape[1], -1) for end in (box.low, box.high))) for box in spaces)
         info = self._composite({name: self._flag(*self._shape) for name in _INFO})
         self.observation_spec = self._of_robots({"observation": seen, "info": info})

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -114,9 +114,8 @@ class FunctionalEnv:
         setup = EnvSetup(chosen)
         self.problem: Problem = setup.problem
         self.layout: ObservationLayout = setup.layout
-        self.features, self.observation_bounds, self.action_bounds = (
-            setup.features, setup.observation_bounds, setup.action_bounds,
-        )  # fmt: skip
+        self.features: Any = setup.features  # which take arrays of JAX too
+        self.observation_bounds, self.action_bounds = setup.observation_bounds, setup.action_bounds
         self.max_cycles: int = setup.max_cycles
         self._reward = find_reward(chosen.reward) or "paper"
         known = [one for one in setup.disturbances if isinstance(one, ControlNoise | RayNoise)]
@@ -158,7 +157,8 @@ class FunctionalEnv:
     def observe(self, state: EnvState) -> jax.Array:
         """``(K, D)`` what every robot is shown."""
         seen = self._seen(state)
-        return seen if self.features is None else self.features.encode(seen)[0]
+        shown: jax.Array = seen if self.features is None else self.features.encode(seen)[0]
+        return shown
 
     def _seen(self, state: EnvState) -> jax.Array:
         """``(K, D)`` what every robot sees, in physical units."""
