@@ -47,7 +47,7 @@ def make_actor(env: TorchRLNavigation) -> ProbabilisticActor:
     inputs, outputs = env.observation_spec[SEEN].shape[-1], env.action_spec[ACTION].shape[-1]
     parameters = [("robots", "loc"), ("robots", "scale")]
     network = MLP(inputs, 2 * outputs, depth=2, num_cells=64, activation_class=torch.nn.Tanh)
-    means = torch.nn.Sequential(network, NormalParamExtractor(scale_mapping="biased_softplus_0.5"))
+    means = torch.nn.Sequential(network, NormalParamExtractor())
     return ProbabilisticActor(
         TensorDictModule(means, [SEEN], parameters), in_keys=parameters,
         out_keys=[ACTION], distribution_class=TanhNormal, return_log_prob=True, log_prob_key=("robots", "log_density"),
