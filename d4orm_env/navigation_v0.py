@@ -64,11 +64,10 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         self.turn_taker: AECNavigationEnv | None = None
 
     def _make_spaces(self) -> None:
-        layout = self._simulation.setup.layout
-        lowest, highest = self.problem.team.control_bounds
+        setup, box = self._simulation.setup, gymnasium.spaces.Box
+        lowest, highest = setup.action_bounds
         low, high = lowest.min(axis=0), highest.max(axis=0)
-        box = gymnasium.spaces.Box
-        self.observation_spaces = {agent: box(layout.low, layout.high) for agent in self.possible_agents}
+        self.observation_spaces = {agent: box(*setup.observation_bounds) for agent in self.possible_agents}
         self.action_spaces = {agent: box(low, high) for agent in self.possible_agents}
         self.state_space = box(*self._simulation.state_bounds)
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.footprint_gaps import touching
 from d4orm_env.core.lazy import LazyModule
+from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import DisturbanceEvents
 from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, marks_of
@@ -94,10 +95,10 @@ class TeamSimulation(Simulation):
         return self._unpaid(observations)
 
     def step(self, controls: FloatArray) -> TeamStep:
-        """Advance one time step under ``controls`` ``(K, m)``; those of docked robots do not matter."""
+        """Advance one time step under ``controls`` ``(K, m)``, or actions; those of docked robots do not matter."""
         self.require_reset()
         observations = self._unseen()
-        self.step_worlds(controls[None], observations)
+        self.step_worlds(self.controls(controls[None]), observations)
         return self._report(observations, self.robot_rewards[0], self.reached[0])
 
     def set_state(self, states: ArrayLike) -> TeamStep:
@@ -147,7 +148,9 @@ class TeamSimulation(Simulation):
         terms = {name: values[0] for name, values in self.terms.items()}
         problem, collided = self.problem, np.flatnonzero(flags[0])
         partners = touching(problem.team, self.states, collided, problem.rounding) if len(collided) > 1 else {}
-        self.last = TeamStep(observations[0], rewards, arrived, *flags, worlds.distance[0].copy(), partners, terms)
+        self.last = TeamStep(
+            self.show(observations)[0], rewards, arrived, *flags, worlds.distance[0].copy(), partners, terms
+        )
         return self.last
 
 
@@ -224,6 +227,11 @@ class BaseEnv:
     def problem(self) -> Problem:
         """The problem being run; where every reset draws a new instance, that of the present episode."""
         return self._simulation.problem
+
+    @property
+    def layout(self) -> ObservationLayout:
+        """Layout of one robot's observation."""
+        return self._simulation.setup.layout
 
     @property
     def lifelong(self) -> bool:

@@ -108,11 +108,10 @@ class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
 
 def joint_spaces(setup: EnvSetup) -> tuple[gymnasium.Space[FloatArray], gymnasium.Space[FloatArray]]:
     """Spaces of the joint observation ``(K * D,)`` and of the joint action ``(K * m,)``."""
-    team, layout = setup.problem.team, setup.layout
-    low, high = team.control_bounds
+    (low, high), (lowest, highest), count = setup.action_bounds, setup.observation_bounds, setup.problem.num_robots
     # Padding has no limit of its own; a box must not be flat.
     low, high = np.where(high > 0, low, low.min(axis=0)), np.where(high > 0, high, high.max(axis=0))
-    observations = gymnasium.spaces.Box(np.tile(layout.low, team.num_robots), np.tile(layout.high, team.num_robots))
+    observations = gymnasium.spaces.Box(np.tile(lowest, count), np.tile(highest, count))
     return observations, gymnasium.spaces.Box(low.ravel(), high.ravel())
 
 

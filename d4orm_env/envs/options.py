@@ -65,6 +65,9 @@ class EnvOptions:
         ray_range: Range of that [m]; noise is :class:`~d4orm_env.disturbances.RayNoise`.
         communication_range: Distance of centres beyond which no neighbour is observed [m]; ``None`` for no limit.
         line_of_sight: Whether neighbours behind obstacles are not observed either; not in space.
+        egocentric: Whether observations are :class:`~d4orm_env.envs.features.Features`, seen from where the robot faces
+            its goal and of order one, and actions are in ``[-1, 1]``, in units of the limits and in that frame: what
+            learns. Policies act in environments without it.
         scenario_settings: Arguments of the scenario, such as ``model`` or ``seed``: all other keyword arguments.
     """
 
@@ -86,6 +89,7 @@ class EnvOptions:
     ray_range: float = 5.0
     communication_range: float | None = None
     line_of_sight: bool = False
+    egocentric: bool = False
     scenario_settings: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -122,6 +126,14 @@ class EnvOptions:
         noise = () if std is None else (ControlNoise(tuple(std.tolist())),)
         return at_work((*noise, *self.disturbances), problem)
 
+    def require_physical_units(self) -> None:
+        """Raise ``ValueError`` if robots are egocentric, which policies are not made for."""
+        if self.egocentric:
+            raise ValueError(
+                "this environment is egocentric, and policies act in physical units; make it without, and give "
+                "egocentric=True to from_sb3() or whatever makes a policy of what you trained"
+            )
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "disturbances", checked_disturbances(self.disturbances))
 
@@ -130,7 +142,7 @@ class EnvOptions:
             raise ValueError(f"randomize_instance is {shown(self.randomize_instance)}; it must be True, False or None")
         if self.progress not in ("straight", "path"):
             raise ValueError(f"progress is {shown(self.progress)}; it must be 'straight' or 'path'")
-        for name in ("observed_path", "line_of_sight"):
+        for name in ("observed_path", "line_of_sight", "egocentric"):
             if not isinstance(value := getattr(self, name), bool):
                 raise ValueError(f"{name} is {shown(value)}; it must be True or False")
         if not self.observed_rays and any(isinstance(one, RayNoise) for one in self.disturbances):
@@ -140,6 +152,8 @@ class EnvOptions:
                 "progress='path' and observed_path need goals that stay; leave them out in lifelong mode, which draws "
                 "new ones all the time"
             )
+        if self.egocentric and self.observed_path:
+            raise ValueError("egocentric observations have no room for observed_path; leave one of the two out")
         if self.problem is None:
             return
         beside = {"scenario": self.scenario, "num_robots": self.num_robots}

@@ -19,6 +19,7 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.disturbances.disturbance import total_slack
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.engine.types import OWN_ARRAYS, WorldBatch
+from d4orm_env.envs.features import Features
 from d4orm_env.envs.inputs import checked_cycles
 from d4orm_env.envs.joint_state import state_bounds
 from d4orm_env.envs.lifelong import goal_region
@@ -54,7 +55,8 @@ class EnvSetup:
         lifelong: Whether robots that arrive get fresh goals.
         reward: The reward function; ``None`` for the paper's, which the engines compute.
         along_paths: Whether distances of rewards are lengths of shortest paths.
-        layout: Layout of one robot's observation.
+        layout: Layout of one robot's observation, before it becomes features.
+        features: What robots are shown instead, if they are egocentric.
     """
 
     def __init__(
@@ -87,6 +89,7 @@ class EnvSetup:
             communication_range=options.communication_range,
             line_of_sight=options.line_of_sight,
         )
+        self.features = Features.of_team(self.layout, problem.team) if options.egocentric else None
         if self.along_paths:
             problem.check_reachable()
         self.region = self._region()
@@ -121,6 +124,20 @@ class EnvSetup:
     def state_bounds(self, max_cycles: int, num_bodies: int) -> tuple[FloatArray, FloatArray]:
         """Finite bounds of the joint states of episodes of so many steps, with so many dynamic obstacles."""
         return state_bounds(self.problem, self.region, max_cycles, self.slack, num_bodies)
+
+    @property
+    def observation_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """``(D,)`` lowest and highest of what one robot is shown; features ``(F,)`` are of order one."""
+        if self.features is None:
+            return self.layout.low, self.layout.high
+        bound = self.features.bound(self.layout, self.problem.team)
+        return -bound, bound
+
+    @property
+    def action_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """``(K, m)`` lowest and highest actions."""
+        low, high = self.problem.team.control_bounds
+        return (low, high) if self.features is None else (-np.ones_like(low), np.ones_like(high))
 
     @property
     def draws(self) -> bool:

@@ -66,7 +66,7 @@ class Simulation:
         self.problems = WorldProblems(self.setup, self._disturbed, num_worlds)
         shape = self.worlds.docked.shape
         self.robot_rewards, self.reached = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
-        self._goals_reached = np.zeros(shape, np.int64)
+        self._goals_reached, self._frames = np.zeros(shape, np.int64), np.zeros((*shape, 2), np.float32)
         self.terms = no_terms(self.setup.reward, shape)
         self._paths = WorldPaths(self.problems.all, one_world=num_worlds == 1 or not self.setup.redraws)
         self._follows_paths = self.setup.along_paths or (self.setup.layout.observed_path and not self._observes_apart)
@@ -76,6 +76,19 @@ class Simulation:
         """Finite bounds of the joint states, for the present ``max_cycles``."""
         return self.setup.state_bounds(self.max_cycles, self.worlds.bodies.shape[1])
 
+    def show(self, seen: FloatArray, worlds: slice | BoolArray = slice(None)) -> FloatArray:
+        """What robots of some worlds are shown of observations ``(b, K, D)``: these or, if egocentric, features."""
+        if (features := self.setup.features) is None:
+            return seen
+        parts = features.encode(seen.reshape(-1, seen.shape[2]))
+        shown, self._frames[worlds] = (part.reshape(*seen.shape[:2], -1) for part in parts)
+        return shown
+
+    def controls(self, actions: FloatArray) -> FloatArray:
+        """``(B, K, m)`` controls in physical units for the actions of robots that were shown the worlds."""
+        features, most = self.setup.features, self.setup.problem.team.control_limits
+        return actions if features is None else features.decode(actions, self._frames, most)
+
     @property
     def ended(self) -> BoolArray:
         """``(B,)`` bool, episodes that are over."""
@@ -84,8 +97,7 @@ class Simulation:
     def reset_worlds(self, seeds: Mapping[int, int], out: FloatArray, *, others: np.uint8 = LOOK) -> None:
         """Begin the episodes of some worlds, and fill the observations ``out`` ``(B, K, D)``.
 
-        The seeds, from 0 to ``2**63 - 1``, are what all that is random follows from. The order for the ``others`` is
-        ``LOOK`` or ``SKIP``.
+        All that is random follows from the seeds, from 0 to ``2**63 - 1``. The ``others`` are to ``LOOK`` or ``SKIP``.
         """
         self._begin(seeds)
         orders = np.full(len(self.problems.all), others)

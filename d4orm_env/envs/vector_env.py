@@ -151,7 +151,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         observations = self._unseen()
         self._simulation.reset_worlds(self._drawn(mask), observations)
         self._running[mask] = True
-        return observations.reshape(self.num_envs, -1), self._infos(mask)
+        return self._simulation.show(observations).reshape(self.num_envs, -1), self._infos(mask)
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, NDArray[np.float64], BoolArray, BoolArray, Info]:
         """Advance every world one time step.
@@ -167,10 +167,11 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             ValueError: If the actions have another shape, or a value that is not finite or beyond 1e15.
         """
         self._require_episodes()
-        controls = joint_controls(actions, self._action_shape, self.problem.num_robots)
         simulation, worlds, seen = self._simulation, self._simulation.worlds, self._unseen()
+        controls = simulation.controls(joint_controls(actions, self._action_shape, self.problem.num_robots))
         simulation.step_worlds(controls, seen, self._drawn(simulation.ended))
-        ended, observations = simulation.ended, seen.reshape(self.num_envs, -1)
+        ended, shown = simulation.ended, simulation.show(seen)
+        observations = shown.reshape(self.num_envs, -1)
         rewards, terminated, truncated = worlds.reward.copy(), worlds.terminated.copy(), worlds.truncated.copy()
         infos = self._infos()
         if ended.any():
@@ -178,6 +179,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             if self._mode is AutoresetMode.SAME_STEP:
                 final = final_infos(observations, infos, ended)
                 simulation.reset_worlds(self._drawn(ended), seen, others=SKIP)
+                shown[ended] = simulation.show(seen[ended], ended)
                 infos = self._infos() | final
         return observations, rewards, terminated, truncated, infos
 
@@ -197,7 +199,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self._require_reset()
         observations, docked = self._unseen(), self._simulation.worlds.docked & ~self._simulation.ended[:, None]
         self._simulation.put_robots(states, docked, observations)
-        return observations.reshape(self.num_envs, -1), self._infos()
+        return self._simulation.show(observations).reshape(self.num_envs, -1), self._infos()
 
     def state(self) -> FloatArray:
         """``(B, S)`` joint states of the worlds; see :mod:`d4orm_env.envs.joint_state`.

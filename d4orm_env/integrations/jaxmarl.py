@@ -55,8 +55,8 @@ class JaxMARLNavigation(MultiAgentEnv):
         self.world = FunctionalEnv(scenario, num_robots, **options)
         super().__init__(self.world.problem.num_robots)
         self.agents = [f"robot_{robot}" for robot in range(self.num_agents)]
-        layout, limit = self.world.layout, self.world.action_limits.max(axis=0)
-        self.observation_spaces = {agent: Box(layout.low, layout.high, (layout.size,)) for agent in self.agents}
+        (low, high), limit = self.world.observation_bounds, self.world.action_limits.max(axis=0)
+        self.observation_spaces = {agent: Box(low, high, low.shape) for agent in self.agents}
         self.action_spaces = {agent: Box(-limit, limit, limit.shape) for agent in self.agents}
 
     @partial(jax.jit, static_argnums=0)

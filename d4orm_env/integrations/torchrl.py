@@ -82,11 +82,11 @@ class TorchRLNavigation(EnvBase):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        layout, team = self.worlds.layout, self.worlds.problem.team
+        spaces: tuple[Any, Any] = self.worlds.single_observation_space, self.worlds.single_action_space
+        seen, acted = (self._box(*(end.reshape(self._shape[1], -1) for end in (box.low, box.high))) for box in spaces)
         info = self._composite({name: self._flag(*self._shape) for name in _INFO})
-        seen = self._box(layout.low, layout.high)
         self.observation_spec = self._of_robots({"observation": seen, "info": info})
-        self.action_spec = self._of_robots({"action": self._box(*team.control_bounds)})
+        self.action_spec = self._of_robots({"action": acted})
         self.reward_spec = self._of_robots({"reward": Unbounded((*self._shape, 1), device=self.device)})
         done = {name: self._flag(self._shape[0]) for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(done, shape=self.batch_size, device=self.device)
@@ -99,7 +99,7 @@ class TorchRLNavigation(EnvBase):
         return Binary(1, (*shape, 1), device=self.device, dtype=torch.bool)
 
     def _box(self, low: FloatArray, high: FloatArray) -> Bounded:
-        """Return the spec of ``n`` numbers for every robot, between bounds ``(n,)`` or ``(K, n)``."""
+        """Return the spec of ``n`` numbers for every robot, between bounds ``(K, n)``."""
         shape = (*self._shape, low.shape[-1])
         ends = (torch.as_tensor(np.broadcast_to(end, shape).copy(), device=self.device) for end in (low, high))
         return Bounded(*ends, shape, device=self.device, dtype=torch.float32)

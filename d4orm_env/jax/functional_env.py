@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -89,7 +89,10 @@ class FunctionalEnv:
 
     Attributes:
         problem: The first instance.
-        layout: Layout of one robot's observation.
+        layout: Layout of one robot's observation, before it becomes features.
+        features: What robots are shown instead, if they are egocentric.
+        observation_bounds: ``(D,)`` lowest and highest of what one robot is shown.
+        action_bounds: ``(K, m)`` lowest and highest actions.
         max_cycles: Steps until truncation.
 
     Raises:
@@ -111,6 +114,8 @@ class FunctionalEnv:
         setup = EnvSetup(chosen)
         self.problem: Problem = setup.problem
         self.layout: ObservationLayout = setup.layout
+        self.features: Any = setup.features  # which take arrays of JAX too
+        self.observation_bounds, self.action_bounds = setup.observation_bounds, setup.action_bounds
         self.max_cycles: int = setup.max_cycles
         self._reward = find_reward(chosen.reward) or "paper"
         known = [one for one in setup.disturbances if isinstance(one, ControlNoise | RayNoise)]
@@ -127,12 +132,12 @@ class FunctionalEnv:
     @cached_property
     def observation_shape(self) -> tuple[int, int]:
         """``(K, D)``."""
-        return self.problem.num_robots, self.layout.size
+        return self.problem.num_robots, len(self.observation_bounds[0])
 
     @cached_property
     def action_limits(self) -> np.ndarray:
-        """``(K, m)`` largest controls, in physical units; zero where a robot has no such component."""
-        return self.problem.team.control_limits
+        """``(K, m)`` largest actions: controls in physical units, zero where a robot has no such component; or ones."""
+        return self.problem.team.control_limits if self.features is None else self.action_bounds[1]
 
     def instance(self, number: int | jax.Array) -> Problem:
         """One of the instances; the number may be traced."""
@@ -150,7 +155,13 @@ class FunctionalEnv:
         return state, self.observe(state)
 
     def observe(self, state: EnvState) -> jax.Array:
-        """``(K, D)`` what every robot sees."""
+        """``(K, D)`` what every robot is shown."""
+        seen = self._seen(state)
+        shown: jax.Array = seen if self.features is None else self.features.encode(seen)[0]
+        return shown
+
+    def _seen(self, state: EnvState) -> jax.Array:
+        """``(K, D)`` what every robot sees, in physical units."""
         seen = functional.observe(self.instance(state.instance), state.team, self.layout, self.max_cycles)
         if not self._ray_noise:
             return seen
@@ -164,7 +175,7 @@ class FunctionalEnv:
         Args:
             key: Key of the noise.
             state: The world.
-            actions: ``(K, m)`` controls in physical units, clipped to the robots' limits.
+            actions: ``(K, m)`` controls in physical units, clipped to the robots' limits; or what egocentric robots do.
         """
         after, transition = self._move(key, state, actions)
         return after, transition._replace(observations=self.observe(after))
@@ -189,6 +200,9 @@ class FunctionalEnv:
     def _move(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         problem, team = self.instance(state.instance), state.team
         actions = jnp.asarray(actions, jnp.float32)
+        if self.features is not None:
+            frames = self.features.encode(self._seen(state))[1]
+            actions = self.features.decode(actions, frames, self.problem.team.control_limits)
         if np.any(self._noise):
             actions = actions + self._noise * jax.random.normal(key, actions.shape, jnp.float32)
         after, step = functional.step(problem, team, actions, self._reward)

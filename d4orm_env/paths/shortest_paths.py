@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import FloatArray, Floats, read_only
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, read_only
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
@@ -186,6 +186,16 @@ def observe_paths(observations: FloatArray, layout: ObservationLayout, direction
     seen, parts = layout.paths(observations), layout.path
     seen[..., parts.direction] = direction
     seen[..., parts.length] = np.minimum(length, layout.high[-1])[..., None]
+
+
+def along_paths(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
+    """``(N, d)`` vectors along paths, as long as they are, and ``(N,)`` robots with one: neither at the goal nor lost.
+
+    Of unit vectors ``direction`` ``(N, d)``, zero at a goal, and ``length`` ``(N,)`` [m], infinite without a path.
+    """
+    direction, length = np.asarray(direction, np.float64), np.asarray(length, np.float64)
+    known = (direction != 0).any(axis=1) & np.isfinite(length)
+    return direction * np.where(known, length, 0.0)[:, None], known
 
 
 def _first_or_finer(problem: Problem, space: Space, reach: float, before: Lattice | None) -> Lattice:

@@ -15,7 +15,10 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.lazy import LazyModule
-from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
+from d4orm_env.envs.features import Features
+from d4orm_env.envs.joint_state import split_state
+from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices, within_limits
+from d4orm_planners.tracking.steering import brake_to_dock
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -40,19 +43,30 @@ class SharedPolicy(Policy):
         predict: ``(B, n)`` float32 observations of any number of robots to ``(B, m)`` actions.
         weights: Something with a ``state_dict``, by which a store of trials tells one training's model from another's.
         normalized: Whether actions are in ``[-1, 1]``, which stand for the lowest and the highest of the environment.
+        egocentric: Whether it was trained in ``egocentric`` environments; the one that it drives in is not. Where the
+            goal speed is limited, its robots then brake to dock as go-to-goal does, as those of the package's policies.
     """
 
-    def __init__(self, predict: Callable[[FloatArray], ArrayLike], weights: Model, normalized: bool = False) -> None:
-        self._predict, self._weights, self._normalized = predict, weights, normalized
+    def __init__(
+        self,
+        predict: Callable[[FloatArray], ArrayLike],
+        weights: Model,
+        normalized: bool = False,
+        egocentric: bool = False,
+    ) -> None:
+        self._predict, self._weights, self._normalized, self._egocentric = predict, weights, normalized, egocentric
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
         self._spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
+        self._features = Features.of_team(env.unwrapped.layout, self.problem.team) if self._egocentric else None
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         if not observations:
             return {}
         stacked = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
+        if self._features is not None:
+            return self._act_egocentrically(self._features, observations, stacked, state)
         actions = as_float32(self._predict(stacked))
         if self._normalized:
             spaces = [self._spaces[agent] for agent in observations]
@@ -60,54 +74,74 @@ class SharedPolicy(Policy):
             actions = low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
         return within_limits(self.problem, dict(zip(observations, actions)))
 
+    def _act_egocentrically(
+        self, features: Features, observations: Observations, stacked: FloatArray, state: FloatArray
+    ) -> Actions:
+        robots, joint = robot_indices(observations), split_state(self.problem, state)
+        seen, frames = features.encode(stacked)
+        limits = self.problem.team.control_limits[robots]
+        controls = features.decode(as_float32(self._predict(seen)), frames, limits)
+        return within_limits(
+            self.problem, dict(zip(observations, brake_to_dock(self.problem, robots, controls, joint)))
+        )
+
     def identity(self) -> dict[str, object]:
         digest = hashlib.sha256()
         for name, tensor in self._weights.state_dict().items():
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
         settings = getattr(self._predict, "keywords", {})  # of a partial
-        return {**settings, "normalized": self._normalized, "weights": digest.hexdigest()}
+        own = {"egocentric": True} if self._egocentric else {}
+        return {**settings, **own, "normalized": self._normalized, "weights": digest.hexdigest()}
 
 
-def from_sb3(model: Model, deterministic: bool = True) -> SharedPolicy:
+def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False) -> SharedPolicy:
     """A model of Stable-Baselines3, trained on the environment's own observations and actions, as through SuperSuit.
 
     Args:
         model: Result of ``PPO.load(path)`` or of the training.
         deterministic: Take the most likely action rather than draw one.
+        egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
     """
-    return SharedPolicy(partial(_ask_sb3, model, deterministic=deterministic), model.policy)
+    ask = partial(_ask_sb3, model, deterministic=deterministic)
+    return SharedPolicy(ask, model.policy, egocentric=egocentric)
 
 
-def from_torch(module: Model, normalized: bool = False) -> SharedPolicy:
+def from_torch(module: Model, normalized: bool = False, egocentric: bool = False) -> SharedPolicy:
     """A ``torch.nn.Module`` that maps observations ``(B, n)`` to actions ``(B, m)``, asked without gradients.
 
     Args:
         module: The module, on the CPU.
         normalized: Whether its actions are in ``[-1, 1]``.
+        egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
     """
-    return SharedPolicy(partial(_ask_torch, module), module, normalized)
+    return SharedPolicy(partial(_ask_torch, module), module, normalized, egocentric)
 
 
-def from_torchrl(module: Model, observation_key: Key = "observation", action_key: Key = "action") -> SharedPolicy:
+def from_torchrl(
+    module: Model, observation_key: Key = "observation", action_key: Key = "action", egocentric: bool = False
+) -> SharedPolicy:
     """A module of TorchRL (or TensorDict), which is asked for its deterministic action, without gradients.
 
     Args:
         module: Reads ``(B, n)`` observations from a ``TensorDict`` of ``B`` robots, writes ``(B, m)`` actions into it.
         observation_key: Key of the observations.
         action_key: Key of the actions.
+        egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
     """
-    return SharedPolicy(partial(_ask_torchrl, module, observation_key=observation_key, action_key=action_key), module)
+    ask = partial(_ask_torchrl, module, observation_key=observation_key, action_key=action_key)
+    return SharedPolicy(ask, module, egocentric=egocentric)
 
 
-def from_rllib(module: Model, normalized: bool = True) -> SharedPolicy:
+def from_rllib(module: Model, normalized: bool = True, egocentric: bool = False) -> SharedPolicy:
     """An ``RLModule`` of RLlib on torch, asked by ``forward_inference``.
 
     Args:
         module: Result of ``algorithm.get_module(module_id)`` or ``RLModule.from_checkpoint(path)``.
         normalized: Whether its actions are in ``[-1, 1]``, as RLlib trains unless ``normalize_actions`` is off.
+        egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
     """
-    return SharedPolicy(partial(_ask_rllib, module), module, normalized)
+    return SharedPolicy(partial(_ask_rllib, module), module, normalized, egocentric)
 
 
 def _ask_sb3(model: Model, observations: FloatArray, *, deterministic: bool) -> ArrayLike:

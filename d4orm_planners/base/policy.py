@@ -15,6 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.inputs import usable
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_env.envs.options import EnvOptions
 from d4orm_planners.base.driving import ATTRIBUTE, driven_alone
 from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.plan import Plan
@@ -63,7 +64,11 @@ class Policy(ABC):
         Args:
             env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
             seed: Seeds whatever the policy draws.
+
+        Raises:
+            ValueError: If the environment is egocentric.
         """
+        getattr(env.unwrapped, "options", EnvOptions()).require_physical_units()
         self.problem = env.unwrapped.problem
 
     @abstractmethod

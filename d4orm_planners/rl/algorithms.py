@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBu
 from stable_baselines3.common.utils import FloatSchedule, set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from d4orm_planners.rl.features import Features
+from d4orm_env.envs.features import Features
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.sb3_network import SetExtractor
 from d4orm_planners.rl.task_mixture import MixedVecEnv

@@ -16,7 +16,7 @@ from d4orm_planners.base.policy import Actions, Observations, Policy, require_re
 from d4orm_planners.base.settings import CheckedSettings, PathText
 from d4orm_planners.rl.detours import Detours
 from d4orm_planners.rl.network import SUFFIX, Network, load_network, range_sensors
-from d4orm_planners.tracking.steering import drive_to_goal, goals_along_paths, must_brake
+from d4orm_planners.tracking.steering import brake_to_dock, goals_along_paths
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -137,13 +137,8 @@ class LearnedPolicy(Policy):
         else:
             controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
         if isinstance(self._actor, _NetworkActor) and not self._actor.network.header.brakes:
-            controls = self._braking(robots, controls, joint)
+            controls = brake_to_dock(self.problem, robots, controls, joint)
         return within_limits(self.problem, dict(zip(observations, controls)))
-
-    def _braking(self, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
-        """``(N, m)`` the controls, but of robots that must brake now to dock those of go-to-goal."""
-        braking = must_brake(self.problem, joint.states, joint.controls, joint.goals)[robots, None]
-        return np.where(braking, drive_to_goal(self.problem, joint.states, joint.goals)[robots], controls)
 
     def _look_along_paths(self, network: Network, robots: list[int], seen: FloatArray, joint: JointState) -> None:
         """Change the goals in ``seen`` ``(N, D)``: as in training, by the map that all have, or round docked robots.

@@ -19,7 +19,7 @@ from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.dynamics.models import get_model
-from d4orm_planners.rl.features import Features
+from d4orm_env.envs.features import Features
 
 FORMAT = 1
 EPSILON = 0.1

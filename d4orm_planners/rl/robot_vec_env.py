@@ -15,11 +15,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, as_float32
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.core.problem import Problem
+from d4orm_env.envs.features import Features
 from d4orm_env.envs.rewards import RewardFunction
 from d4orm_env.envs.team_step import Info
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_env.scenarios.problems import ScenarioLike
-from d4orm_planners.rl.features import Features
 
 
 class SharedVecEnv(VecEnv):

@@ -17,9 +17,9 @@ from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.team import Team
+from d4orm_env.envs.features import Features
 from d4orm_env.scenarios.problems import SCENARIOS, is_scenario_file
 from d4orm_planners.base.policy import Policy, robot_indices
-from d4orm_planners.rl.features import Features
 
 if TYPE_CHECKING:
     from minari import MinariDataset

@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from d4orm_planners.rl.features import Features
+from d4orm_env.envs.features import Features
 from d4orm_planners.rl.network import EPSILON, FORMAT, KINDS, SUM_SCALE, Header, Network
 
 if TYPE_CHECKING:

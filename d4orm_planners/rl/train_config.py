@@ -179,7 +179,7 @@ class TrainingSettings(TrainConfig):
             obstacles, see :mod:`d4orm_planners.rl.network`.
         observed_robots: In observations.
         shortest_paths: Whether robots see their goals along their shortest paths, as is wanted among walls, see
-            :meth:`~d4orm_planners.rl.features.Features.along`.
+            :meth:`~d4orm_env.envs.features.Features.along`.
         learning_rate: At the beginning; ``None`` is the algorithm's own. It falls linearly to a tenth.
         learner_settings: Further settings of the algorithm, as Stable-Baselines3 calls them, where they are others than
             those of :mod:`d4orm_planners.rl.algorithms`: ``{"gradient_steps": 8}``.

@@ -17,6 +17,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep
+from d4orm_env.envs.joint_state import JointState
+from d4orm_env.paths.shortest_paths import along_paths
 
 Rows = TypeVar("Rows", FloatArray, Floats)
 Columns: TypeAlias = tuple[FloatArray, ...]
@@ -72,16 +74,6 @@ def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: Floa
     return np.where(known[:, None], places + ahead, goals).astype(np.float32)
 
 
-def along_paths(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolArray]:
-    """``(N, d)`` vectors along paths, as long as they are, and ``(N,)`` robots with one: neither at the goal nor lost.
-
-    Of unit vectors ``direction`` ``(N, d)``, zero at a goal, and ``length`` ``(N,)`` [m], infinite without a path.
-    """
-    direction, length = np.asarray(direction, np.float64), np.asarray(length, np.float64)
-    known = (direction != 0).any(axis=1) & np.isfinite(length)
-    return direction * np.where(known, length, 0.0)[:, None], known
-
-
 def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArray) -> FloatArray:
     """``(K, m)`` controls inside each robot's limits that bring the team from ``states`` ``(K, n)`` to ``velocities``
     ``(K, d)`` [m/s] as soon as they allow.
@@ -134,6 +126,12 @@ def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals
     gap = np.linalg.norm(goals - states[:, : problem.dimension], axis=1) - problem.goal_radius
     braking = speed * (speed / (2 * problem.team.max_acceleration) + np.float32(problem.dt))
     return np.isfinite(problem.goal_speed) & (gap <= braking)
+
+
+def brake_to_dock(problem: Problem, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
+    """``(N, m)`` the controls of some robots, but of those that must brake now to dock the controls of go-to-goal."""
+    braking = must_brake(problem, joint.states, joint.controls, joint.goals)[robots, None]
+    return np.where(braking, drive_to_goal(problem, joint.states, joint.goals)[robots], controls)
 
 
 def short_way_round(problem: Problem, differences: Rows) -> Rows:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import argument_parser, count, require, save_table
+from examples.recipes.task import WORLD
 
 require("rl", "torchrl")
 try:
@@ -57,12 +58,12 @@ class Successes(Callback):
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
     parser.add_argument("--iterations", type=count, default=200, help="of 8192 steps of teams each")
     arguments = parser.parse_args()
     iterations, parts = (60, 3) if arguments.quick else (arguments.iterations, 10)
     torch.set_num_threads(1)  # the layers are too small to be shared
-    own = {"num_robots": arguments.num_robots, "reward": "training", "max_cycles": 100, "num_instances": 512}
+    own = {"num_robots": arguments.num_robots, "num_instances": 512, **WORLD}
     counted, folder = Successes(), arguments.out / "benchmarl"
     folder.mkdir(parents=True, exist_ok=True)
     model = MlpConfig.get_from_yaml()

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from examples.outputs import argument_parser, count, require, save_table
+from examples.recipes.task import WORLD, solved
 
 require("rl", "torch")
 import torch
@@ -22,7 +23,7 @@ from torch import nn
 from torch.distributions import Normal
 
 import d4orm_env  # noqa: F401 - its environments are registered by the import
-from d4orm_planners.rl.features import Features
+from d4orm_planners.base.adapters import from_torch
 
 WORLDS, HORIZON = 256, 32
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.98, 0.95, 0.2, 4, 4
@@ -71,23 +72,19 @@ class Robots:
     def __init__(self, num_robots: int, seed: int) -> None:
         self.env = gymnasium.make_vec(
             "d4orm/Navigation-v0", num_envs=WORLDS, vectorization_mode="vector_entry_point", scenario="random",
-            num_robots=num_robots, reward="training", max_cycles=100, autoreset_mode="SameStep", num_instances=512,
+            num_robots=num_robots, autoreset_mode="SameStep", num_instances=512, **WORLD,
         )  # fmt: skip
         observations, infos = self.env.reset(seed=seed)
-        self.limits = np.tile(self.env.single_action_space.high, (WORLDS, 1)).reshape(WORLDS * num_robots, -1)
-        # Seen from a robot that faces its goal: with observations as they come, teams of four stopped at 53%.
-        self.features = Features.of(self.env.unwrapped.layout, "holonomic2d")
+        self.num_actions = self.env.single_action_space.shape[0] // num_robots
         self.num_robots, self.acting = num_robots, ~infos["arrived"]
         self.seen = self._rows(observations)
 
     def _rows(self, observations: np.ndarray) -> Any:
-        rows, self.frames = self.features.encode(observations.reshape(WORLDS * self.num_robots, -1))
-        return torch.as_tensor(rows)
+        return torch.as_tensor(observations.reshape(WORLDS * self.num_robots, -1))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, list[bool]]:
         """Rewards, whether episodes of robots ended and whether they acted ``(rows,)``; how worlds that ended did."""
-        controls = self.features.decode(actions.numpy(), self.frames, self.limits).reshape(WORLDS, -1)
-        observations, _, terminated, truncated, infos = self.env.step(controls)
+        observations, _, terminated, truncated, infos = self.env.step(actions.numpy().reshape(WORLDS, -1))
         acted, ended = self.acting, terminated | truncated
         arrived, successes = infos["arrived"], []
         if ended.any():
@@ -149,14 +146,14 @@ def update(agent: Agent, optimizer: Any, batch: Batch, advantage: Any) -> None:
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
-    parser.add_argument("--updates", type=count, default=300, help="of 8192 steps of teams each")
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
+    parser.add_argument("--updates", type=count, default=150, help="of 8192 steps of teams each")
     arguments = parser.parse_args()
     updates, parts = (60, 3) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the layers are too small to be shared
     robots = Robots(arguments.num_robots, seed=0)
-    agent = Agent(robots.seen.shape[1], robots.limits.shape[1])
+    agent = Agent(robots.seen.shape[1], robots.num_actions)
     optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE, eps=1e-5)
     rows, begin, done = [], time.perf_counter(), 0
     for part in np.array_split(np.arange(updates), parts):
@@ -171,6 +168,7 @@ def main() -> None:
         rows.append({"robot-steps": done, "episodes": len(successes), "success": f"{np.mean(successes or [0]):.0%}"})
         print(f"{done} robot-steps, {time.perf_counter() - begin:.0f} s: success {rows[-1]['success']}", flush=True)
     robots.env.close()
+    print(solved(from_torch(agent.actor, egocentric=True), arguments))
     save_table(rows, arguments.out / "cleanrl_ppo.csv")
 
 

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from examples.outputs import argument_parser, require, save_table
+from examples.outputs import argument_parser, count, require, save_table
+from examples.recipes.task import WORLD, solved
 
 require("jaxrl", "optax")
 
@@ -23,12 +24,11 @@ require("jaxrl", "optax")
 import optax
 
 from d4orm_env.jax.functional_env import FunctionalEnv
+from d4orm_planners.base.adapters import SharedPolicy
 
-NUM_WORLDS, NUM_ROBOTS, HORIZON = 256, 2, 32
+NUM_WORLDS, HORIZON = 256, 32
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES = 0.98, 0.95, 0.2, 4, 4
 ENTROPY, VALUE = 1e-3, 0.5
-REACH = 5.0
-"""Lengths in observations are taken in this measure [m], and cut off beyond it."""
 
 
 class Sample(NamedTuple):
@@ -78,22 +78,14 @@ def log_density(network: Any, observation: Any, action: Any) -> Any:
     return (-0.5 * ((action - mean) / jnp.exp(log_std)) ** 2 - log_std - 0.5 * np.log(2 * np.pi)).sum(-1)
 
 
-def seen(env: FunctionalEnv, observations: Any) -> Any:
-    """Observations of order one."""
-    scale = np.minimum(np.maximum(np.abs(env.layout.high), 1e-3), REACH)
-    return jnp.clip(observations / along(scale, observations), -1, 1)
-
-
 def collect(env: FunctionalEnv, network: Any, carry: Any, key: Any) -> tuple[Any, tuple[Sample, Any]]:
     """One step of all worlds."""
-    state, observations = carry
-    observation = seen(env, observations)
+    state, observation = carry
     draw, move = jax.random.split(key)
     mean = apply(network["actor"], observation)
     action = mean + along(jnp.exp(network["log_std"]), mean) * jax.random.normal(draw, mean.shape, jnp.float32)
     value = apply(network["critic"], observation)[..., 0]
-    controls = jnp.clip(action, -1, 1) * along(env.action_limits, action)
-    state, transition = jax.vmap(env.step)(jax.random.split(move, len(observations)), state, controls)
+    state, transition = jax.vmap(env.step)(jax.random.split(move, len(observation)), state, action)
     done = transition.finished | transition.done[:, None]
     sample = Sample(
         observation,
@@ -134,7 +126,7 @@ def loss(network: Any, samples: Sample, advantage: Any, target: Any) -> Any:
 def train(env: FunctionalEnv, num_updates: int, key: Any) -> tuple[Any, Any]:
     """The network, and for every update episodes ended and succeeded, ``(updates, 2)``; to be compiled."""
     init, worlds, updates = jax.random.split(key, 3)
-    network = make_network(init, env.layout.size, env.problem.control_size)
+    network = make_network(init, env.observation_shape[1], env.problem.control_size)
     optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(1e-3))
     start = jax.vmap(env.reset)(jax.random.split(worlds, NUM_WORLDS))
 
@@ -147,7 +139,7 @@ def train(env: FunctionalEnv, num_updates: int, key: Any) -> tuple[Any, Any]:
         learner, world = carry
         act, *shuffles = jax.random.split(key, 1 + EPOCHS)
         world, (samples, ends) = jax.lax.scan(partial(collect, env, learner[0]), world, jax.random.split(act, HORIZON))
-        last = apply(learner[0]["critic"], seen(env, world[1]))[..., 0]
+        last = apply(learner[0]["critic"], world[1])[..., 0]
         advantage = advantages(samples, last)
         flat = jax.tree.map(
             lambda values: values.reshape(-1, *values.shape[3:]), (samples, advantage, advantage + samples.value)
@@ -166,18 +158,22 @@ def train(env: FunctionalEnv, num_updates: int, key: Any) -> tuple[Any, Any]:
 
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    arguments = argument_parser(__doc__).parse_args()
-    num_updates, rows = (80, 4) if arguments.quick else (400, 10)
-    env = FunctionalEnv("random", num_robots=NUM_ROBOTS, reward="training", max_cycles=100)
-    _, counts = jax.jit(partial(train, env, num_updates))(jax.random.key(0))
+    parser = argument_parser(__doc__)
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
+    parser.add_argument("--updates", type=count, default=150, help="of 8192 steps of teams each")
+    arguments = parser.parse_args()
+    num_updates, rows = (80, 4) if arguments.quick else (arguments.updates, 10)
+    env = FunctionalEnv("random", num_robots=arguments.num_robots, num_instances=512, **WORLD)
+    network, counts = jax.jit(partial(train, env, num_updates))(jax.random.key(0))
     table = [
         {
-            "robot-steps": (part[-1] + 1) * HORIZON * NUM_WORLDS * NUM_ROBOTS,
+            "robot-steps": (part[-1] + 1) * HORIZON * NUM_WORLDS * arguments.num_robots,
             "episodes": int(counts[part, 0].sum()),
             "success": f"{counts[part, 1].sum() / max(counts[part, 0].sum(), 1):.0%}",
         }
         for part in np.array_split(np.arange(num_updates), rows)
     ]
+    print(solved(SharedPolicy(jax.jit(partial(apply, network["actor"])), None, egocentric=True), arguments))
     save_table(table, arguments.out / "jax_ppo.csv")
 
 

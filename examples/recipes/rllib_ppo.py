@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import argument_parser, count, save_table
+from examples.recipes.task import WORLD, solved
 
 try:
     from ray.rllib.algorithms.ppo import PPOConfig
@@ -20,9 +21,7 @@ except ImportError as error:
 from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
-from d4orm_env import navigation_v0
 from d4orm_env.integrations.rllib import RLlibNavigation
-from d4orm_planners import run_episode
 from d4orm_planners.base.adapters import from_rllib
 
 WORLDS = 64
@@ -51,12 +50,11 @@ def settings(env_config: dict[str, Any]) -> PPOConfig:
 def main() -> None:
     """Train, print how many episodes succeeded on the way, and drive with what was learned."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
     parser.add_argument("--iterations", type=count, default=200, help="of 2048 steps of teams each")
     arguments = parser.parse_args()
     iterations, parts = (45, 3) if arguments.quick else (arguments.iterations, 10)
-    world = {"scenario": "random", "num_robots": arguments.num_robots, "reward": "training", "max_cycles": 100}
-    algorithm = settings(world).build_algo()
+    algorithm = settings({"scenario": "random", "num_robots": arguments.num_robots, **WORLD}).build_algo()
     results = [algorithm.train()["env_runners"] for _ in range(iterations)]
     rows = []
     for part in np.array_split(np.arange(iterations), parts):
@@ -66,10 +64,8 @@ def main() -> None:
         success = (ended * share).sum() / max(ended.sum(), 1)
         rows.append({"robot-steps": int(steps), "episodes": int(ended.sum()), "success": f"{success:.0%}"})
     save_table(rows, arguments.out / "rllib_ppo.csv")
-    policy = from_rllib(algorithm.get_module("robot"))
-    env = navigation_v0.parallel_env(**world)
-    arrived = [int(run_episode(env, policy, seed=seed).metrics["arrived"]) for seed in range(10_000, 10_010)]
-    print(f"afterwards {sum(arrived)} of {10 * arguments.num_robots} robots arrived in 10 episodes")
+    policy = from_rllib(algorithm.get_module("robot"), normalized=False, egocentric=True)
+    print(solved(policy, arguments))
     algorithm.stop()
 
 

@@ -15,50 +15,42 @@ from typing import Any
 
 import numpy as np
 from examples.outputs import argument_parser, count, require, save_table
+from examples.recipes.task import WORLD, solved
 
 require("rl", "torchrl")
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.envs.utils import set_exploration_type
-from torchrl.modules import MultiAgentMLP, ProbabilisticActor, TanhNormal
+from torchrl.modules import MLP, MultiAgentMLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from d4orm_env.integrations.torchrl import TorchRLNavigation
+from d4orm_planners.base.adapters import from_torchrl
 
 WORLDS, HORIZON = 256, 32
 GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES, LEARNING_RATE = 0.98, 0.95, 0.2, 4, 4, 1e-3
-REACH = 5.0
-"""Observations are cut off beyond this and taken in its measure: they are in metres, metres per second and seconds."""
-
-SEEN, ACTION, REWARD, VALUE = (("robots", name) for name in ("seen", "action", "reward", "state_value"))
+SEEN, ACTION, REWARD, VALUE = (("robots", name) for name in ("observation", "action", "reward", "state_value"))
 
 
-def scaled() -> TensorDictModule:
-    """Return a module that scales observations for the networks."""
-    return TensorDictModule(
-        lambda observation: observation.clamp(-REACH, REACH) / REACH, [("robots", "observation")], [SEEN]
-    )
-
-
-def network(env: TorchRLNavigation, outputs: int, centralised: bool) -> MultiAgentMLP:
-    """One for all robots, of what each sees or of what all see."""
-    return MultiAgentMLP(
-        n_agent_inputs=env.observation_spec["robots", "observation"].shape[-1], n_agent_outputs=outputs,
-        n_agents=len(env.group_map["robots"]), centralised=centralised, share_params=True, depth=2, num_cells=64,
-        activation_class=torch.nn.Tanh,
+def make_critic(env: TorchRLNavigation) -> TensorDictModule:
+    """Return the robots' critic, one network for all of what all see."""
+    network = MultiAgentMLP(
+        n_agent_inputs=env.observation_spec[SEEN].shape[-1], n_agent_outputs=1, n_agents=len(env.group_map["robots"]),
+        centralised=True, share_params=True, depth=2, num_cells=64, activation_class=torch.nn.Tanh,
     )  # fmt: skip
+    return TensorDictModule(network, [SEEN], [VALUE])
 
 
 def make_actor(env: TorchRLNavigation) -> ProbabilisticActor:
-    """Return the robots' actor."""
-    limits = env.action_spec["robots", "action"].space
+    """Return the robots' actor, one network for any number of them, of what each sees."""
+    inputs, outputs = env.observation_spec[SEEN].shape[-1], env.action_spec[ACTION].shape[-1]
     parameters = [("robots", "loc"), ("robots", "scale")]
-    means = torch.nn.Sequential(network(env, 2 * limits.high.shape[-1], False), NormalParamExtractor())
+    network = MLP(inputs, 2 * outputs, depth=2, num_cells=64, activation_class=torch.nn.Tanh)
+    means = torch.nn.Sequential(network, NormalParamExtractor())
     return ProbabilisticActor(
-        TensorDictSequential(scaled(), TensorDictModule(means, [SEEN], parameters)), in_keys=parameters,
+        TensorDictModule(means, [SEEN], parameters), in_keys=parameters,
         out_keys=[ACTION], distribution_class=TanhNormal, return_log_prob=True, log_prob_key=("robots", "log_density"),
-        distribution_kwargs={"low": limits.low[0], "high": limits.high[0]},
     )  # fmt: skip
 
 
@@ -91,18 +83,16 @@ def with_advantages(data: Any, advantages: GAE) -> Any:
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=2, help="size of the team")
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
     parser.add_argument("--updates", type=count, default=200, help="of 8192 steps of teams each")
     arguments = parser.parse_args()
     updates, parts = (60, 3) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the layers are too small to be shared
-    env = TorchRLNavigation(
-        WORLDS, "random", arguments.num_robots, seed=0, reward="training", max_cycles=100, num_instances=512
-    )
+    env = TorchRLNavigation(WORLDS, "random", arguments.num_robots, seed=0, num_instances=512, **WORLD)
     state = env.reset()
     actor = make_actor(env)
-    critic = TensorDictSequential(scaled(), TensorDictModule(network(env, 1, True), [SEEN], [VALUE]))
+    critic = make_critic(env)
     loss = ClipPPOLoss(actor, critic, clip_epsilon=CLIP, entropy_coeff=1e-3, normalize_advantage=False)
     names = {"done": ("robots", "done"), "terminated": ("robots", "terminated")}
     loss.set_keys(action=ACTION, reward=REWARD, value=VALUE, sample_log_prob=("robots", "log_density"), **names)
@@ -129,6 +119,7 @@ def main() -> None:
         rows.append({"robot-steps": done, "episodes": len(successes), "success": f"{np.mean(successes or [0]):.0%}"})
         print(f"{done} robot-steps, {time.perf_counter() - begin:.0f} s: success {rows[-1]['success']}", flush=True)
     env.close()
+    print(solved(from_torchrl(actor, SEEN, ACTION, egocentric=True), arguments))
     save_table(rows, arguments.out / "torchrl_mappo.csv")
 
 

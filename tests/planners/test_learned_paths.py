@@ -11,12 +11,12 @@ import pytest
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.envs.features import Features
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.rl.detours import Detours
-from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.learned import SEEN_OBSTACLES, SHIPPED
 from d4orm_planners.rl.network import Header, Network, load_network
 

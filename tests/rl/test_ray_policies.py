@@ -9,9 +9,9 @@ import pytest
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.envs.features import Features
 from d4orm_planners import evaluate, make_policy, run_episode
 from d4orm_planners.cli import app as cli
-from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.network import load_network
 
 pytest.importorskip("stable_baselines3")

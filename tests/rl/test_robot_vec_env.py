@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.observation_layout import ObservationLayout, ObservationSlices
-from d4orm_planners.rl.features import Features
+from d4orm_env.envs.features import Features
 
 MODELS = ("holonomic2d", "velocity2d", "differential_drive", "holonomic3d")
 

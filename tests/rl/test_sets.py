@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.envs.features import Features
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
-from d4orm_planners.rl.features import Features
 from d4orm_planners.rl.network import Header, Network, load_network
 from d4orm_planners.rl.perturbed_scenarios import clutter, perturbed
 

@@ -6,6 +6,7 @@ import csv
 import importlib
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -78,6 +79,7 @@ def completed(name: str, out: Path, *arguments: str) -> None:
     ("name", "module", "extra"),
     [
         ("supersuit_ppo", "supersuit", "rl"),
+        ("sb3_joint_ppo", "stable_baselines3", "rl"),
         ("train_and_compare", "stable_baselines3", "rl"),
         ("training_seeds", "stable_baselines3", "rl"),
         ("tune_learners", "stable_baselines3", "rl"),
@@ -779,11 +781,14 @@ def test_principal_components_are_distances_of_plans(multimodality: ModuleType) 
 
 
 @pytest.mark.slow
-def test_supersuit_trains_a_policy_that_acts(tmp_path: Path) -> None:
-    pytest.importorskip("supersuit")
+@pytest.mark.parametrize(("name", "module"), [("supersuit_ppo", "supersuit"), ("sb3_joint_ppo", "stable_baselines3")])
+def test_stable_baselines3_trains_a_policy_that_acts(name: str, module: str, tmp_path: Path) -> None:
+    pytest.importorskip(module)
     out = tmp_path / "out"
-    completed("supersuit_ppo", out)
-    assert [row["seed"] for row in table(out / "supersuit_ppo.csv")] == ["0", "1"]
+    result = run(name, out)
+    assert result.returncode == 0, result.stderr
+    assert re.search(r"solves \d of 5 unseen instances, after \d+\.\d minutes", result.stdout)
+    assert (out / f"{name}.zip").is_file()
 
 
 @pytest.mark.slow

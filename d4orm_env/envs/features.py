@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.observation_layout import ObservationSlices
+from d4orm_env.core.observation_layout import ObservationLayout, ObservationSlices
+from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import get_model
-from d4orm_planners.tracking.steering import along_paths
+from d4orm_env.paths.shortest_paths import along_paths
 
 TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
 """Models whose controls are vectors of the world."""
 
 ArrayOrTensor: TypeAlias = Any
-"""An array of NumPy or of torch."""
+"""An array of NumPy or JAX, or a tensor of torch."""
 
 Frame: TypeAlias = Literal["goal", "heading"]
 
@@ -58,11 +59,32 @@ class Features:
         turns = get_model(model).heading_index is not None
         return cls(slices, model in TURNED_MODELS, "heading" if turns else "goal")
 
+    @classmethod
+    def of_team(cls, slices: ObservationSlices, team: Team) -> Features:
+        """The same for a team.
+
+        Raises:
+            ValueError: If it mixes models.
+        """
+        if len(models := set(team.models)) > 1:
+            raise ValueError(
+                f"the team mixes {', '.join(sorted(models))}, which act in different frames; give model=, or leave "
+                "egocentric out"
+            )
+        return cls.of(slices, team.models[0])
+
     @property
     def size(self) -> int:
         """Number of features ``F``."""
         slices = self.slices
         return self.own_size + slices.num_neighbors * self.neighbor_size + slices.num_obstacles * self.obstacle_size
+
+    def bound(self, layout: ObservationLayout, team: Team) -> FloatArray:
+        """``(F,)`` magnitude that no feature exceeds: turned, a component may be as large as its vector."""
+        own, slowest = self.slices.own, team.max_speed.min()
+        motion = np.concatenate([layout.high[own.velocity], layout.high[own.max_acceleration]]).max() / slowest
+        largest = max(1.0, float(motion), float(layout.high[own.radius][0]))
+        return np.full(self.size, 2 * largest, np.float32)
 
     @property
     def own_size(self) -> int:
@@ -132,7 +154,8 @@ class Features:
         goal, max_speed = observations[:, own.goal], observations[:, own.max_speed]
         frame = _unit(goal[:, :2] if self.frame == "goal" else observations[:, own.heading])
         # On the goal itself any direction will do.
-        frame[(frame == 0).all(axis=1), 0] = 1
+        xp = namespace(observations)
+        frame = xp.where((frame == 0).all(axis=1)[:, None], xp.asarray([[1, 0]], np.float32), frame)
         rays = observations[:, self.slices.rays]
         if self.frame == "goal" and self.slices.num_rays:
             frame, rays = self._along_rays(frame, rays)
@@ -144,28 +167,29 @@ class Features:
             observations[:, own.time_left],
             observations[:, own.radius],
             observations[:, own.max_acceleration] / max_speed,
-            *_scales(np.maximum(rays - observations[:, own.radius], 0)),
+            *_scales(xp.maximum(rays - observations[:, own.radius], 0)),
             self._neighbors(frame, observations).reshape(count, -1),
             self._obstacles(frame, observations).reshape(count, -1),
         ]
-        features = np.concatenate(parts, axis=1, dtype=np.float32)
+        features = xp.concatenate(parts, axis=1, dtype=np.float32)
         return features, frame.astype(np.float32)
 
     def decode(self, actions: FloatArray, frames: FloatArray, limits: FloatArray) -> FloatArray:
         """Controls for a network's actions.
 
         Args:
-            actions: ``(N, m)`` in units of the limits, in the robots' frames.
-            frames: ``(N, 2)`` as from :meth:`encode`.
-            limits: ``(N, m)`` largest controls.
+            actions: ``(..., m)`` in units of the limits, in the robots' frames.
+            frames: ``(..., 2)`` as from :meth:`encode`.
+            limits: ``(..., m)`` largest controls.
 
         Returns:
-            ``(N, m)`` controls in physical units, within the limits: as a vector where controls are vectors.
+            ``(..., m)`` controls in physical units, within the limits: as a vector where controls are vectors.
         """
-        controls = np.clip(actions, -1, 1) * limits
+        xp = namespace(actions)
+        controls = xp.clip(actions, -1, 1) * limits
         if self.turned:
-            controls = _out_of(frames, controls * np.minimum(1, limits / np.maximum(_norm(controls), 1e-6)))
-        within: FloatArray = np.clip(controls, -limits, limits)
+            controls = _out_of(frames, controls * xp.minimum(1, limits / xp.maximum(_norm(controls), 1e-6)))
+        within: FloatArray = xp.clip(controls, -limits, limits)
         return within
 
     def actions(self, controls: FloatArray, frames: FloatArray, limits: FloatArray) -> FloatArray:
@@ -187,71 +211,86 @@ class Features:
 
     def _along_rays(self, frame: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Frames ``(N, 2)`` turned to the nearest rays, and rays ``(N, R)`` from these on, counter-clockwise."""
-        directions = self.slices.ray_directions
+        xp, directions = namespace(frame), self.slices.ray_directions
         first = (frame @ directions.T).argmax(axis=1)
-        order = (first[:, None] + np.arange(len(directions))) % len(directions)
-        return directions[first], np.take_along_axis(rays, order, axis=1)
+        order = (first[:, None] + xp.arange(len(directions))[None]) % len(directions)
+        return xp.asarray(directions)[first], xp.take_along_axis(rays, order, axis=1)
 
     def _neighbors(self, frame: FloatArray, observations: FloatArray) -> FloatArray:
         own, part, seen = self.slices.own, self.slices.neighbor, self.slices.neighbors(observations)
+        xp = namespace(observations)
         max_speed = observations[:, own.max_speed]
         position, velocity = seen[..., part.position], seen[..., part.velocity]
         reach = observations[:, None, own.radius] + seen[..., part.radius]
-        gap = np.maximum(_norm(position) - reach, 0)
+        gap = xp.maximum(_norm(position) - reach, 0)
         approach = -_dot(position, velocity)
-        time = np.clip(approach / np.maximum(_dot(velocity, velocity), 1e-6), 0, _HORIZON)
-        miss = np.maximum(_norm(position + time * velocity) - reach, 0)
+        time = xp.clip(approach / xp.maximum(_dot(velocity, velocity), 1e-6), 0, _HORIZON)
+        miss = xp.maximum(_norm(position + time * velocity) - reach, 0)
         parts = [
-            np.ones_like(gap),
+            xp.ones_like(gap),
             _into(frame[:, None], _unit(position)),
             *_scales(gap),
             _into(frame[:, None], velocity) / (2 * max_speed[:, None]),
             time / _HORIZON,
-            np.exp(-4 * miss),
+            xp.exp(-4 * miss),
         ]
-        features: FloatArray = np.concatenate(parts, axis=2) * seen[..., part.present]
+        features: FloatArray = xp.concatenate(parts, axis=2) * seen[..., part.present]
         return features
 
     def _obstacles(self, frame: FloatArray, observations: FloatArray) -> FloatArray:
         part, seen = self.slices.obstacle, self.slices.obstacles(observations)
-        present = seen[..., part.present]
-        if not present.any():
+        xp, present = namespace(observations), seen[..., part.present]
+        if xp is np and not present.any():
             return np.zeros((*seen.shape[:2], self.slices.dimension + 3), np.float32)
-        gap = np.maximum(seen[..., part.gap], 0)
-        parts = [np.ones_like(gap), _into(frame[:, None], _unit(seen[..., part.position])), *_scales(gap)]
-        features: FloatArray = np.concatenate(parts, axis=2) * present
+        gap = xp.maximum(seen[..., part.gap], 0)
+        parts = [xp.ones_like(gap), _into(frame[:, None], _unit(seen[..., part.position])), *_scales(gap)]
+        features: FloatArray = xp.concatenate(parts, axis=2) * present
         return features
+
+
+def namespace(array: ArrayOrTensor) -> Any:
+    """The functions for an array: NumPy's, or JAX's where it is one of those."""
+    return np if isinstance(array, np.ndarray) else array.__array_namespace__()
 
 
 def _scales(gap: NDArray[np.floating]) -> tuple[FloatArray, FloatArray]:
     """Two functions of a distance [m], one that resolves metres and one that resolves centimetres."""
-    return np.divide(1, 1 + gap), np.exp(-4 * gap)
+    xp = namespace(gap)
+    return xp.divide(1, 1 + gap), xp.exp(-4 * gap)
 
 
 def _dot(one: NDArray[np.floating], two: NDArray[np.floating]) -> FloatArray:
     """``(..., 1)`` products of ``(..., d)``; several times quicker than a sum over the short last axis."""
-    products: FloatArray = np.einsum("...i,...i->...", one, two)[..., None]
+    products: FloatArray = namespace(one).einsum("...i,...i->...", one, two)[..., None]
     return products
 
 
 def _norm(vectors: NDArray[np.floating]) -> FloatArray:
     """``(..., 1)`` lengths of ``(..., d)``."""
-    return np.sqrt(_dot(vectors, vectors))
+    length: FloatArray = namespace(vectors).sqrt(_dot(vectors, vectors))
+    return length
 
 
 def _unit(vectors: NDArray[np.floating]) -> FloatArray:
     """``(..., d)`` of length one; zero stays zero."""
-    return np.divide(vectors, np.maximum(_norm(vectors), 1e-6))
+    xp = namespace(vectors)
+    unit: FloatArray = xp.divide(vectors, xp.maximum(_norm(vectors), 1e-6))
+    return unit
 
 
 def _into(frame: FloatArray, vectors: FloatArray) -> FloatArray:
     """Turn ``(..., d)`` vectors of the world, about the vertical axis, into frames ``(..., 2)``."""
     cos, sin, x, y = frame[..., 0], frame[..., 1], vectors[..., 0], vectors[..., 1]
-    turned = vectors.copy()
-    turned[..., 0], turned[..., 1] = cos * x + sin * y, cos * y - sin * x
+    ahead, left = cos * x + sin * y, cos * y - sin * x
+    if not isinstance(vectors, np.ndarray):
+        xp = namespace(vectors)
+        turned: FloatArray = xp.concatenate([xp.stack([ahead, left], axis=-1), vectors[..., 2:]], axis=-1)
+        return turned
+    turned = vectors.copy()  # several times quicker than stacking
+    turned[..., 0], turned[..., 1] = ahead, left
     return turned
 
 
 def _out_of(frame: FloatArray, vectors: FloatArray) -> FloatArray:
     """The reverse of :func:`_into`."""
-    return _into(frame * np.array([1, -1], frame.dtype), vectors)
+    return _into(namespace(frame).concatenate([frame[..., :1], -frame[..., 1:]], axis=-1), vectors)
