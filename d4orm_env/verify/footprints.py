@@ -49,9 +49,9 @@ class Turning(Watch):
             gap[some] = self._gap_at(stretch, steps[some], pairs[some], first, np.zeros(len(some)))
 
         if np.isinf(self.minimum) and len(gap):
-            nearest = gap.argmin(keepdims=True)
-            ask(nearest)
-            self.minimum = float(gap[nearest[0]])
+            nearest = int(gap.argmin())
+            ask(np.array([nearest]))
+            self.minimum = float(gap[nearest])
         ask(np.flatnonzero(gap - lead < max(self.minimum, 0.0)))
         return gap
 

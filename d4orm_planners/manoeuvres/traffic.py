@@ -126,7 +126,7 @@ def _meets(
 
 @compiled
 def _steps_away(body: RobotBody, traffic: Traffic, other: Whole, step: Whole, pose: Floats, moving: int) -> int:
-    """Steps, from one on, in which another robot cannot be too near to one that is there, if one or two of them move."""
+    """Steps, from one on, in which another robot cannot be too near to one that is there, if one or both move."""
     there = traffic.poses[other, min(step, traffic.last[other])]
     dx, dy = there[0] - pose[0], there[1] - pose[1]
     far = body.arrays.radius[body.robot] + body.arrays.radius[other] + body.extra + 2 * body.stride
@@ -160,8 +160,9 @@ def _touches(
 
 @compiled
 def meeting(
-    body: RobotBody, traffic: Traffic, swept: Floats, first: int, last: int, depart: int, buffer: FloatArray
-) -> tuple[int, int]:
+    body: RobotBody, traffic: Traffic, swept: Floats | FloatArray, first: int, last: int, depart: int,
+    buffer: FloatArray,
+) -> tuple[int, int]:  # fmt: skip
     """The first step, of those from ``first`` to ``last`` of a move that begins at step ``depart``, in which another
     robot is too near, and a step of the clock before which that one does not go away; zeros for none.
     """

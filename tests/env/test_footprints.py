@@ -242,8 +242,8 @@ def test_discs_and_balls_round_bodies_hide_no_gap_from_the_judge(
     make: Callable[[], Problem], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, contacts = make(), set()
-    plans = [np.random.default_rng(seed).normal(size=(60, problem.num_robots, problem.control_size)) for seed in range(6)]
-    plans = [np.repeat(plan[::10], 10, axis=0) for plan in plans]
+    held = np.random.default_rng(0).normal(size=(6, 6, problem.num_robots, problem.control_size))
+    plans = np.repeat(held, 10, axis=1)
     reports = [verify(problem, plan) for plan in plans]
     for watch in (TurningPairs, Obstacles, Sides):
         monkeypatch.setattr(watch, "outer_gap", lambda self, pairs, *places: np.full(len(pairs), -np.inf))
