@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch
+from d4orm_env.verify.convex_bodies import ConvexBodies
 from d4orm_env.verify.discs import surroundings
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
-from d4orm_env.verify.footprints import ConvexBodies, TurningPairs, turning_watches
+from d4orm_env.verify.footprints import TurningPairs, turning_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
@@ -118,9 +119,12 @@ class _Course:
         self._shapes = ConvexBodies.of(problem.team) if problem.team.shapes else None
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
-        # Copies, or they would keep those at all sub-steps.
-        displacements = [self._displacement(steps)[:, -1].copy() for steps in self._parts(horizon, self._numbers)]
-        self.ends: Floats = np.cumsum(np.concatenate([start[None, :, : motion.size], *displacements]), axis=0)
+        self._moving = int(np.flatnonzero(motion.moving).max(initial=-1)) + 1
+        ends = np.zeros((horizon + 1, num_robots, motion.size))
+        ends[0] = start[:, : motion.size]
+        for steps in self._parts(self._moving, self._numbers):
+            ends[1:][steps] = self._displacement(steps)[:, -1]
+        self.ends: Floats = np.cumsum(ends, axis=0)
 
     def bodies(self, docking: Docking) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Robots and numbers ``(B,)`` of the bodies of every reading, those of trailers last."""
@@ -168,8 +172,7 @@ class _Course:
         """All steps, up to the first at which all are at rest, with a body for every reading of every robot."""
         horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
         stop = np.minimum(docking.steps, horizon)
-        moving = np.flatnonzero(self._motion.moving).max(initial=-1) + 1
-        horizon = min(horizon, int(docking.steps.max()) + 1, int(moving) + 1)
+        horizon = min(horizon, int(docking.steps.max()) + 1, self._moving + 1)
         docked = self.ends[stop, robot]
         for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
             displacement, place = self._displacement(steps), self.ends[:-1][steps]

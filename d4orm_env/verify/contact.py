@@ -20,11 +20,14 @@ Indices = NDArray[np.intp]
 
 _ROUNDING = 2.0**-30
 """Rounding of distances, as a share of how far any robot gets."""
-_WIDER = 1 + 2.0**-17
-"""Factor by which boxes are stretched for rounding."""
+WIDER = 1 + 2.0**-17
+"""Factor by which boxes, and discs round bodies, are stretched for rounding."""
 
 BLOCKS = (128, 32, 8, 1)
 """Steps that are judged at once, from many to one."""
+
+FEW = 128
+"""Pairs that are looked at closely first, those that may be nearest: they tell that many others do not matter."""
 
 MAX_NUMBERS = 2**18
 """Numbers in the largest arrays that are worked on at once, but for those of a single step."""
@@ -66,8 +69,10 @@ class Watch(ABC):
         self._smallest, self._smallest_time, self._first = (np.full(size, np.inf) for _ in range(3))
 
     @abstractmethod
-    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
-        """``(N,)`` gap of that pair at the beginning of that step [m]."""
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
+        """``(N,)`` gap of that pair at the beginning of that step, or some number below it that exceeds the smallest
+        gap so far, and zero, by at least ``lead`` ``(N,)`` [m].
+        """
 
     @abstractmethod
     def bodies(self, pairs: Indices) -> Sequence[Indices]:
@@ -92,11 +97,11 @@ class Watch(ABC):
         steps, pairs = np.repeat(begins, len(pairs)), np.tile(pairs, len(begins))
         size = max(1, MAX_NUMBERS // (stretch.path.shape[1] * stretch.path.shape[3]))
         for least, near_steps, near_pairs in self._near(stretch, travelled, BLOCKS, steps, pairs):
-            order = np.argsort(least, kind="stable")
-            for some in (order[first : first + size] for first in range(0, len(order), size)):
-                if least[some[0]] >= max(self.minimum, 0.0):
-                    break
+            order, first, count = np.argsort(least, kind="stable"), 0, min(FEW, size)
+            while first < len(order) and least[order[first]] < max(self.minimum, 0.0):
+                some = order[first : first + count]
                 self._look(stretch, near_steps[some], near_pairs[some])
+                first, count = first + count, min(2 * count, size)
 
     def _near(
         self, stretch: Stretch, travelled: Floats, blocks: Sequence[int], steps: Indices, pairs: Indices
@@ -111,11 +116,12 @@ class Watch(ABC):
         size = MAX_NUMBERS // 16
         for first in range(0, len(steps), size):
             begin, pair = steps[first : first + size], pairs[first : first + size]
-            gap = self.gap(stretch, begin, pair)
+            end, lead = np.minimum(begin + block, num_steps), np.full(len(begin), _ROUNDING * travelled[-1].max())
+            for body in self.bodies(pair):
+                lead += travelled[end, body] - travelled[begin, body]
+            gap = self.gap(stretch, begin, pair, lead)
             self.minimum = min(self.minimum, float(gap.min(initial=np.inf)))
-            end = np.minimum(begin + block, num_steps)
-            least = gap - sum(travelled[end, body] - travelled[begin, body] for body in self.bodies(pair))
-            least -= _ROUNDING * travelled[-1].max()
+            least = gap - lead
             near = least < max(self.minimum, 0.0)
             if block == 1:
                 yield least[near], begin[near], pair[near]
@@ -168,7 +174,7 @@ class Pairs(Watch):
         a, b = order[:-1], order[1:]
         gap = self.near_gap(stretch, a, b)
         least = min(self.minimum, float(gap[self._robot[a] != self._robot[b]].min(initial=np.inf)))
-        widening = (_WIDER * self._radius + max(least, 0.0) / 2)[:, None]
+        widening = (WIDER * self._radius + max(least, 0.0) / 2)[:, None]
         lower, upper = lower - widening, upper + widening
         # Boxes that overlap along one axis: each with those that begin before it ends.
         order = np.argsort(lower[:, axis], kind="stable")
@@ -187,7 +193,7 @@ class Pairs(Watch):
         """``(N,)`` gap of bodies ``a`` and ``b`` when the stretch begins [m]."""
         return norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
 
-    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
         place = stretch.path[:, 0]
         distance = norm(place[steps, self.rows[pairs]] - place[steps, self.columns[pairs]])
         return distance - self._size[pairs]
@@ -212,7 +218,7 @@ class Static(Watch):
         super().__init__(kind, robot, names, rows, columns)
         self._radius = radius[rows]
 
-    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
         distance = self.distance(stretch.path[steps, 0, self.rows[pairs]], self.columns[pairs])
         return distance - self._radius[pairs]
 

@@ -2,71 +2,29 @@
 
 Written again from the footprints' corners, roundings and semi-axes, as everything here. Within a sub-step places and
 headings change linearly, and a gap by no more than its bodies' points move: sub-steps are halved where, by that bound,
-the gap may be less than what is known.
+the gap may be less than what is known. Shapes are asked only where the discs or balls round them leave it open.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.core import portable
-from d4orm_env.verify.contact import Indices, Pairs, Static, Stretch, Watch
-from d4orm_env.verify.geometry import Floats, ball_gap, core_gap, norm, polygon_distance
+from d4orm_env.verify.contact import WIDER, Indices, Pairs, Static, Stretch, Watch
+from d4orm_env.verify.convex_bodies import ConvexBodies
+from d4orm_env.verify.geometry import Floats, ball_gap, box_distance, core_gap, norm, polygon_distance
 
 if TYPE_CHECKING:
-    from d4orm_env.core.team import Team
     from d4orm_env.core.world import World
 
 _Gap = Callable[[Indices, Indices, Floats, Floats], Floats]
 """``(N,)`` gaps of things and bodies at places and headings."""
-MAX_CORNERS = 8
 HALVINGS = 20
 """Most times that a sub-step is halved."""
 RESOLUTION = 1 / 15_000
 """Closer to the smallest gap than this share of a radius nothing is looked for."""
-
-
-@dataclass(frozen=True, eq=False)
-class ConvexBodies:
-    """Convex bodies, one row each."""
-
-    corners: Floats  #: ``(B, 8, 2)`` of planar cores, the last one repeated; of no use in space
-    rounding: Floats  #: ``(B,)``
-    semi_axes: Floats  #: ``(B, 3)`` in space
-    outer: Floats  #: ``(B,)`` radii of the discs or balls round them
-    stretch: Floats  #: ``(B,)`` how much faster a gap may change than a body moves
-
-    @classmethod
-    def of(cls, team: Team) -> ConvexBodies:
-        """The footprints of a team: of its robots, and then of their trailers."""
-        bodies: list[Any] = [getattr(footprint, "front", footprint) for footprint in team.footprint]
-        bodies += [trailer for footprint in team.footprint for trailer in getattr(footprint, "trailers", ())]
-        size = len(bodies)
-        corners, rounding, semi_axes = np.zeros((size, MAX_CORNERS, 2)), np.zeros(size), np.ones((size, 3))
-        for robot, footprint in enumerate(bodies):
-            if team.dimension == 3:
-                semi_axes[robot] = footprint.semi_axes
-                continue
-            own, rounding[robot] = footprint.core
-            corners[robot, : len(own)], corners[robot, len(own) :] = own, own[-1]
-        outer = np.array([footprint.outer_radius for footprint in bodies]).astype(np.float32).astype(np.float64)
-        return cls(corners, rounding, semi_axes, outer, semi_axes.max(axis=1) / semi_axes.min(axis=1))
-
-    def take(self, index: Indices) -> ConvexBodies:
-        """Some of them, in the order given."""
-        return ConvexBodies(
-            self.corners[index], self.rounding[index], self.semi_axes[index], self.outer[index], self.stretch[index]
-        )
-
-    def placed(self, index: Indices, place: Floats, turn: Floats) -> Floats:
-        """``(N, 8, 2)`` corners of bodies at places ``(N, 2)`` turned by ``(N,)``."""
-        sine, cosine = (part[:, None] for part in portable.sin_cos(turn))
-        x, y = self.corners[index, :, 0], self.corners[index, :, 1]
-        return place[:, None] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
 
 
 class Turning(Watch):
@@ -78,8 +36,24 @@ class Turning(Watch):
         """``(N,)`` gap of these pairs, their bodies at places ``(N, d)`` and headings ``(N,)``."""
         raise NotImplementedError
 
-    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
-        return self._gap_at(stretch, steps, pairs, np.zeros(len(steps), np.intp), np.zeros(len(steps)))
+    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
+        """``(N,)`` gap of the discs or balls round these pairs, no more than theirs, each body at places ``(N, d)``."""
+        raise NotImplementedError
+
+    def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
+        places = [stretch.path[steps, 0, bodies] for bodies in self.bodies(pairs)]
+        gap = self.outer_gap(pairs, *places)
+
+        def ask(some: Indices) -> None:
+            first = np.zeros(len(some), np.intp)
+            gap[some] = self._gap_at(stretch, steps[some], pairs[some], first, np.zeros(len(some)))
+
+        if np.isinf(self.minimum) and len(gap):
+            nearest = int(gap.argmin())
+            ask(np.array([nearest]))
+            self.minimum = float(gap[nearest])
+        ask(np.flatnonzero(gap - lead < max(self.minimum, 0.0)))
+        return gap
 
     def _gap_at(self, stretch: Stretch, steps: Indices, pairs: Indices, sub_steps: Indices, share: Floats) -> Floats:
         """``(N,)`` gap of that pair when that share of that sub-step has passed."""
@@ -137,6 +111,9 @@ class TurningPairs(Turning, Pairs):
         super().__init__(robot, shapes.outer)
         self.shapes = shapes
 
+    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
+        return norm(places[0] - places[1]) - WIDER * self._size[pairs]
+
     def near_gap(self, stretch: Stretch, a: Indices, b: Indices) -> Floats:
         poses = [(stretch.path[0, 0, bodies], stretch.turn[0, 0, bodies]) for bodies in (a, b)]
         return self._between_bodies(a, b, poses)
@@ -175,22 +152,46 @@ class Obstacles(TurningStatic):
         self._round = np.asarray(world.circles if world.dimension == 2 else world.spheres, np.float64)
         self._cylinders, self._boxes = np.asarray(world.cylinders, np.float64), np.asarray(world.boxes, np.float64)
 
+    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
+        gaps, (place,) = np.empty(len(pairs)), places
+        for kind, here, thing in self._kinds(pairs):
+            gaps[here] = self._distance(kind, thing, place[here])
+        return gaps - WIDER * self.shapes.outer[self.rows[pairs]]
+
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
-        ((place, turn),) = poses
-        gaps, column, first = np.empty(len(pairs)), self.columns[pairs], 0
-        for things, gap in self._kinds():
-            here = np.flatnonzero((column >= first) & (column < first + len(things)))
-            if len(here):
-                gaps[here] = gap(column[here] - first, self.rows[pairs[here]], place[here], turn[here])
-            first += len(things)
+        ((place, turn),), gaps = poses, np.empty(len(pairs))
+        ways: dict[str, _Gap] = {"polygons": self._to_polygon, "cylinders": self._to_cylinder}
+        planar = self._world.dimension == 2
+        ways |= {"circles": self._to_circle, "boxes": self._to_rectangle if planar else self._to_box}
+        ways["spheres"] = self._to_ball
+        for kind, here, thing in self._kinds(pairs):
+            gaps[here] = ways[kind](thing, self.rows[pairs[here]], place[here], turn[here])
         return gaps
 
-    def _kinds(self) -> Sequence[tuple[Sequence[object] | Floats, _Gap]]:
-        if self._world.dimension == 3:
-            return (self._round, self._to_ball), (self._cylinders, self._to_cylinder), (self._boxes, self._to_box)
-        return (
-            (self._round, self._to_circle), (self._boxes, self._to_rectangle), (self._world.polygons, self._to_polygon),
-        )  # fmt: skip
+    def _kinds(self, pairs: Indices) -> Iterator[tuple[str, Indices, Indices]]:
+        """Kinds of obstacles, which of these pairs ``(N,)`` concern one of them, and which one."""
+        column, first = self.columns[pairs], 0
+        for kind in _kinds(self._world):
+            end = first + len(getattr(self._world, kind))
+            here = np.flatnonzero((column >= first) & (column < end))
+            if len(here):
+                yield kind, here, column[here] - first
+            first = end
+
+    def _distance(self, kind: str, thing: Indices, place: Floats) -> Floats:
+        """``(N,)`` signed distance from places to obstacles."""
+        if kind == "boxes":
+            return box_distance(place, self._boxes[thing])
+        if kind == "polygons":
+            distance = np.empty(len(thing))
+            for polygon in np.unique(thing):
+                here = np.flatnonzero(thing == polygon)
+                corners = np.asarray(self._world.polygons[polygon], np.float64)
+                distance[here] = polygon_distance(place[here], corners)
+            return distance
+        things = self._cylinders if kind == "cylinders" else self._round
+        centre = things[thing, :-1]
+        return norm(place[:, : centre.shape[1]] - centre) - things[thing, -1]
 
     def _to_circle(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
         core = self.shapes.placed(body, np.zeros_like(place), turn)
@@ -243,12 +244,20 @@ class Sides(TurningStatic):
         super().__init__("bounds contact", robot, shapes, names)
         self._place, self._dimension = np.concatenate([lower, -upper]), len(lower)
 
+    def _inside(self, pairs: Indices, place: Floats) -> Floats:
+        """``(N,)`` how far places ``(N, d)`` are inside of their sides."""
+        side, axis = np.divmod(self.columns[pairs], self._dimension)
+        return np.where(side == 0, 1.0, -1.0) * place[np.arange(len(axis)), axis] - self._place[self.columns[pairs]]
+
+    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
+        return self._inside(pairs, *places) - WIDER * self.shapes.outer[self.rows[pairs]]
+
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
         ((place, turn),) = poses
         column, body = self.columns[pairs], self.rows[pairs]
         side, axis = np.divmod(column, self._dimension)
         sign = np.where(side == 0, 1.0, -1.0)
-        at = sign * place[np.arange(len(axis)), axis] - self._place[column]
+        at = self._inside(pairs, place)
         if self._dimension == 3:
             return at - self.shapes.semi_axes[body, axis]
         corners = self.shapes.placed(body, np.zeros_like(place), turn)
@@ -261,8 +270,11 @@ def _ball(radius: Floats) -> Floats:
 
 
 def _names(world: World) -> list[str]:
-    kinds = ("circles", "boxes", "polygons") if world.dimension == 2 else ("spheres", "cylinders", "boxes")
-    return [f"{kind}[{index}]" for kind in kinds for index in range(len(getattr(world, kind)))]
+    return [f"{kind}[{index}]" for kind in _kinds(world) for index in range(len(getattr(world, kind)))]
+
+
+def _kinds(world: World) -> tuple[str, ...]:
+    return ("circles", "boxes", "polygons") if world.dimension == 2 else ("spheres", "cylinders", "boxes")
 
 
 def turning_watches(world: World, robot: Indices, shapes: ConvexBodies) -> list[Watch]:

@@ -1,7 +1,7 @@
 """Motion of robots under a plan, written again in float64: clipping, the models in continuous time, the speed limit.
 
 Within a control step holonomic robots move on parabolas, integrated in closed form; the heading and speed of a
-differential drive are linear in time and its position is their Simpson quadrature. Other models are
+differential drive or a unicycle are linear in time and its position is their Simpson quadrature. Other models are
 :mod:`integrated <d4orm_env.verify.integrated>`. Robots do not act on each other, so
 each is moved over the whole horizon at once, as if it never docked. Models and limits: paper, sections III and IV-B.
 """
@@ -20,7 +20,7 @@ from d4orm_env.verify.integrated import Integrated
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
 
-MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive")
+MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle")
 """The models that have equations here; the others are integrated."""
 
 
@@ -29,7 +29,7 @@ class TeamMotion:
 
     Attributes:
         limits: ``(K, m)`` limits of the controls.
-        sizes: ``(H, K, m)`` the quantities that they limit, before clipping: one norm, or turn rate and acceleration.
+        sizes: ``(H, K, m)`` the quantities that they limit, before clipping: one norm, or two components.
         pace: ``(H, K)`` speed after each step [m/s].
         bend: ``(H, K)`` bound on the acceleration within each step, curvature included [m/s^2].
         integration_error: ``(H, K)`` bound on what RK4, one step at a time, may differ from this by [m].
@@ -38,10 +38,12 @@ class TeamMotion:
     def __init__(self, problem: Problem, controls: Floats) -> None:
         team, start = problem.team, np.asarray(problem.start, np.float64)
         self.dt, self.size = problem.dt, np.shape(problem.goal)[1]
-        self.wheeled = np.array([name == "differential_drive" for name in team.models])
+        names = np.array(team.models)
+        self._drives, self._unicycles = names == "differential_drive", names == "unicycle"
+        self.wheeled = self._drives | self._unicycles
         # Integrated robots stand still as long as the equations are at work.
-        integrated = ~np.isin(team.models, MODELS)
-        self.first_order = integrated | (np.array(team.models) == "velocity2d")
+        integrated = ~np.isin(names, MODELS)
+        self.first_order = integrated | self._unicycles | (names == "velocity2d")
         self._names = {robot: team.robot_models[robot].control_names for robot in np.flatnonzero(integrated).tolist()}
         self.max_speed, self.max_acceleration, self.max_turn_rate = (
             np.asarray(values, np.float64) for values in (team.max_speed, team.max_acceleration, team.max_turn_rate)
@@ -51,7 +53,8 @@ class TeamMotion:
         self.hitches = [float(team.limits[robot, column]) for robot, model in models for _, column in model.trailers]
         self.limits = self._limits()
         commands, self.sizes = self._clip(np.where(integrated[:, None], 0.0, controls[..., : self.size]))
-        self._turn_rate, self._thrust = (np.where(self.wheeled, commands[..., column], 0.0) for column in (0, 1))
+        self._turn_rate = np.where(self.wheeled, np.where(self._drives, commands[..., 0], commands[..., 1]), 0.0)
+        self._thrust = np.where(self._drives, commands[..., 1], 0.0)
         self._acceleration = np.where((self.wheeled | self.first_order)[:, None], 0.0, commands)
         self._set_velocities(start, commands)
         thrust, turn_rate = np.abs(self._thrust), np.abs(self._turn_rate)
@@ -87,8 +90,10 @@ class TeamMotion:
     def _limits(self) -> Floats:
         limits = np.ones((len(self.wheeled), self.size))  # a column that limits nothing meets sizes of zero
         limits[:, 0] = np.where(self.first_order, self.max_speed, self.max_acceleration)
-        for robot in np.flatnonzero(self.wheeled):
-            limits[robot] = self.max_turn_rate[robot], self.max_acceleration[robot]
+        limits[self._drives, 0], limits[self._drives, 1] = (
+            most[self._drives] for most in (self.max_turn_rate, self.max_acceleration)
+        )
+        limits[self._unicycles, 1] = self.max_turn_rate[self._unicycles]
         return limits
 
     def limited_quantity(self, robot: int, column: int) -> str:
@@ -96,7 +101,8 @@ class TeamMotion:
         if robot in self._names:
             return self._names[robot][column]
         if self.wheeled[robot]:
-            return ("turn rate [rad/s]", "acceleration [m/s^2]")[column]
+            turn, other = "turn rate [rad/s]", "acceleration [m/s^2]" if self._drives[robot] else "speed [m/s]"
+            return turn if self._drives[robot] == (column == 0) else other
         return "speed [m/s]" if self.first_order[robot] else "acceleration [m/s^2]"
 
     def _clip(self, controls: Floats) -> tuple[Floats, Floats]:
@@ -114,18 +120,21 @@ class TeamMotion:
         """Velocity, heading and speed at the beginning of every step; the speed limit acts between steps."""
         dt, state = self.dt, np.zeros((len(start), max(4, 2 * self.size, start.shape[1])))
         state[:, : start.shape[1]] = start
-        heading, speed = np.where(self.wheeled, state[:, 2], 0.0), np.where(self.wheeled, state[:, 3], 0.0)
-        has_velocity = ~(self.wheeled | self.first_order)[:, None]
-        velocity = np.where(has_velocity, state[:, self.size : 2 * self.size], 0.0)
-        self._velocity, self._speed, self.pace = np.empty_like(commands), *np.empty((2, *commands.shape[:2]))
-        for step, command in enumerate(commands):
-            velocity = np.where(self.first_order[:, None], command, velocity)
-            self._velocity[step], self._speed[step] = velocity, speed
-            velocity = velocity + self._acceleration[step] * dt
+        self._velocity = np.where((self.first_order & ~self.wheeled)[:, None], commands, 0.0)
+        self._speed = np.where(self._unicycles, commands[..., 0], 0.0)
+        self.pace = np.where(self.wheeled, np.abs(self._speed), np.minimum(norm(self._velocity), self.max_speed))
+        slow = np.flatnonzero(~self.first_order)  # by inertia
+        most, drives = self.max_speed[slow], self._drives[slow]
+        velocity = np.where(drives[:, None], 0.0, state[slow, self.size : 2 * self.size])
+        speed = np.where(drives, state[slow, 3], 0.0)
+        for step in range(len(commands) if len(slow) else 0):
+            self._velocity[step, slow], self._speed[step, slow] = velocity, speed
+            velocity = velocity + self._acceleration[step, slow] * dt
             pace = norm(velocity)
-            velocity = velocity * (self.max_speed / np.maximum(pace, self.max_speed))[:, None]
-            speed = np.clip(speed + self._thrust[step] * dt, -self.max_speed, self.max_speed)
-            self.pace[step] = np.where(self.wheeled, np.abs(speed), np.minimum(pace, self.max_speed))
+            velocity = velocity * (most / np.maximum(pace, most))[:, None]
+            speed = np.clip(speed + self._thrust[step, slow] * dt, -most, most)
+            self.pace[step, slow] = np.where(drives, np.abs(speed), np.minimum(pace, most))
+        heading = np.where(self.wheeled, state[:, 2], 0.0)
         self._heading = np.cumsum(np.concatenate([heading[None], self._turn_rate * dt]), axis=0)
 
     @property
@@ -168,7 +177,7 @@ class TeamMotion:
         return np.concatenate([headings, trailers], axis=-1)
 
     def _wheeled_displacement(self, steps: slice, sub_steps: int) -> Floats:
-        """``(T, S, ., 2)`` the differential drives' part of :meth:`displacement`, but for its beginning."""
+        """``(T, S, ., 2)`` the wheeled robots' part of :meth:`displacement`, but for its beginning."""
         turn_rate, thrust, speed, heading = (
             values[steps, self.wheeled] for values in (self._turn_rate, self._thrust, self._speed, self._heading[:-1])
         )

@@ -19,7 +19,7 @@ from d4orm_planners.manoeuvres.kinds import SECTOR, SECTORS
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
 
 TURN = 2 * np.pi
-LATER = 40
+LATER = 20
 """Poses count by way of which a robot takes at most so many steps more to its goal than it must."""
 
 

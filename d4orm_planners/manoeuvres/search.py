@@ -15,12 +15,12 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.manoeuvres.curves import Curve, Curves, curve_of
 from d4orm_planners.manoeuvres.heaps import pop
-from d4orm_planners.manoeuvres.lattice import cell_of, moved, pose_of
+from d4orm_planners.manoeuvres.lattice import cell_of, is_far_from_all, moved, pose_of
 from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, docks_after, is_sweep_free, reaches, stretch_steps, sweep
 from d4orm_planners.manoeuvres.nodes import Nodes, Task, add, cost_to_go, is_dominated, slot_of
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TOWING, Goal, Limits, Snap, snap_of
-from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, met_until, safe_since, safe_until, visits_of
+from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_since, safe_until, visits_of
 
 NOTHING, PAUSED = -1, -2
 """Results of a search that ends without a motion, and of one that is to go on if there is time."""
@@ -33,8 +33,12 @@ SHORT, EVERY = 40, 8
 @compiled
 def _has_traffic(traffic: Traffic, nodes: Nodes, count: int, since: int) -> bool:
     """Check whether anybody comes near to a move at this time or later."""
+    seen = (-1, -1)
     for step in range(1, count + 1):
         begin, end = visits_of(traffic, nodes.swept[step, 0], nodes.swept[step, 1])
+        if (begin, end) == seen:
+            continue
+        seen = (begin, end)
         for row in range(begin, end):
             if traffic.visits[row, 2] >= since:
                 return True
@@ -46,11 +50,9 @@ def _meeting(task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int
     """A step of a move in which another robot is met if it begins then, zero for none, and the soonest departure at
     which that one may be gone; the likely step first.
     """
-    for number in range(count + 1):
-        step = number if number else likely
-        if step:
-            before, after = nodes.swept[step - 1], nodes.swept[step]
-            until = met_until(task.body, traffic, depart + step, before, after, nodes.buffer)
+    for first, last in ((likely, likely), (1, count)):
+        if first > 0:
+            step, until = meeting(task.body, traffic, nodes.swept, first, last, depart, nodes.buffer)
             if until > 0:
                 return step, until - step
     return 0, depart
@@ -94,7 +96,8 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
     if task.goal.docks:
         end = docks_after(task, nodes, count)
         count, docks = min(count, end), end <= count
-    if count == 0 or not is_sweep_free(task.body, nodes.swept, count, nodes.buffer):
+    far = move >= 0 and is_far_from_all(task.body, nodes.swept[0, 0], nodes.swept[0, 1], task.primitives.reach[move])
+    if count == 0 or not (far or is_sweep_free(task.body, nodes.swept, count, nodes.buffer)):
         return
     mode = task.primitives.mode[move] if move >= 0 and not docks else -1
     busy, met = _has_traffic(traffic, nodes, count, depart), 0

@@ -125,12 +125,12 @@ def _meets(
 
 
 @compiled
-def _steps_away(body: RobotBody, traffic: Traffic, other: Whole, step: Whole, pose: Floats) -> int:
-    """Steps, from one on, in which another robot cannot be too near to one that stands there."""
+def _steps_away(body: RobotBody, traffic: Traffic, other: Whole, step: Whole, pose: Floats, moving: int) -> int:
+    """Steps, from one on, in which another robot cannot be too near to one that is there, if one or both move."""
     there = traffic.poses[other, min(step, traffic.last[other])]
     dx, dy = there[0] - pose[0], there[1] - pose[1]
     far = body.arrays.radius[body.robot] + body.arrays.radius[other] + body.extra + 2 * body.stride
-    return max(0, int((np.sqrt(dx * dx + dy * dy) - far) / body.stride))
+    return max(0, int((np.sqrt(dx * dx + dy * dy) - far) / (moving * body.stride)))
 
 
 @compiled
@@ -159,18 +159,32 @@ def _touches(
 
 
 @compiled
-def met_until(body: RobotBody, traffic: Traffic, step: Whole, before: Floats, after: Floats, buffer: FloatArray) -> int:
-    """Return zero if no other robot is too near to this one in a step that ends at a number, between two poses of it;
-    else a later step, before which that one does not go away.
+def meeting(
+    body: RobotBody, traffic: Traffic, swept: Floats | FloatArray, first: int, last: int, depart: int,
+    buffer: FloatArray,
+) -> tuple[int, int]:  # fmt: skip
+    """The first step, of those from ``first`` to ``last`` of a move that begins at step ``depart``, in which another
+    robot is too near, and a step of the clock before which that one does not go away; zeros for none.
     """
-    begin, end = visits_of(traffic, after[0], after[1])
-    for row in range(begin, end):
-        other = traffic.visits[row, 0]
-        if traffic.visits[row, 1] <= step <= traffic.visits[row, 2] and _meets(
-            body, traffic, other, step, before, after, body.parts, buffer
-        ):
-            return int(traffic.gone[other]) if step > traffic.last[other] else int(step) + 1
-    return 0
+    while first <= last:
+        begin, end = visits_of(traffic, swept[first, 0], swept[first, 1])
+        until = first + 1
+        while until <= last and visits_of(traffic, swept[until, 0], swept[until, 1]) == (begin, end):
+            until += 1
+        met, whom = until, -1
+        for row in range(begin, end):
+            other, step = traffic.visits[row, 0], max(first, traffic.visits[row, 1] - depart)
+            while step < met and step + depart <= traffic.visits[row, 2]:
+                away = _steps_away(body, traffic, other, step + depart, swept[step], 2)
+                before, after = swept[max(step - 1, 0)], swept[step]
+                if away == 0 and _meets(body, traffic, other, step + depart, before, after, body.parts, buffer):
+                    met, whom = step, other
+                step += max(away, 1)
+        if whom >= 0:
+            at = met + depart
+            return met, traffic.gone[whom] if at > traffic.last[whom] else at + 1
+        first = until
+    return 0, 0
 
 
 @compiled
@@ -184,7 +198,7 @@ def safe_until(body: RobotBody, traffic: Traffic, step: Whole, pose: Floats, buf
         # Who stands does not come nearer.
         last, at = min(traffic.visits[row, 2], until - 1, max(traffic.last[other], since)), since
         while at <= last:
-            away = _steps_away(body, traffic, other, at, pose)
+            away = _steps_away(body, traffic, other, at, pose, 1)
             if away == 0 and _meets(body, traffic, other, at, pose, pose, body.parts if at > step else 1, buffer):
                 until = at
                 break
@@ -214,7 +228,6 @@ def safe_since(body: RobotBody, traffic: Traffic, pose: Floats, buffer: FloatArr
 def meets_nobody(body: RobotBody, traffic: Traffic, poses: FloatArray, buffer: FloatArray) -> bool:
     """Check whether no other robot comes too near to one that takes poses ``(T + 1, 6)``, and stays in the last."""
     last = poses.shape[0] - 1
-    for step in range(last + 1):
-        if met_until(body, traffic, step, poses[max(step - 1, 0)], poses[step], buffer) > 0:
-            return False
+    if meeting(body, traffic, poses, 0, last, 0, buffer)[1] > 0:
+        return False
     return safe_until(body, traffic, last, poses[last], buffer) == NEVER

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +17,7 @@ from shapely import geometry as shapely
 from d4orm_env import Problem, Team, World, load_problem, make_problem, navigation_v0, rollout, save_problem, verify
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Footprint, Polygon
+from d4orm_env.verify.footprints import Obstacles, Sides, TurningPairs
 
 KITE = Polygon([[0.3, 0.0], [0.0, 0.2], [-0.2, 0.1], [-0.2, -0.1]])
 SHAPES: tuple[Footprint, ...] = (Box(0.6, 0.2, 0.1), Capsule(0.4, 0.1), KITE, Disc(0.2), Box(0.3, 0.3))
@@ -223,3 +225,32 @@ def test_the_environment_goes_by_footprints() -> None:
     assert infos["robot_0"]["collided"]
     assert infos["robot_1"]["collided"]
     assert infos["robot_0"]["contacts"] == ["robot_1"]
+
+
+def ellipsoids_problem() -> Problem:
+    team = Team(("holonomic3d",) * 4, footprint=Ellipsoid(0.12, 0.1, 0.3))
+    start = np.pad(np.array([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]), ((0, 0), (0, 3)))
+    world = World(
+        3, spheres=[[1, 0, 0.5, 0.2]], cylinders=[[-1, 0, 0.2]], boxes=[[-0.2, -1.2, -1, 0.2, -0.9, 1]],
+        lower=[-2, -2, -2], upper=[2, 2, 2],
+    )  # fmt: skip
+    return Problem(team, start, -start[:, :3], world, horizon=60)
+
+
+@pytest.mark.parametrize("make", [lambda: planar_problem(horizon=60), ellipsoids_problem])
+def test_discs_and_balls_round_bodies_hide_no_gap_from_the_judge(
+    make: Callable[[], Problem], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, contacts = make(), set()
+    held = np.random.default_rng(0).normal(size=(6, 6, problem.num_robots, problem.control_size))
+    plans = np.repeat(held, 10, axis=1)
+    reports = [verify(problem, plan) for plan in plans]
+    for watch in (TurningPairs, Obstacles, Sides):
+        monkeypatch.setattr(watch, "outer_gap", lambda self, pairs, *places: np.full(len(pairs), -np.inf))
+    for plan, report in zip(plans, reports, strict=True):
+        everything = verify(problem, plan)
+        contacts |= {violation.kind for violation in report.violations}
+        assert [str(violation) for violation in report.violations] == [str(other) for other in everything.violations]
+        assert report.min_separation == pytest.approx(everything.min_separation, abs=1e-9)
+        assert report.min_clearance == pytest.approx(everything.min_clearance, abs=1e-9)
+    assert contacts >= {"robot contact", "obstacle contact", "bounds contact"}

@@ -262,16 +262,19 @@ def test_the_engines_roll_wheeled_teams_out_alike(name: str) -> None:
     np.testing.assert_allclose(cpu.controls, jax.controls, atol=1e-6)
 
 
-def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion() -> None:
-    problem = make_problem("circle", num_robots=3, model="differential_drive")
+@pytest.mark.parametrize("name", ["differential_drive", "unicycle"])
+def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion(name: str) -> None:
+    problem = make_problem("circle", num_robots=3, model=name)
     controls = random_controls(problem, 2).astype(np.float64)
     start = np.asarray(problem.start, np.float64)
     exact = TeamMotion(problem, controls)
-    model, robots = get_model("differential_drive"), np.arange(3)
-    found = Integrated(model, robots, start, controls, problem.team, problem.dt)
+    found = Integrated(get_model(name), np.arange(3), start, controls, problem.team, problem.dt)
     steps = slice(None)
     np.testing.assert_allclose(found.displacement(steps, 12), exact.displacement(steps, 12), atol=1e-6)
     np.testing.assert_allclose(found.pace, exact.pace, atol=1e-9)
+    np.testing.assert_allclose(found.headings(steps, 12)[..., 0], exact.headings(steps, 12), atol=1e-6)
+    np.testing.assert_allclose(found.limits, exact.limits, atol=0)
+    np.testing.assert_allclose(np.maximum(found.sizes, found.limits), np.maximum(exact.sizes, exact.limits), atol=1e-9)
     # Its bound on the acceleration holds, and is not far off.
     inner = np.diff(exact.displacement(steps, 40), n=2, axis=1) * (40 / problem.dt) ** 2
     acceleration = np.sqrt((inner**2).sum(axis=-1)).max(axis=1)
