@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, shown
+from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, short_repr
 
 __all__ = ["Box", "Capsule", "Disc", "Ellipsoid", "Footprint", "Polygon", "Train"]
 
@@ -77,7 +77,9 @@ class Footprint(ABC):
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
             if name == "offset":
                 if not (isinstance(value, int | float) and abs(value) <= LARGEST):
-                    raise ValueError(f"offset of {type(self).__name__} must be a number of metres, not {shown(value)}")
+                    raise ValueError(
+                        f"offset of {type(self).__name__} must be a number of metres, not {short_repr(value)}"
+                    )
                 continue
             positive_number(value, f"{name} of {type(self).__name__}", least=SMALLEST, most=LARGEST)
 
@@ -195,7 +197,7 @@ class Polygon(Planar):
         try:
             table = np.array(corners, np.float64)
         except (TypeError, ValueError):
-            raise ValueError(f"corners of Polygon must be rows of two numbers, not {shown(corners)}") from None
+            raise ValueError(f"corners of Polygon must be rows of two numbers, not {short_repr(corners)}") from None
         if table.ndim != 2 or table.shape[1] != 2 or not 3 <= len(table) <= MAX_CORNERS:
             raise ValueError(f"corners of Polygon have shape {table.shape}; expected (n, 2), n from 3 to {MAX_CORNERS}")
         if not np.isfinite(table).all() or np.abs(table).max() > LARGEST:
@@ -269,7 +271,9 @@ class Train(Footprint):
     def __init__(self, front: Disc | Planar, trailers: Sequence[Disc | Planar]) -> None:
         for footprint in (front, *trailers):
             if not isinstance(footprint, Disc | Planar):
-                raise ValueError(f"Train is made of planar footprints such as Box(0.5, 0.25), not {shown(footprint)}")
+                raise ValueError(
+                    f"Train is made of planar footprints such as Box(0.5, 0.25), not {short_repr(footprint)}"
+                )
         if not trailers:
             raise ValueError("trailers of Train are none; give one footprint each, or leave Train out")
         object.__setattr__(self, "front", front)

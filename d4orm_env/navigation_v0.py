@@ -61,7 +61,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         self._control_size = self.problem.control_size
         self._make_spaces()
         self._np_random: np.random.Generator | None = None
-        self.turn_taker: AECNavigationEnv | None = None
+        self.aec_env: AECNavigationEnv | None = None
 
     def _make_spaces(self) -> None:
         setup, box = self._simulation.setup, gymnasium.spaces.Box
@@ -183,8 +183,8 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         robots = [self._robots[agent] for agent in self.agents]
         observations = {agent: step.observations[robot] for agent, robot in zip(self.agents, robots)}
         infos = agent_infos(self.agents, robots, step)
-        if self.turn_taker is not None:
-            self.turn_taker.tell(observations, infos)
+        if self.aec_env is not None:
+            self.aec_env.refresh(observations, infos)
         return observations, infos
 
     @property
@@ -243,9 +243,9 @@ class AECNavigationEnv(parallel_to_aec_wrapper):
         super().__init__(environment)
         self._observations: dict[str, FloatArray] = {}
         self.infos: AgentInfos = {}
-        environment.turn_taker = self
+        environment.aec_env = self
 
-    def tell(self, observations: dict[str, FloatArray], infos: AgentInfos) -> None:
+    def refresh(self, observations: dict[str, FloatArray], infos: AgentInfos) -> None:
         """Show agents the world as it is now, before all have chosen."""
         self._observations = {**self._observations, **observations}
         self.infos = {**self.infos, **infos}

@@ -109,24 +109,27 @@ def _at_rest(model: str, x: Array) -> Array:
     return x.at[:, 3:].set(0.0) if model != "holonomic2d" else x.at[:, 2:].set(0.0)
 
 
-def _near_robot(team: PlainTeam, place: Array) -> Array:
+def _near_robot(team: PlainTeam, position: Array) -> Array:
     """``(K,)`` bool from the full distance matrix."""
-    distance = jnp.linalg.norm(place[:, None] - place[None, :], axis=-1)
-    distance = jnp.where(jnp.eye(len(place), dtype=bool), jnp.inf, distance)
+    distance = jnp.linalg.norm(position[:, None] - position[None, :], axis=-1)
+    distance = jnp.where(jnp.eye(len(position), dtype=bool), jnp.inf, distance)
     return (distance <= team.radius[:, None] + team.radius[None, :] + team.margin).any(axis=1)
 
 
-def _near_obstacle(team: PlainTeam, place: Array) -> Array:
+def _near_obstacle(team: PlainTeam, position: Array) -> Array:
     """``(K,)`` bool: within the margin of an obstacle or the bounds."""
-    dimension = place.shape[1]
-    reach = team.radius + team.margin
-    near = ((place - reach[:, None] <= team.bounds[:1]) | (place + reach[:, None] >= team.bounds[1:])).any(axis=1)
+    dimension = position.shape[1]
+    safety_distance = team.radius + team.margin
+    near = (
+        (position - safety_distance[:, None] <= team.bounds[:1])
+        | (position + safety_distance[:, None] >= team.bounds[1:])
+    ).any(axis=1)
     for kind, axes in ((team.balls, dimension), (team.cylinders, 2)):
-        distance = jnp.linalg.norm(place[:, None, :axes] - kind[None, :, :axes], axis=-1)
-        near = near | (distance <= reach[:, None] + kind[None, :, axes]).any(axis=1)
+        distance = jnp.linalg.norm(position[:, None, :axes] - kind[None, :, :axes], axis=-1)
+        near = near | (distance <= safety_distance[:, None] + kind[None, :, axes]).any(axis=1)
     lower, upper = team.boxes[None, :, :dimension], team.boxes[None, :, dimension:]
-    outside = jnp.maximum(jnp.maximum(lower - place[:, None], place[:, None] - upper), 0.0)
-    return near | (jnp.linalg.norm(outside, axis=-1) <= reach[:, None]).any(axis=1)
+    outside = jnp.maximum(jnp.maximum(lower - position[:, None], position[:, None] - upper), 0.0)
+    return near | (jnp.linalg.norm(outside, axis=-1) <= safety_distance[:, None]).any(axis=1)
 
 
 def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Array) -> Array:
@@ -137,18 +140,18 @@ def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Array)
     scale = jnp.maximum(distance_at_start, team.goal_radius)
 
     def advance(carry: tuple[Array, Array], control: Array) -> tuple[tuple[Array, Array], Array]:
-        x, docked = carry
+        x, arrived = carry
         y, speed = jax.vmap(partial(_step_robot, model, team.dt))(limits, x, control)
         arrives = jnp.linalg.norm(y[:, :dimension] - team.goal, axis=1) <= team.goal_radius
         arrives = arrives & (speed <= team.docking_speed)
         y = jnp.where(arrives[:, None], _at_rest(model, y), y)
-        x = jnp.where(docked[:, None], x, y)
-        place = x[:, :dimension]
-        reward = 1 - jnp.linalg.norm(place - team.goal, axis=1) / scale
-        reward = reward - team.collision_penalty * _near_obstacle(team, place)
+        x = jnp.where(arrived[:, None], x, y)
+        position = x[:, :dimension]
+        reward = 1 - jnp.linalg.norm(position - team.goal, axis=1) / scale
+        reward = reward - team.collision_penalty * _near_obstacle(team, position)
         if collisions:
-            reward = reward - team.collision_penalty * _near_robot(team, place)
-        return (x, docked | arrives), reward
+            reward = reward - team.collision_penalty * _near_robot(team, position)
+        return (x, arrived | arrives), reward
 
     start = (team.start, jnp.zeros(len(team.start), bool))
     return jax.lax.scan(advance, start, controls)[1].mean(axis=0)

@@ -80,11 +80,11 @@ def open_problem(
 ) -> Problem:
     """Robots far from each other, from their goals and from everything near the origin."""
     team = Team((STANDING[dimension],) * num_robots, radius=radius)
-    place = np.zeros((num_robots, dimension))
-    place[:, 0] = 100 + 10 * np.arange(num_robots)
+    position = np.zeros((num_robots, dimension))
+    position[:, 0] = 100 + 10 * np.arange(num_robots)
     start = np.zeros((num_robots, team.state_size))
-    start[:, :dimension] = place
-    return Problem(team, start, place + 3, world, **changes)
+    start[:, :dimension] = position
+    return Problem(team, start, position + 3, world, **changes)
 
 
 def stand(engine: Engine, problem: Problem, positions: Any) -> StepResult:

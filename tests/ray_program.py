@@ -49,15 +49,15 @@ def kill(restarts: int, mode: str) -> tuple[list[int], list[int], list[str], boo
     notes: list[str] = []
     try:
         notes.append(search.advance().note)
-        crew = search.state.crew
-        before = [node.search.planner.process for node in crew.alive]
+        pool = search.state.pool
+        before = [node.search.planner.process for node in pool.alive]
         # Into an iteration, or nearly.
         timer = threading.Timer(0.1, os.kill, (before[1], signal.SIGKILL))
         timer.start()
         while len(notes) < 8 and not any(notes):
             notes.append(search.advance().note)
         timer.join()
-        after = [node.search.planner.process for node in crew.alive]
+        after = [node.search.planner.process for node in pool.alive]
     finally:
         search.close()
     return before, after, [note for note in notes if note], search.plan("stopped").solved

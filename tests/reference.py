@@ -43,16 +43,16 @@ def evaluate(task: SamplingTask, controls: np.ndarray) -> Evaluated:
     num_samples, d = len(controls), problem.dimension
     states = np.repeat(problem.start[None].astype(np.float64), num_samples, axis=0)
     arrived = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
-    docked = np.repeat(np.asarray(arrived)[None], num_samples, axis=0)
+    arrived = np.repeat(np.asarray(arrived)[None], num_samples, axis=0)
     reference = np.linalg.norm(problem.goal - problem.start[:, :d].astype(np.float64), axis=1)
     inverse = 1 / np.maximum(reference, max(problem.goal_radius, task.reference_distance or 0))
     total, doubt = np.zeros((num_samples, problem.num_robots)), np.full(num_samples, np.inf)
     for t in range(controls.shape[1]):
-        states, short = _step(problem, states, docked, controls[:, t].astype(np.float64))
-        place = states[..., :d]
-        gaps = _gaps_to_robots(task, place, t), problem.world.clearance(place) - problem.team.radius
+        states, short = _step(problem, states, arrived, controls[:, t].astype(np.float64))
+        position = states[..., :d]
+        gaps = _gaps_to_robots(task, position, t), problem.world.clearance(position) - problem.team.radius
         beyond = [gap - problem.margin for gap in gaps]
-        total += 1 - inverse * np.linalg.norm(problem.goal - place, axis=-1)
+        total += 1 - inverse * np.linalg.norm(problem.goal - position, axis=-1)
         total -= task.penalty * problem.collision_penalty * sum((gap <= 0).astype(float) for gap in beyond)
         doubt = np.minimum(doubt, np.abs(np.stack([short, *beyond])).min(axis=(0, 2)))
     return Evaluated(total.T / controls.shape[1], doubt, inverse)
@@ -74,20 +74,20 @@ def position_error(task: SamplingTask, controls: np.ndarray, control_error: floa
     return float(roundings * (reach + time * speed * (1 + turning)) + control_error * time * max(time, 1))
 
 
-def _step(problem: Any, states: Any, docked: Any, controls: Any) -> tuple[Any, Any]:
-    """States ``(M, K, n)`` after a step, and ``(M, K)`` how far each robot is from docking; ``docked`` is updated."""
-    states, short = states.copy(), np.full(docked.shape, np.inf)
+def _step(problem: Any, states: Any, arrived: Any, controls: Any) -> tuple[Any, Any]:
+    """States ``(M, K, n)`` after a step, and ``(M, K)`` how far each robot is from docking; ``arrived`` is updated."""
+    states, short = states.copy(), np.full(arrived.shape, np.inf)
     docking_speed = problem.goal_speed + problem.team.max_speed / 2**13
     for k, name in enumerate(problem.team.models):
         after, speed = _MOVES[name](states[:, k], controls[:, k], problem.team.limits[k].astype(np.float64), problem.dt)
         gap = np.linalg.norm(after[:, : problem.dimension] - problem.goal[k], axis=1)
-        moving = ~docked[:, k]
+        moving = ~arrived[:, k]
         states[moving, k] = after[moving]
         # Docking needs both to be small, so the larger one decides.
         short[moving, k] = np.maximum(gap - problem.goal_radius, speed - docking_speed[k])[moving]
-        docked[:, k] |= short[:, k] <= 0
+        arrived[:, k] |= short[:, k] <= 0
         at_rest = _at_rest(name, states[:, k])
-        states[docked[:, k], k] = at_rest[docked[:, k]]
+        states[arrived[:, k], k] = at_rest[arrived[:, k]]
     return states, short
 
 
@@ -97,10 +97,10 @@ def _within(vector: Any, limit: float) -> Any:
 
 
 def _double_integrator(x: Any, u: Any, limits: Any, dt: float, d: int) -> tuple[Any, Any]:
-    place, velocity, push = x[:, :d], x[:, d : 2 * d], _within(u[:, :d], limits[ACCELERATION])
+    position, velocity, push = x[:, :d], x[:, d : 2 * d], _within(u[:, :d], limits[ACCELERATION])
     after = _within(velocity + dt * push, limits[SPEED])
     rest = x[:, 2 * d :]
-    return np.hstack([place + dt * velocity + dt**2 / 2 * push, after, rest]), np.linalg.norm(after, axis=1)
+    return np.hstack([position + dt * velocity + dt**2 / 2 * push, after, rest]), np.linalg.norm(after, axis=1)
 
 
 def _single_integrator(x: Any, u: Any, limits: Any, dt: float) -> tuple[Any, Any]:
@@ -117,9 +117,9 @@ def _differential_drive(x: Any, u: Any, limits: Any, dt: float) -> tuple[Any, An
         heading, speed = x[:, 2] + time * turn, x[:, 3] + time * push
         return speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
 
-    place = x[:, :2] + dt / 6 * (velocity(0) + 4 * velocity(dt / 2) + velocity(dt))
+    position = x[:, :2] + dt / 6 * (velocity(0) + 4 * velocity(dt / 2) + velocity(dt))
     speed = np.clip(x[:, 3] + dt * push, -limits[SPEED], limits[SPEED])
-    return np.column_stack([place, x[:, 2] + dt * turn, speed]), np.abs(speed)
+    return np.column_stack([position, x[:, 2] + dt * turn, speed]), np.abs(speed)
 
 
 _MOVES = {
@@ -137,17 +137,17 @@ def _at_rest(name: str, states: Any) -> Any:
     return states
 
 
-def _gaps_to_robots(task: SamplingTask, place: Any, time: int) -> Any:
+def _gaps_to_robots(task: SamplingTask, position: Any, time: int) -> Any:
     """``(M, K)`` from every robot's surface to the nearest other robot's or moving body's."""
-    nearest = np.full(place.shape[:2], np.inf)
+    nearest = np.full(position.shape[:2], np.inf)
     if not task.collisions:
         return nearest
     radius = np.asarray(task.problem.team.radius, np.float64)
-    gaps = np.linalg.norm(place[:, :, None] - place[:, None], axis=-1) - radius[:, None] - radius
+    gaps = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1) - radius[:, None] - radius
     gaps[:, range(len(radius)), range(len(radius))] = np.inf
     nearest = gaps.min(axis=2)
     if task.moving is not None:
         bodies = task.moving.positions[time].astype(np.float64)
-        gaps = np.linalg.norm(place[:, :, None] - bodies, axis=-1) - radius[:, None] - task.moving.radius
+        gaps = np.linalg.norm(position[:, :, None] - bodies, axis=-1) - radius[:, None] - task.moving.radius
         nearest = np.minimum(nearest, gaps.min(axis=2))
     return nearest

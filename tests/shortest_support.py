@@ -10,15 +10,15 @@ from scipy.sparse.csgraph import dijkstra
 from d4orm_env import World
 
 
-def visible_lengths(world: World, reach: float, source: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Lengths of the shortest paths of a disc of this reach from ``source`` to ``places`` ``(Q, 2)``.
+def visible_lengths(world: World, reach: float, source: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Lengths of the shortest paths of a disc of this reach from ``source`` to ``positions`` ``(Q, 2)``.
 
     Inflated corners are polygons inside of the true arcs, so that lengths are never too large, and hardly too small.
     """
     solid = [shapely.box(*box) for box in world.boxes.tolist()] + [shapely.Polygon(p) for p in world.polygons]
     parts = [shapely.Point(x, y).buffer(r + reach, quad_segs=24) for x, y, r in world.circles.tolist()]
     blocked = shapely.union_all([*parts, shapely.union_all(solid).buffer(reach, quad_segs=6)])
-    corners = [source[None], places]
+    corners = [source[None], positions]
     for part in shapely.get_parts(blocked):
         oriented = shapely.orient_polygons(part)  # counterclockwise outside, clockwise round holes
         for outline in (oriented.exterior, *oriented.interiors):
@@ -29,7 +29,7 @@ def visible_lengths(world: World, reach: float, source: np.ndarray, places: np.n
     nodes = np.concatenate(corners)
     low, high = world.bounds.astype(np.float64)
     inside = ((nodes >= low + reach - 1e-9) & (nodes <= high - reach + 1e-9)).all(axis=1)
-    inside[: 1 + len(places)] = True
+    inside[: 1 + len(positions)] = True
     nodes = nodes[inside]
     solid_within = blocked.buffer(-1e-6)
     shapely.prepare(solid_within)
@@ -38,4 +38,4 @@ def visible_lengths(world: World, reach: float, source: np.ndarray, places: np.n
     one, other = one[free], other[free]
     gaps = np.linalg.norm(nodes[one] - nodes[other], axis=1)
     graph = csr_array((gaps, (one, other)), shape=(len(nodes), len(nodes)))
-    return dijkstra(graph, directed=False, indices=0)[1 : 1 + len(places)]
+    return dijkstra(graph, directed=False, indices=0)[1 : 1 + len(positions)]

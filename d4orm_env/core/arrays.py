@@ -72,7 +72,7 @@ def frozen_array(
         # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
         array = as_float32(value) + np.float32(0)
     except ValueError as error:
-        raise ValueError(f"{name} must be an array of numbers, not {shown(value)}; {error}") from error
+        raise ValueError(f"{name} must be an array of numbers, not {short_repr(value)}; {error}") from error
     if (array.size == 0 and 0 in shape) or (array.size == 0 and None in shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
@@ -135,7 +135,7 @@ LARGEST_WHOLE = 2**63 - 1
 """Whole numbers must stay below it: every library holds them."""
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """``value`` as it stands in an error: on one line and not too long, whatever it is."""
     if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
         return f"about {'-' if value < 0 else ''}1e{int(value.bit_length() * np.log10(2))}"
@@ -160,7 +160,7 @@ def positive_number(
             raise TypeError("truth is no number")
         number = float(value)  # type: ignore[arg-type] # what is none raises
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a number, not {shown(value)}") from error
+        raise ValueError(f"{name} must be a number, not {short_repr(value)}") from error
     except OverflowError:
         number = np.inf if value > 0 else -np.inf  # type: ignore[operator] # a whole number
     if not np.isfinite(number) or number < 0 or (number == 0 and not zero_allowed):
@@ -182,9 +182,9 @@ def duration(value: object, name: str, *, zero_allowed: bool = False) -> float:
 def whole_number(value: object, name: str, minimum: int, maximum: int | None = None) -> int:
     """``value`` as an int of at least ``minimum``, and at most ``maximum`` where there is one."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        raise ValueError(f"{name} must be a whole number, not {shown(value)}")
+        raise ValueError(f"{name} must be a whole number, not {short_repr(value)}")
     if value < minimum:
-        raise ValueError(f"{name} is {shown(int(value))}; it must be at least {minimum}")
+        raise ValueError(f"{name} is {short_repr(int(value))}; it must be at least {minimum}")
     if maximum is not None and value > maximum:
-        raise ValueError(f"{name} is {shown(int(value))}; it must be at most {maximum}")
+        raise ValueError(f"{name} is {short_repr(int(value))}; it must be at most {maximum}")
     return int(value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 
 
 class UnknownKeywordError(TypeError, ValueError):
@@ -26,7 +26,7 @@ def unknown(what: str, value: object, known: Iterable[str], *others: str) -> Val
     """The error for a name that is none of those known, with the one that was meant perhaps, and ``others`` to give."""
     names = list(known)
     remedy = ", or ".join((f"choose one of {', '.join(names)}", *others))
-    return ValueError(f"{what} {shown(value)} is unknown; {remedy}{did_you_mean(value, names)}".lstrip())
+    return ValueError(f"{what} {short_repr(value)} is unknown; {remedy}{did_you_mean(value, names)}".lstrip())
 
 
 def no_setting(name: str, owner: str, known: Iterable[str]) -> UnknownKeywordError:

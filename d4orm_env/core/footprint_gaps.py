@@ -54,11 +54,11 @@ def near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray,
     """Pairs of robots at ``points`` ``(K, d)`` within the margin: the first, the second, and their gap [m]."""
     axis = int(np.argmax(np.ptp(points, axis=0)))
     order = np.argsort(points[:, axis], kind="stable")
-    along, reach = points[order, axis], 2 * radius.max() + margin
+    along, safety_distance = points[order, axis], 2 * radius.max() + margin
     pairs: list[IntArray] = [np.empty((2, 0), np.int64)]
     for offset in range(1, len(points)):
         # Robots farther apart along the axis than any two reach need no look; a larger offset brings none nearer.
-        near = np.flatnonzero(along[offset:] - along[:-offset] <= reach)
+        near = np.flatnonzero(along[offset:] - along[:-offset] <= safety_distance)
         if not len(near):
             break
         pairs.append(np.sort(np.stack([order[near], order[near + offset]]), axis=0))
@@ -126,13 +126,13 @@ def _corner_distance(a: Core, b: Core) -> float:
     return float(np.linalg.norm(offset - share[..., None] * along, axis=2).min())
 
 
-def _ball_gaps(world: World, place: Floats, axes: Floats) -> Iterator[float]:
+def _ball_gaps(world: World, position: Floats, axes: Floats) -> Iterator[float]:
     for ball in world.spheres.astype(np.float64):
-        yield _ball_gap(ball[:3] - place, axes, np.full(3, ball[3]))
+        yield _ball_gap(ball[:3] - position, axes, np.full(3, ball[3]))
     for x, y, radius in world.cylinders.astype(np.float64):
-        yield _ball_gap(np.array([x - place[0], y - place[1], 0.0]), axes, np.full(3, radius))
+        yield _ball_gap(np.array([x - position[0], y - position[1], 0.0]), axes, np.full(3, radius))
     for box in world.boxes.astype(np.float64):
-        offset = np.clip(place, box[:3], box[3:]) - place
+        offset = np.clip(position, box[:3], box[3:]) - position
         stretch = float(np.linalg.norm(offset / axes))
         yield float(np.linalg.norm(offset)) * (1 - 1 / stretch) if stretch > 0 else -float(axes.min())
 

@@ -47,13 +47,13 @@ def prove_infeasible(problem: Problem) -> dict[int, str]:
     within it counts. For models of users only goals and walls count, because nothing says how far their robots get in a
     step.
     """
-    d, reach = problem.dimension, problem.team.inner_radius + problem.margin
+    d, safety_distance = problem.dimension, problem.team.inner_radius + problem.margin
     starts, goals = problem.start[:, :d].astype(np.float64), problem.goal.astype(np.float64)
-    doubt = problem.rounding + ROUNDING * max(np.abs(starts).max(), np.abs(goals).max(), reach.max())
+    doubt = problem.rounding + ROUNDING * max(np.abs(starts).max(), np.abs(goals).max(), safety_distance.max())
     proofs = dict(_crowded(problem, "starts", starts, _travel(problem, _start_speed(problem)) + doubt, "one step"))
     at_rest = np.full(problem.num_robots, problem.goal_radius + doubt)
     proofs |= dict(_crowded(problem, "has a goal", goals, at_rest, "the goal radius"))
-    if not proofs and problem.world.num_obstacles and reach.min() > 0:
+    if not proofs and problem.world.num_obstacles and safety_distance.min() > 0:
         robots = _walled_off(problem, starts, goals, float(doubt))
         proofs = dict.fromkeys(robots, "has no free path to its goal: walls are closed all round the one or the other")
     return proofs
@@ -79,15 +79,15 @@ def _travel(problem: Problem, speed: Floats) -> Floats:
     return travel
 
 
-def _crowded(problem: Problem, what: str, places: Floats, freedom: Floats, within: str) -> Iterator[tuple[int, str]]:
+def _crowded(problem: Problem, what: str, positions: Floats, freedom: Floats, within: str) -> Iterator[tuple[int, str]]:
     """Robots within the margin of something wherever they get from their places ``(K, d)`` by ``freedom`` ``(K,)``."""
     radius, margin = problem.team.inner_radius, problem.margin
-    clearance, needed = problem.world.clearance(places) - radius, f"the margin of {margin:g} m within {within}"
+    clearance, needed = problem.world.clearance(positions) - radius, f"the margin of {margin:g} m within {within}"
     for robot in np.flatnonzero(clearance + freedom < margin).tolist():
         gap = f"{what} {clearance[robot]:.3g} m from an obstacle or the bounds"
         yield robot, f"{gap}, and cannot come clear of them by {needed}"
-    for later in range(1, len(places)):
-        offset = places[:later] - places[later]
+    for later in range(1, len(positions)):
+        offset = positions[:later] - positions[later]
         gaps = np.sqrt((offset * offset).sum(axis=1)) - radius[:later] - radius[later]
         for other in np.flatnonzero(gaps + freedom[:later] + freedom[later] < margin).tolist():
             for robot, neighbour in ((later, other), (other, later)):
@@ -97,26 +97,28 @@ def _crowded(problem: Problem, what: str, places: Floats, freedom: Floats, withi
 
 def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -> list[int]:
     """Robots whose goals are not connected with their starts."""
-    d, reach = problem.dimension, problem.team.inner_radius + problem.margin
+    d, safety_distance = problem.dimension, problem.team.inner_radius + problem.margin
     travel = _travel(problem, problem.team.max_speed.astype(np.float64))
     for halving in range(1 + HALVINGS):
-        low, cell, clearance = _cells(problem, np.concatenate([starts, goals]), float(reach.min()) / 2**halving)
+        low, cell, clearance = _cells(
+            problem, np.concatenate([starts, goals]), float(safety_distance.min()) / 2**halving
+        )
         half, are_open = cell * np.sqrt(d) / 2, True
         robots: list[int] = []
-        for group in _similar(reach):
-            body, least = float(reach[group].min()) - problem.margin, float(reach[group].min())
+        for group in _similar(safety_distance):
+            body, least = float(safety_distance[group].min()) - problem.margin, float(safety_distance[group].min())
             by_steps = least - travel[group].max() / 2
             kept, away = (by_steps, travel[group].max()) if by_steps > body else (body, 0.0)
             # Beyond the cells everything is connected.
             free = np.pad(clearance > kept - half - doubt, 1, constant_values=True)
             regions, _ = ndimage.label(free, np.ones((3,) * d))
-            rooms, _ = ndimage.label(clearance > np.sqrt(reach[group].max() ** 2 + cell * cell / 4))
+            rooms, _ = ndimage.label(clearance > np.sqrt(safety_distance[group].max() ** 2 + cell * cell / 4))
             for robot in group.tolist():
                 begin = _near(regions, low - cell, cell, starts[robot], away + half + doubt)
                 end = _near(regions, low - cell, cell, goals[robot], problem.goal_radius + half + doubt)
                 if not begin & end:
                     robots.append(robot)
-                begin, end = (_near(rooms, low, cell, place[robot], 2 * half) for place in (starts, goals))
+                begin, end = (_near(rooms, low, cell, position[robot], 2 * half) for position in (starts, goals))
                 are_open &= bool(begin & end)
         if robots or are_open:
             return sorted(robots)
@@ -125,7 +127,7 @@ def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -
     return []
 
 
-def _cells(problem: Problem, places: Floats, cell: float) -> tuple[Floats, float, Floats]:
+def _cells(problem: Problem, positions: Floats, cell: float) -> tuple[Floats, float, Floats]:
     """The lowest corner of all cells, their size, larger where there would be too many, and the clearance of each.
 
     They reach beyond the bounds, or in an open world all round obstacles and places ``(P, d)``.
@@ -133,7 +135,7 @@ def _cells(problem: Problem, places: Floats, cell: float) -> tuple[Floats, float
     lower, upper = problem.world.bounds.astype(np.float64)
     if problem.world.lower is None:
         lower, upper = problem.world.shapes.extent()
-        lower, upper = np.minimum(lower, places.min(axis=0)), np.maximum(upper, places.max(axis=0))
+        lower, upper = np.minimum(lower, positions.min(axis=0)), np.maximum(upper, positions.max(axis=0))
     while True:
         low, high = lower - 2 * cell, upper + 2 * cell
         size = np.ceil((high - low) / cell)
@@ -144,19 +146,19 @@ def _cells(problem: Problem, places: Floats, cell: float) -> tuple[Floats, float
     return low, cell, problem.world.clearance(centres)
 
 
-def _similar(reach: Floats) -> Iterator[IntArray]:
+def _similar(safety_distance: Floats) -> Iterator[IntArray]:
     """Robots in groups of about the same reach ``(K,)``."""
-    left = np.argsort(reach, kind="stable")
+    left = np.argsort(safety_distance, kind="stable")
     while len(left):
-        alike = reach[left] <= SIMILAR * reach[left[0]]
+        alike = safety_distance[left] <= SIMILAR * safety_distance[left[0]]
         yield left[alike]
         left = left[~alike]
 
 
-def _near(labels: NDArray[np.int32], low: Floats, cell: float, place: Floats, distance: float) -> set[int]:
+def _near(labels: NDArray[np.int32], low: Floats, cell: float, position: Floats, distance: float) -> set[int]:
     """Labels, but for zero, of the cells whose middle is so near to a place."""
-    first = np.clip(np.floor((place - distance - low) / cell).astype(int), 0, labels.shape)
-    last = np.clip(np.ceil((place + distance - low) / cell).astype(int), 0, labels.shape)
+    first = np.clip(np.floor((position - distance - low) / cell).astype(int), 0, labels.shape)
+    last = np.clip(np.ceil((position + distance - low) / cell).astype(int), 0, labels.shape)
     part = labels[tuple(map(slice, first, last))]
-    offset = cell * (np.moveaxis(np.indices(part.shape), 0, -1) + first + 0.5) + low - place
+    offset = cell * (np.moveaxis(np.indices(part.shape), 0, -1) + first + 0.5) + low - position
     return set(part[(offset * offset).sum(axis=-1) <= distance * distance].tolist()) - {0}

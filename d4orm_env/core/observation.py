@@ -82,10 +82,10 @@ def _see_robots(k: int, sensed: Sensed, i: int, out: FloatArray) -> None:
 
 
 def _see_obstacles(
-    place: FloatArray, arrays: ProblemArrays, radius: float, nearest: FloatArray, i: int, out: FloatArray
+    position: FloatArray, arrays: ProblemArrays, radius: float, nearest: FloatArray, i: int, out: FloatArray
 ) -> None:
     """Fill the rows of obstacles, from component ``i`` on."""
-    d = place.shape[0]
+    d = position.shape[0]
     for row in range(nearest.shape[0]):
         present = nearest[row, 0] < np.inf
         out[i] = 1 if present else 0
@@ -93,7 +93,7 @@ def _see_obstacles(
         for axis in range(d):
             out[i + 1 + axis] = 0
         if present:
-            _point_to(int(nearest[row, 1]), place, arrays, out[i + 1 : i + 1 + d])
+            _point_to(int(nearest[row, 1]), position, arrays, out[i + 1 : i + 1 + d])
         i += 2 + d
 
 
@@ -125,35 +125,35 @@ def _find_nearest_robots(k: int, position: FloatArray, hidden: BoolArray, neares
             insert_nearest(gap2, other, nearest)
 
 
-def _find_nearest_obstacles(place: FloatArray, arrays: ProblemArrays, nearest: FloatArray) -> None:
-    d = place.shape[0]
+def _find_nearest_obstacles(position: FloatArray, arrays: ProblemArrays, nearest: FloatArray) -> None:
+    d = position.shape[0]
     if nearest.shape[0] == 0:
         return
     nearest[:, 0] = np.inf
     index, count = arrays.grid, arrays.boxes.shape[0] + arrays.triangles.shape[0]
-    own = _list_of(place, index) if count > 0 and index.nearest >= nearest.shape[0] else -1
+    own = _list_of(position, index) if count > 0 and index.nearest >= nearest.shape[0] else -1
     begin, end = (index.first[own], index.first[own + 1]) if own >= 0 else (0, count)
     for number in range(begin, end):
         item = index.items[number] if own >= 0 else number
         if item < arrays.boxes.shape[0]:
-            insert_nearest(_distance_to_box(place, arrays.boxes[item]) - arrays.boxes[item, 2 * d], item, nearest)
+            insert_nearest(_distance_to_box(position, arrays.boxes[item]) - arrays.boxes[item, 2 * d], item, nearest)
         else:
-            gap = _gap_to_triangle(place, arrays.triangles[item - arrays.boxes.shape[0]])
+            gap = _gap_to_triangle(position, arrays.triangles[item - arrays.boxes.shape[0]])
             insert_nearest(gap[0], item, nearest)
     for axis in range(d):
         for side in range(2):
-            beyond = arrays.bounds[side, axis] - place[axis]
+            beyond = arrays.bounds[side, axis] - position[axis]
             insert_nearest(-beyond if side == 0 else beyond, count + 2 * axis + side, nearest)
 
 
-def _list_of(place: FloatArray, index: WorldIndex) -> int:
+def _list_of(position: FloatArray, index: WorldIndex) -> int:
     """Number of the list of obstacles in the innermost grid that holds a place; -1 beyond them all."""
     width = 1.0
     for level in range(index.levels):
         cell, inside = 0, True
-        for axis in range(place.shape[0]):
+        for axis in range(position.shape[0]):
             middle = 0.5 * index.size[axis]
-            step = ((place[axis] - index.low[axis]) * index.scale - middle) / width + middle
+            step = ((position[axis] - index.low[axis]) * index.scale - middle) / width + middle
             inside &= (step >= 0) & (step < index.size[axis])
             cell = cell * index.size[axis] + int(step) if inside else 0
         if inside:
@@ -162,41 +162,41 @@ def _list_of(place: FloatArray, index: WorldIndex) -> int:
     return -1
 
 
-def _point_to(item: int, place: FloatArray, arrays: ProblemArrays, out: FloatArray) -> None:
+def _point_to(item: int, position: FloatArray, arrays: ProblemArrays, out: FloatArray) -> None:
     """Fill the vector to the nearest point of an obstacle, or of a bound, which come last."""
-    d, boxes, triangles = place.shape[0], arrays.boxes.shape[0], arrays.triangles.shape[0]
+    d, boxes, triangles = position.shape[0], arrays.boxes.shape[0], arrays.triangles.shape[0]
     if item < boxes:
         box = arrays.boxes[item]
-        distance, radius = _distance_to_box(place, box), box[2 * d]
+        distance, radius = _distance_to_box(position, box), box[2 * d]
         # Inside a box, whose radius is zero, the vector is too.
         share = (distance - radius) / max(distance, 1e-6) if radius > 0 else 1.0
         for axis in range(d):
-            out[axis] = (min(max(place[axis], box[axis]), box[d + axis]) - place[axis]) * share
+            out[axis] = (min(max(position[axis], box[axis]), box[d + axis]) - position[axis]) * share
     elif item < boxes + triangles:
-        distance, out[0], out[1] = _gap_to_triangle(place, arrays.triangles[item - boxes])
+        distance, out[0], out[1] = _gap_to_triangle(position, arrays.triangles[item - boxes])
     else:
         axis, side = (item - boxes - triangles) // 2, (item - boxes - triangles) % 2
-        out[axis] = arrays.bounds[side, axis] - place[axis]
+        out[axis] = arrays.bounds[side, axis] - position[axis]
 
 
-def _distance_to_box(place: FloatArray, box: FloatArray) -> float:
+def _distance_to_box(position: FloatArray, box: FloatArray) -> float:
     """Distance to the box that is rounded off."""
-    d = place.shape[0]
-    gap = min(max(place[0], box[0]), box[d]) - place[0]
+    d = position.shape[0]
+    gap = min(max(position[0], box[0]), box[d]) - position[0]
     distance2 = gap * gap
     for axis in range(1, d):
-        gap = min(max(place[axis], box[axis]), box[d + axis]) - place[axis]
+        gap = min(max(position[axis], box[axis]), box[d + axis]) - position[axis]
         distance2 += gap * gap
     return np.sqrt(distance2)
 
 
-def _gap_to_triangle(place: FloatArray, corners: FloatArray) -> tuple[float, float, float]:
+def _gap_to_triangle(position: FloatArray, corners: FloatArray) -> tuple[float, float, float]:
     """Distance of a triangle and the vector to its nearest point, zero inside."""
     inside, nearest_x, nearest_y, least = True, 0.0, 0.0, np.inf
     for edge in range(3):
         after = (edge + 1) % 3
         along_x, along_y = corners[2 * after] - corners[2 * edge], corners[2 * after + 1] - corners[2 * edge + 1]
-        offset_x, offset_y = place[0] - corners[2 * edge], place[1] - corners[2 * edge + 1]
+        offset_x, offset_y = position[0] - corners[2 * edge], position[1] - corners[2 * edge + 1]
         inside &= along_x * offset_y - along_y * offset_x >= 0
         share = (offset_x * along_x + offset_y * along_y) / (along_x * along_x + along_y * along_y)
         share = min(max(share, 0.0), 1.0)

@@ -247,8 +247,8 @@ def _reduced(x: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
     quadrant = multiple.astype(np.int64) & 3
     if some_huge:
         quadrant, high, low = (np.array(part) for part in (quadrant, high, low))
-        for place in zip(*np.nonzero(np.atleast_1d(huge)), strict=True):
-            where = place if np.ndim(x) else ()
+        for position in zip(*np.nonzero(np.atleast_1d(huge)), strict=True):
+            where = position if np.ndim(x) else ()
             quadrant[where], high[where], low[where] = _reduced_exactly(float(x[where]))
     return quadrant, high, low
 

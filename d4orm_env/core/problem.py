@@ -195,8 +195,8 @@ class Problem(Frozen):
 
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
         """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
-        places = np.concatenate([self.start[:, : self.dimension], self.goal])
-        grid = self.world.index(self._reach, max(num_obstacles, 1), places, self._within)
+        positions = np.concatenate([self.start[:, : self.dimension], self.goal])
+        grid = self.world.index(self._reach, max(num_obstacles, 1), positions, self._within)
         return self.arrays._replace(grid=grid)
 
     @cached_property

@@ -69,14 +69,14 @@ def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radiu
 
 def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:
     """A problem with an index of its obstacles, as the engines read it."""
-    places, turns = problem.start[:, : problem.dimension], not np.isnan(problem.goal_heading).all()
+    positions, turns = problem.start[:, : problem.dimension], not np.isnan(problem.goal_heading).all()
     arrays = ProblemArrays(
         model_codes=np.array([MODEL_CODES[name] for name in problem.team.models], np.int32),
         limits=problem.team.limits.copy(),
         radius=problem.team.radius,
         start=problem.start,
         goal=problem.goal,
-        inverse_initial_distance=inverse_initial_distance(places, problem.goal, problem.goal_radius),
+        inverse_initial_distance=inverse_initial_distance(positions, problem.goal, problem.goal_radius),
         boxes=problem.world.shapes.boxes,
         triangles=problem.world.shapes.triangles,
         grid=grid,

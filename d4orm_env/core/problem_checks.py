@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import (
     Floats,
     as_float32,
     positive_number,
-    shown,
+    short_repr,
     whole_number,
 )
 from d4orm_env.core.bodies import numbers_by_robot
@@ -51,7 +51,7 @@ INTEGRATION_ERROR = 2 / 15
 def check_arrival(value: object) -> None:
     """Refuse what is no :data:`Arrival`."""
     if value not in get_args(Arrival):
-        raise ValueError(f"arrival is {shown(value)}; choose one of {', '.join(get_args(Arrival))}")
+        raise ValueError(f"arrival is {short_repr(value)}; choose one of {', '.join(get_args(Arrival))}")
 
 
 def checked_numbers(
@@ -73,16 +73,16 @@ def checked_numbers(
 
 def check_physics(problem: Problem) -> list[str]:
     """Refuse what float32 or RK4 does not hold and places that robots cannot be at; those within the margin."""
-    team, places = problem.team, problem.start[:, : problem.dimension]
-    check_resolution(team, np.concatenate([places, problem.goal], axis=1), problem.dt, problem.goal_radius)
+    team, starts = problem.team, problem.start[:, : problem.dimension]
+    check_resolution(team, np.concatenate([starts, problem.goal], axis=1), problem.dt, problem.goal_radius)
     check_turning(team, problem.dt, problem.goal_radius)
     check_tolerances(problem.goal_heading_tolerance)
     at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, problem.goal_heading)
     goals = np.column_stack([problem.goal, at_goals]).astype(np.float64)
     faults = [
-        check_places(team, problem.world, what, positions, problem.margin, poses)
+        check_positions(team, problem.world, what, positions, problem.margin, poses)
         for what, positions, poses in (
-            ("start", places, team.body_poses(problem.start) if team.shapes else None), ("goal", problem.goal, goals)
+            ("start", starts, team.body_poses(problem.start) if team.shapes else None), ("goal", problem.goal, goals)
         )
     ]  # fmt: skip
     return [fault for fault in faults if fault]
@@ -97,7 +97,7 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
         speeds = as_float32(given)
         speeds = np.repeat(speeds, team.num_robots) if speeds.ndim == 0 else speeds
     except ValueError as error:
-        raise ValueError(f"goal_speed must be a number or one per robot, not {shown(given)}; {error}") from error
+        raise ValueError(f"goal_speed must be a number or one per robot, not {short_repr(given)}; {error}") from error
     if speeds.shape != (team.num_robots,):
         raise ValueError(f"goal_speed has shape {speeds.shape}; expected one number, or ({team.num_robots},)")
     wrong = ~((speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf)))
@@ -185,9 +185,9 @@ def unwound_states(team: Team, states: FloatArray) -> FloatArray:
     return within
 
 
-def check_resolution(team: Team, places: FloatArray, dt: float, goal_radius: float) -> None:
-    """Refuse ``places`` ``(K, .)`` that float32 does not resolve as the goal radius, and a step of a robot, ask."""
-    farthest = np.abs(places).max(axis=1)
+def check_resolution(team: Team, positions: FloatArray, dt: float, goal_radius: float) -> None:
+    """Refuse ``positions`` ``(K, .)`` that float32 does not resolve as the goal radius, and a step of a robot, ask."""
+    farthest = np.abs(positions).max(axis=1)
     grain = np.spacing(farthest).astype(np.float64)
     stride = team.max_speed.astype(np.float64) * dt
     for robot in range(team.num_robots):
@@ -226,27 +226,27 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
             )
 
 
-def check_places(
-    team: Team, world: World, what: str, places: FloatArray, margin: float, poses: Floats | None = None
+def check_positions(
+    team: Team, world: World, what: str, positions: FloatArray, margin: float, poses: Floats | None = None
 ) -> str:
-    """Refuse starts or goals (``what``) at ``places`` ``(K, d)`` outside the world, or that touch something.
+    """Refuse starts or goals (``what``) at ``positions`` ``(K, d)`` outside the world, or that touch something.
 
     Where the heading of a body's pose is NaN [rad], as all are by default, the disc within its footprint counts for it;
     ``poses`` are ``(F, d + 1)``, or without the trailers ``(K, d + 1)``. Returned is what is nearest within the margin,
     for an error or a warning: the empty string if nothing is.
     """
     radius = team.radius.astype(np.float64)
-    gaps = world.clearance(places) - radius
+    gaps = world.clearance(positions) - radius
     shaped = bool(team.shapes)
     if poses is None:
-        poses = np.column_stack([places.astype(np.float64), np.full(len(places), np.nan)])
+        poses = np.column_stack([positions.astype(np.float64), np.full(len(positions), np.nan)])
     bodies = numbers_by_robot(team.bodies[: len(poses)], team.num_robots) if shaped else []
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
         gaps[robot] = min(world_gap(world, team.bodies[i].footprint, poses[i]) for i in bodies[robot])
     for robot in np.flatnonzero(gaps <= 0):
-        where = f"{what} of robot_{robot} at {_point(places[robot])} is {0 - gaps[robot]:.3g} m inside an obstacle"
+        where = f"{what} of robot_{robot} at {_point(positions[robot])} is {0 - gaps[robot]:.3g} m inside an obstacle"
         raise ValueError(f"{where} or outside the bounds ({_size(team, int(robot))}); move it, or change the world")
-    first, second, between = near_pairs(places.astype(np.float64), radius, margin)
+    first, second, between = near_pairs(positions.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
         between = np.array([_least_gap(team, poses, bodies[one], bodies[other]) for one, other in pairs], np.float64)
@@ -256,7 +256,7 @@ def check_places(
         one, other = int(first[pair]), int(second[pair])
         distance = "" if shaped else f"more than {radius[one] + radius[other]:g} m "
         raise ValueError(
-            f"{what}s of robot_{one} at {_point(places[one])} and robot_{other} at {_point(places[other])} "
+            f"{what}s of robot_{one} at {_point(positions[one])} and robot_{other} at {_point(positions[other])} "
             f"overlap by {0 - between[pair]:.3g} m; move them {distance}apart"
         )
     least = int(np.argmin(gaps))
@@ -287,5 +287,5 @@ def _turning_limits(model: Model) -> str:
     return ", ".join(model.limit_names[column] for _, column in model.state_limits) or "limits"
 
 
-def _point(place: FloatArray) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in place) + ")"
+def _point(position: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in position) + ")"

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import describe, unknown
 
 T = TypeVar("T", covariant=True)
@@ -54,7 +54,8 @@ class Registry(Mapping[str, T]):
         """Register a thing, or the text ``"package.module:Name"`` of one; again if defined anew."""
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise ValueError(
-                f"{self.what} name {shown(name)} is none; give one of letters, digits, hyphens, dots and underscores"
+                f"{self.what} name {short_repr(name)} is none; give one of letters, digits, hyphens, dots and "
+                "underscores"
             )
         if not isinstance(thing, str):
             self._admit(name, thing)
@@ -75,7 +76,7 @@ class Registry(Mapping[str, T]):
         if not claims:
             raise KeyError(name)
         if len(claims) > 1 and not self._same(claims):
-            owners = " and ".join(claim if isinstance(claim, str) else shown(claim) for claim in claims)
+            owners = " and ".join(claim if isinstance(claim, str) else short_repr(claim) for claim in claims)
             raise ValueError(f"{self.what} name {name!r} is claimed by {owners}; uninstall one of them")
         return claims[0]
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from d4orm_env.core.arrays import shown, whole_number
+from d4orm_env.core.arrays import short_repr, whole_number
 from d4orm_env.core.team import Team
 
 _BITCRAZE = "92 mm between motors, 47 mm propellers; not looked up, measure yours"
@@ -89,7 +89,7 @@ ROBOTS: Mapping[str, RobotType] = MappingProxyType({
 def find_robot(name: str) -> RobotType:
     """The robot of that name."""
     if not isinstance(name, str) or name not in ROBOTS:
-        raise ValueError(f"robot {shown(name)} is unknown; choose one of {', '.join(ROBOTS)}")
+        raise ValueError(f"robot {short_repr(name)} is unknown; choose one of {', '.join(ROBOTS)}")
     return ROBOTS[name]
 
 

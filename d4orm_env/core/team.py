@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, read_only, shown
+from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, read_only, short_repr
 from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, find_bodies
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
@@ -93,7 +93,9 @@ class Team(Frozen):
             raise ValueError(f"footprint has {len(footprints)} entries for {count} robots; give one each, or one")
         for robot, footprint in enumerate(footprints):
             if not isinstance(footprint, Footprint):
-                raise ValueError(f"footprint of robot_{robot} is {shown(footprint)}; give one such as Box(0.5, 0.25)")
+                raise ValueError(
+                    f"footprint of robot_{robot} is {short_repr(footprint)}; give one such as Box(0.5, 0.25)"
+                )
             if footprint.dimension != self.dimension and not isinstance(footprint, Disc):
                 raise ValueError(
                     f"footprint of robot_{robot}, {footprint}, lies in {footprint.dimension} dimensions and the team "
@@ -108,7 +110,9 @@ class Team(Frozen):
         reach = [self._reach(robot, footprint) for robot, footprint in enumerate(footprints)]
         radii = frozen_per_robot(reach, "radius", count)
         if radius is not None and (frozen_per_robot(radius, "radius", count) != radii).any():
-            raise ValueError(f"radius {shown(radius)} is not that of the footprints, {radii.tolist()}; leave it out")
+            raise ValueError(
+                f"radius {short_repr(radius)} is not that of the footprints, {radii.tolist()}; leave it out"
+            )
         shaped = not all(isinstance(footprint, Disc) for footprint in footprints)
         self._set(radius=radii, shapes=footprints if shaped else ())
 
@@ -173,13 +177,13 @@ class Team(Frozen):
 
     def _complete_own_limits(self, given: Mapping[str, ArrayLike]) -> dict[str, FloatArray]:
         if not isinstance(given, Mapping):
-            raise ValueError(f"own_limits must be a mapping such as {{'wheelbase': 0.3}}, not {shown(given)}")
+            raise ValueError(f"own_limits must be a mapping such as {{'wheelbase': 0.3}}, not {short_repr(given)}")
         known = [{limit.name: limit for limit in model.own_limits} for model in self.robot_models]
         names = dict.fromkeys(name for limits in known for name in limits)
         for name in given:
             if name not in names:
                 raise ValueError(
-                    f"own_limits holds {shown(name)}, which no model of the team has; "
+                    f"own_limits holds {short_repr(name)}, which no model of the team has; "
                     f"it has {', '.join(names) or 'none of its own'}"
                 )
         return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}

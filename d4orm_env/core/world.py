@@ -178,28 +178,28 @@ class World(Frozen):
         return max(float((upper - lower).max()), SMALLEST) / 32
 
     def index(
-        self, reach: float, nearest: int = 1, places: FloatArray | None = None, within: float = 0.0
+        self, max_distance: float, nearest: int = 1, positions: FloatArray | None = None, within: float = 0.0
     ) -> WorldIndex:
         """The grid that finds obstacles, made once for distances of about the same size.
 
         Args:
-            reach: The largest distance from an obstacle at which it counts [m].
+            max_distance: The largest distance from an obstacle at which it counts [m].
             nearest: Number of nearest obstacles that it is to find.
-            places: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m], and in
+            positions: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m], and in
                 wider grids farther away.
             within: Distance within which it is to find all obstacles, not only the nearest [m].
         """
-        reach = margin = _rounded_up(reach)
+        max_distance = margin = _rounded_up(max_distance)
         levels = 1
-        if places is not None and self.shapes.count:
+        if positions is not None and self.shapes.count:
             lower, upper = self.shapes.extent()
-            margin = _rounded_up(max(reach, float(np.max([lower - places, places - upper]))))
+            margin = _rounded_up(max(max_distance, float(np.max([lower - positions, positions - upper]))))
             levels = _LEVELS if self.shapes.count <= _FEW else 1
-        key = (reach, nearest, margin, levels, within)
+        key = (max_distance, nearest, margin, levels, within)
         if key not in self._indices:
             # Cells of a quarter of a reach leave few points undecided, which pays for thousands of samples. Who
             # observes asks once per robot and time step, and in ever new worlds.
-            cell = reach / 4 if places is None else reach
+            cell = max_distance / 4 if positions is None else max_distance
             self._indices[key] = build_index(self.shapes, cell, margin, nearest, levels, within)
         return self._indices[key]
 

@@ -9,7 +9,7 @@ import numpy as np
 from crazyflow.drones import Drone
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, shown
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, short_repr
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -44,7 +44,7 @@ class DronePhysics:
 
     def __post_init__(self) -> None:
         if self.drone not in DRONES:
-            raise ValueError(f"drone is {shown(self.drone)}; choose one of {', '.join(DRONES)}")
+            raise ValueError(f"drone is {short_repr(self.drone)}; choose one of {', '.join(DRONES)}")
         factor = positive_number(self.mass_factor, "mass_factor", least=0.1, most=10)
         object.__setattr__(self, "mass_factor", factor)
         object.__setattr__(self, "gust", positive_number(self.gust, "gust", zero_allowed=True, most=10))
@@ -115,12 +115,12 @@ class DroneBodies:
         self._setpoints: FloatArray = self.problem.start.copy()
         self._parked: BoolArray = np.zeros(self.problem.num_robots, np.bool_)
         self._random, self._clock = generator(seed, Stream.GUSTS), 0
-        place = self.problem.start[:, :3].astype(np.float64)
-        self._flight.begin(place)
-        still = np.zeros((round(HOVER * SETPOINT_RATE), *place.shape))
-        self._flight.fly(place + still, still, still, still)
+        position = self.problem.start[:, :3].astype(np.float64)
+        self._flight.begin(position)
+        still = np.zeros((round(HOVER * SETPOINT_RATE), *position.shape))
+        self._flight.fly(position + still, still, still, still)
         self._position = self._flight.position
-        self._off, self._acceleration = self._position - place, np.zeros_like(place)
+        self._off, self._acceleration = self._position - position, np.zeros_like(position)
         self._look()
         self.record = FlightRecord.empty(self.problem.num_robots)
 
@@ -247,7 +247,7 @@ class parallel_env(navigation_v0.parallel_env):
     ) -> None:
         if not isinstance(physics, DronePhysics | None):
             raise ValueError(
-                f"physics is {shown(physics)}; give d4orm_env.crazyflow.DronePhysics(...), or leave it out"
+                f"physics is {short_repr(physics)}; give d4orm_env.crazyflow.DronePhysics(...), or leave it out"
             )
         self._physics = physics or DronePhysics()
         super().__init__(scenario, num_robots, **options)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, shown, whole_number
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, positive_number, short_repr, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import (
     MAX_DELAY,
@@ -137,7 +137,7 @@ class Quantisation(Disturbance[Memory]):
 def _steps_or_range(value: Any, name: str) -> int | tuple[int, int]:
     ends = value if isinstance(value, tuple | list) else (value, value)
     if len(ends) != 2:
-        raise ValueError(f"{name} is {shown(value)}; give a number of steps, or a range as (1, 3)")
+        raise ValueError(f"{name} is {short_repr(value)}; give a number of steps, or a range as (1, 3)")
     least = whole_number(ends[0], name, 0, MAX_DELAY)
     most = whole_number(ends[1], name, least, MAX_DELAY)
     return least if least == most else (least, most)

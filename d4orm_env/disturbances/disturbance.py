@@ -15,7 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, positive_number, shown
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, positive_number, short_repr
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -24,7 +24,7 @@ from d4orm_env.disturbances.draws import Draws
 from d4orm_env.dynamics.robot_model import TimeStep
 
 Memory = tuple[NDArray[np.generic], ...]
-"""Memory of a disturbance over an episode: arrays ``(B, ...)``, changed in place. A ``NamedTuple`` names them."""
+"""Memory of a disturbance over an episode: arrays ``(B, ...)``, changed in position. A ``NamedTuple`` names them."""
 
 M = TypeVar("M", bound=Memory)
 
@@ -207,12 +207,12 @@ def checked_disturbances(given: object) -> Disturbances:
     if isinstance(given, Disturbance):
         given = (given,)
     if isinstance(given, str) or not isinstance(given, Iterable):
-        raise ValueError(f"disturbances is {shown(given)}; give a list of them, as [Delay(2), Push(0.1, 0.3)]")
+        raise ValueError(f"disturbances is {short_repr(given)}; give a list of them, as [Delay(2), Push(0.1, 0.3)]")
     listed = tuple(given)
     for one in listed:
         if not isinstance(one, Disturbance):
             raise ValueError(
-                f"disturbances holds {shown(one)}, which is none; give instances, as [Delay(2), Push(0.1, 0.3)]"
+                f"disturbances holds {short_repr(one)}, which is none; give instances, as [Delay(2), Push(0.1, 0.3)]"
             )
     return listed
 
@@ -229,7 +229,7 @@ def total_slack(disturbances: Disturbances, problem: Problem) -> BoundsSlack:
     return reduce(BoundsSlack.joined, (one.slack(problem) for one in disturbances), BoundsSlack())
 
 
-def marks_of(effects: Sequence[DisturbanceEffect], problem: Problem) -> DisturbanceEvents:
+def events_of(effects: Sequence[DisturbanceEffect], problem: Problem) -> DisturbanceEvents:
     """Marks of one world from its effects at the beginning and after every step, each of one world."""
     still = np.zeros((1, problem.num_robots, problem.dimension), np.float32)
     obeying = np.zeros((1, problem.num_robots), np.bool_)
@@ -265,7 +265,7 @@ def unless(special: object, check: Check) -> Check:
 def truth(value: object, name: str) -> bool:
     """True or False."""
     if not isinstance(value, bool):
-        raise ValueError(f"{name} is {shown(value)}; it must be True or False")
+        raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
     return value
 
 
@@ -274,13 +274,13 @@ def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:
     try:
         array = as_float32(value)
     except ValueError:
-        raise ValueError(f"{name} must be a number or one per control component, not {shown(value)}") from None
+        raise ValueError(f"{name} must be a number or one per control component, not {short_repr(value)}") from None
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; give one number, or one per control component")
     if not np.isfinite(array).all() or (array < 0).any():
-        raise ValueError(f"{name} is {shown(value)}; it must be zero or more and finite")
+        raise ValueError(f"{name} is {short_repr(value)}; it must be zero or more and finite")
     if (array > LARGEST).any():
-        raise ValueError(f"{name} is {shown(value)}; it must be at most {LARGEST:g}")
+        raise ValueError(f"{name} is {short_repr(value)}; it must be at most {LARGEST:g}")
     return tuple(array.tolist()) if array.ndim else float(np.asarray(value, np.float64))
 
 

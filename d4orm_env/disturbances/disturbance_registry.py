@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.registry import Registry
 from d4orm_env.disturbances.controls import Bias, ControlNoise, CorrelatedNoise, Delay, Dropout, Gain, Lag, Quantisation
@@ -29,7 +29,7 @@ _BUILT_IN: tuple[type[AnyDisturbance], ...] = (
 def _admit(name: str, thing: object) -> type[AnyDisturbance]:
     if not (isinstance(thing, type) and issubclass(thing, Disturbance)):
         raise ValueError(
-            f"disturbance {name!r} is {shown(thing)}; give a subclass of d4orm_env.disturbances.Disturbance"
+            f"disturbance {name!r} is {short_repr(thing)}; give a subclass of d4orm_env.disturbances.Disturbance"
         )
     return thing
 

@@ -160,8 +160,8 @@ class DisturbedWorlds:
             states = np.where(scene.standing[..., None], scene.states, states)
         if self._bodies.shape[1]:
             effects = (one.disturbance.effect(one.memory, scene).bodies for one in self._bringing)
-            there = [bodies for bodies in effects if bodies is not None]
-            self._bodies = there[0] if len(there) == 1 else np.concatenate(there, axis=1)
+            present = [bodies for bodies in effects if bodies is not None]
+            self._bodies = present[0] if len(present) == 1 else np.concatenate(present, axis=1)
         return states, controls
 
     def effect(self, scene: Scene) -> DisturbanceEffect:

@@ -93,13 +93,13 @@ class Intruder(Disturbance[Courses]):
     def _courses(self, scene: Scene, draws: Draws) -> Courses:
         """New lines for all worlds, their bodies at the beginning."""
         d, room = scene.problem.dimension, np.float32(self._room(scene.problem))
-        stands = np.concatenate([scene.start[..., :d], scene.goal], axis=1)
-        low, high = stands.min(axis=1), stands.max(axis=1)
+        endpoints = np.concatenate([scene.start[..., :d], scene.goal], axis=1)
+        low, high = endpoints.min(axis=1), endpoints.max(axis=1)
         centre, half = (low + high) / 2, (high - low) / 2
         reach = np.sqrt((half * half).sum(axis=-1)) + room
         heading = draws.direction(self.count, _TRIES, d)
         through = low[:, None, None] + (high - low)[:, None, None] * draws.uniform(self.count, _TRIES, d)
-        gaps = _distances(stands[:, None, None], through[..., None, :], heading[..., None, :]).min(axis=-1)
+        gaps = _distances(endpoints[:, None, None], through[..., None, :], heading[..., None, :]).min(axis=-1)
         best = np.minimum(gaps, room).argmax(axis=-1)
         chosen = (np.arange(len(best))[:, None], np.arange(self.count), best)
         heading, through = heading[chosen], through[chosen]
@@ -107,10 +107,10 @@ class Intruder(Disturbance[Courses]):
         offset = centre[:, None] - through
         middle = (offset * heading).sum(axis=-1)
         half_chord = np.sqrt(np.maximum(reach[:, None] ** 2 - (offset * offset).sum(axis=-1) + middle * middle, 0))
-        places = through + (middle - half_chord)[..., None] * heading
-        speed, radius = np.float32(self.speed), np.full((*places.shape[:-1], 1), self.radius, np.float32)
+        positions = through + (middle - half_chord)[..., None] * heading
+        speed, radius = np.float32(self.speed), np.full((*positions.shape[:-1], 1), self.radius, np.float32)
         time = 2 * half_chord / np.maximum(speed, np.float32(1e-6))
-        return Courses(np.concatenate([places, speed * heading, radius], axis=-1), time)
+        return Courses(np.concatenate([positions, speed * heading, radius], axis=-1), time)
 
 
 def _distances(points: FloatArray, through: FloatArray, heading: FloatArray) -> FloatArray:
@@ -148,19 +148,19 @@ class MovingObstacle(Disturbance[Kept]):
     def __post_init__(self) -> None:
         super().__post_init__()
         times = frozen_array(self.times, "MovingObstacle times", (None,), largest=LARGEST).astype(np.float64)
-        places = np.array(self.positions, np.float64)
+        positions = np.array(self.positions, np.float64)
         if len(times) < 2 or (np.diff(times) <= 0).any():
             raise ValueError("MovingObstacle times must be two or more, and increase")
-        if places.ndim == 2:
-            places = places[:, None]
-        if places.ndim != 3 or len(places) != len(times) or not 1 <= places.shape[1] <= MAX_INTRUDERS:
+        if positions.ndim == 2:
+            positions = positions[:, None]
+        if positions.ndim != 3 or len(positions) != len(times) or not 1 <= positions.shape[1] <= MAX_INTRUDERS:
             raise ValueError(
                 f"MovingObstacle positions have shape {np.shape(self.positions)}; they must be (T, d), or (T, N, d) of "
                 f"at most {MAX_INTRUDERS} bodies, for {len(times)} times"
             )
-        if (np.abs(places) > LARGEST).any():
+        if (np.abs(positions) > LARGEST).any():
             raise ValueError(f"MovingObstacle positions must be at most {LARGEST:g} m in magnitude, or NaN")
-        for name, value in {"times": times, "positions": places}.items():
+        for name, value in {"times": times, "positions": positions}.items():
             object.__setattr__(self, name, value)
 
     def __eq__(self, other: object) -> bool:
@@ -171,8 +171,8 @@ class MovingObstacle(Disturbance[Kept]):
 
     @property
     def _content(self) -> tuple[object, ...]:
-        times, places = self._track
-        return times.tobytes(), places.shape, places.tobytes(), self.radius
+        times, positions = self._track
+        return times.tobytes(), positions.shape, positions.tobytes(), self.radius
 
     @property
     def replayable(self) -> bool:
@@ -192,10 +192,10 @@ class MovingObstacle(Disturbance[Kept]):
             )
 
     def slack(self, problem: Problem) -> BoundsSlack:
-        times, places = self._track
-        stands = np.concatenate([problem.start[:, : problem.dimension], problem.goal])
-        beyond = np.maximum(places - stands.max(axis=0), stands.min(axis=0) - places)
-        speed = np.linalg.norm(np.diff(places, axis=0), axis=-1) / np.diff(times)[:, None]
+        times, positions = self._track
+        endpoints = np.concatenate([problem.start[:, : problem.dimension], problem.goal])
+        beyond = np.maximum(positions - endpoints.max(axis=0), endpoints.min(axis=0) - positions)
+        speed = np.linalg.norm(np.diff(positions, axis=0), axis=-1) / np.diff(times)[:, None]
         return BoundsSlack(
             distance=float(np.linalg.norm(np.maximum(np.nan_to_num(beyond), 0), axis=-1).max()),
             speed=max(0.0, float(np.nan_to_num(speed).max()) - float(problem.team.max_speed.max())),
@@ -216,16 +216,16 @@ class MovingObstacle(Disturbance[Kept]):
 
     def _at(self, steps: IntArray, dt: float) -> FloatArray:
         """``(B, N, 2 d + 1)`` bodies after ``(B,)`` steps; all zeros for one that is absent."""
-        times, places = self._track
+        times, positions = self._track
         now = steps.astype(np.float64) * dt
         index = np.clip(np.searchsorted(times, now + _ROUNDING, side="right") - 1, 0, len(times) - 2)
-        begin, duration = places[index], (times[index + 1] - times[index])[:, None, None]
-        velocity = (places[index + 1] - begin) / duration
-        place = begin + (now - times[index])[:, None, None] * velocity
-        radius = np.full((*place.shape[:-1], 1), self.radius)
+        begin, duration = positions[index], (times[index + 1] - times[index])[:, None, None]
+        velocity = (positions[index + 1] - begin) / duration
+        position = begin + (now - times[index])[:, None, None] * velocity
+        radius = np.full((*position.shape[:-1], 1), self.radius)
         inside = (now >= times[0] - _ROUNDING) & (now <= times[-1] + _ROUNDING)
-        there = inside[:, None, None] & np.isfinite(place).all(axis=-1, keepdims=True)
-        return np.where(there, np.concatenate([place, velocity, radius], axis=-1), 0).astype(np.float32)
+        present = inside[:, None, None] & np.isfinite(position).all(axis=-1, keepdims=True)
+        return np.where(present, np.concatenate([position, velocity, radius], axis=-1), 0).astype(np.float32)
 
 
 def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
@@ -264,10 +264,10 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
     times = np.unique([time for track in people.values() for time in track])
     if len(times) < 2:
         raise ValueError(f"{path} has rows at {len(times)} different times; give two at least")
-    places = np.full((len(times), len(people), 2), np.nan)
+    positions = np.full((len(times), len(people), 2), np.nan)
     for number, track in enumerate(people.values()):
         own = np.array(sorted(track))
         here = (times >= own[0]) & (times <= own[-1])
         for axis in range(2):
-            places[here, number, axis] = np.interp(times[here], own, [track[time][axis] for time in own])
-    return MovingObstacle(times - times[:1], places, radius)
+            positions[here, number, axis] = np.interp(times[here], own, [track[time][axis] for time in own])
+    return MovingObstacle(times - times[:1], positions, radius)

@@ -73,7 +73,7 @@ class Push(Disturbance[Kept]):
 
 
 def pushed(problem: Problem, states: FloatArray, velocity: FloatArray) -> FloatArray:
-    """``states`` ``(B, K, n)``, changed in place, with velocities ``(B, K, d)`` given to robots."""
+    """``states`` ``(B, K, n)``, changed in position, with velocities ``(B, K, d)`` given to robots."""
     slip, d = velocity.copy(), problem.dimension
     for robot in np.flatnonzero(velocity.any(axis=(0, 2))):
         model = problem.team.robot_models[robot]

@@ -9,7 +9,7 @@ from itertools import chain
 
 import numpy as np
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
@@ -94,7 +94,7 @@ def register_model(model: Model) -> None:
             numbers, returns a wrong number of them or names a constant that is a float.
     """
     if not isinstance(model, Model):
-        raise ValueError(f"register_model takes a Model, not {shown(model)}; see docs/own_robot.md")
+        raise ValueError(f"register_model takes a Model, not {short_repr(model)}; see docs/own_robot.md")
     MODELS.add(model.name, model)
 
 
@@ -103,7 +103,7 @@ def _admit(name: str, model: object) -> Model:
     if model in _BUILT_IN:
         return model
     if not isinstance(model, Model):
-        raise ValueError(f"model {name!r} is {shown(model)}; it must be a Model, see docs/own_robot.md")
+        raise ValueError(f"model {name!r} is {short_repr(model)}; it must be a Model, see docs/own_robot.md")
     if model.name != name:
         raise ValueError(f"model {name!r} calls itself {model.name!r}; offer it under that name")
     _check_attributes(model)

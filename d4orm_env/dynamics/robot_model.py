@@ -260,7 +260,7 @@ class Model:
         return components
 
     def lower_bounds(self, limits: L) -> L:
-        """``(L,)`` magnitudes that bound negative values in place of the limits; see :attr:`lower_limits`."""
+        """``(L,)`` magnitudes that bound negative values in position of the limits; see :attr:`lower_limits`."""
         bounds = limits.copy()
         for column, own in self.lower_limits:
             bounds[column] = min(limits[own], limits[SPEED]) if column == SPEED else limits[own]

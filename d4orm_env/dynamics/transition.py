@@ -42,7 +42,7 @@ def docking_speed(goal_speed: N, max_speed: N) -> N:
     return goal_speed + max_speed * SPEED_ALLOWANCE
 
 
-def stands(arrived: Truth, docks: Truth) -> Flag:
+def absorbed(arrived: Truth, docks: Truth) -> Flag:
     """Check whether a robot that has arrived stays at rest, whatever its control; ``docks`` says whether any does."""
     return arrived & docks
 

@@ -88,7 +88,9 @@ class _SourceKeyedCache(FunctionCache):
     def __init__(self, function: Callable[..., object], key: str) -> None:
         super().__init__(function)
         self._function, self._key = function, key
-        self._cache_file: KernelFiles = KernelFiles(self.cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
+        self._cache_file: KernelFiles = KernelFiles(
+            self.cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp()
+        )
 
     @cached_property
     def _source_key(self) -> str:

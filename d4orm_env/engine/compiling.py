@@ -103,7 +103,7 @@ for _function in (
     transition.advance,
     transition.arrives,
     transition.faces,
-    transition.stands,
+    transition.absorbed,
     collision.axis_gap,
     collision.leaves,
     collision.meets_edge,

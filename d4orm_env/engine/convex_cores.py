@@ -89,28 +89,28 @@ def _separation(a: FloatArray, b: FloatArray, widest: np.float32) -> np.float32:
 
 
 @compiled
-def _corner_near_edge(a: FloatArray, b: FloatArray, reach: np.float32) -> bool:
-    """Check whether a corner of ``a`` is within reach of an edge of ``b``."""
+def _corner_near_edge(a: FloatArray, b: FloatArray, radius_sum: np.float32) -> bool:
+    """Check whether a corner of ``a`` is within radius_sum of an edge of ``b``."""
     count = int(b[COUNT])
     for i in range(int(a[COUNT])):
         for j in range(count):
             x, y = a[CORNERS + 2 * i] - b[CORNERS + 2 * j], a[CORNERS + 2 * i + 1] - b[CORNERS + 2 * j + 1]
-            if x * x + y * y <= reach * reach:
+            if x * x + y * y <= radius_sum * radius_sum:
                 return True
             after = CORNERS + 2 * ((j + 1) % count)
             along_x, along_y = b[after] - b[CORNERS + 2 * j], b[after + 1] - b[CORNERS + 2 * j + 1]
             # A point, and a box of no size, have edges of no length: their corner has been asked.
             if along_x * along_x + along_y * along_y > ZERO and collision.meets_edge(
-                x, y, along_x, along_y, reach, ZERO, OPS
+                x, y, along_x, along_y, radius_sum, ZERO, OPS
             ):
                 return True
     return False
 
 
 @compiled
-def cores_within(a: FloatArray, b: FloatArray, reach: np.float32) -> bool:
-    """Check whether two placed cores, each widened by its rounding, are within ``reach`` of each other."""
-    total = a[ROUNDING] + b[ROUNDING] + reach
+def cores_within(a: FloatArray, b: FloatArray, radius_sum: np.float32) -> bool:
+    """Check whether two placed cores, each widened by its rounding, are within ``radius_sum`` of each other."""
+    total = a[ROUNDING] + b[ROUNDING] + radius_sum
     nothing = np.float32(-np.inf)
     apart = _separation(b, a, _separation(a, b, nothing))
     if apart > total:
@@ -176,14 +176,14 @@ def _smaller(a: np.float32, b: np.float32) -> np.float32:
 
 @compiled
 def _offset(
-    one: Rectangle, other: Rectangle, places: FloatArray, a: Whole, b: Whole, poses: FloatArray, p: Whole, q: Whole
+    one: Rectangle, other: Rectangle, positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, p: Whole, q: Whole
 ) -> Offset:
     """The second centre seen from the first one, along the axes of the first and of the second, and the turn between
     them as a unit vector. Places are in the rows from ``a`` and ``b`` on, poses in those from ``p`` and ``q`` on.
     """
     c, s, d, t = poses[p], poses[p + TILE], poses[q], poses[q + TILE]
-    x = (places[b] - places[a]) + ((poses[q + 2 * TILE] + other[2] * d) - (poses[p + 2 * TILE] + one[2] * c))
-    y = (places[b + TILE] - places[a + TILE]) + (
+    x = (positions[b] - positions[a]) + ((poses[q + 2 * TILE] + other[2] * d) - (poses[p + 2 * TILE] + one[2] * c))
+    y = (positions[b + TILE] - positions[a + TILE]) + (
         (poses[q + 3 * TILE] + other[2] * t) - (poses[p + 3 * TILE] + one[2] * s)
     )
     return c * x + s * y, c * y - s * x, d * x + t * y, d * y - t * x, c * d + s * t, c * t - s * d
@@ -231,17 +231,17 @@ def _corners_distance2(
 @compiled
 def rectangles_within(
     one: Rectangle, other: Rectangle, near: np.uint64, total: np.float32,
-    places: FloatArray, a: Whole, b: Whole, poses: FloatArray, p: Whole, q: Whole, buffer: FloatArray,
+    positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, p: Whole, q: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     """Return where, of the first ``CHUNK`` samples, those ``near``, two rectangles are within ``total``."""
     use_wide_registers()
     for s in range(CHUNK):
-        buffer[s] = _apart(one, other, _offset(one, other, places, a + s, b + s, poses, p + s, q + s))
+        buffer[s] = _apart(one, other, _offset(one, other, positions, a + s, b + s, poses, p + s, q + s))
     sure, possible = chunk_at_most(buffer, 0, ZERO) & near, chunk_at_most(buffer, 0, total) & near
     if sure == possible:
         return sure
     for s in range(CHUNK):
-        at = _offset(one, other, places, a + s, b + s, poses, p + s, q + s)
+        at = _offset(one, other, positions, a + s, b + s, poses, p + s, q + s)
         mine = _corners_distance2(one, other, at[0], at[1], at[4], at[5])
         buffer[s] = _smaller(mine, _corners_distance2(other, one, -at[2], -at[3], at[4], -at[5]))
     return sure | (chunk_at_most(buffer, 0, total * total) & possible)

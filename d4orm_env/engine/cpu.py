@@ -69,7 +69,7 @@ class CpuEngine:
         """See :meth:`d4orm_env.engine.types.Engine.step`."""
         after = _rolled_out(arrays, states, arrived, np.asarray(controls)[None])
         return StepResult(
-            after.state[1], after.control[1], after.docked[1], after.collided[1], after.violated[1], after.rewards[1]
+            after.state[1], after.control[1], after.arrived[1], after.collided[1], after.violated[1], after.rewards[1]
         )
 
     def move(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> FloatArray:
@@ -125,7 +125,7 @@ class CpuEngine:
             positions=np.ascontiguousarray(moments.state[..., : problem.dimension]),
             controls=moments.control[1:],
             rewards=moments.rewards[1:],
-            arrived=moments.docked,
+            arrived=moments.arrived,
             collided=moments.collided,
             margin_violated=moments.violated,
         )
@@ -152,7 +152,7 @@ def _view(layout: ObservationLayout) -> ObservationSpec:
 
 
 def _rolled_out(
-    arrays: ProblemArrays, states: FloatArray, docked: BoolArray, controls: FloatArray, *, checked: bool = True
+    arrays: ProblemArrays, states: FloatArray, before: BoolArray, controls: FloatArray, *, checked: bool = True
 ) -> WorldArrays:
     """The ``H+1`` moments of a team from states ``(K, n)`` on under controls ``(H, K, m)``, clipped here.
 
@@ -163,7 +163,7 @@ def _rolled_out(
     control = np.zeros((rows, *controls.shape[1:]), np.float32)
     arrived, collided, violated = np.zeros((3, rows, len(states)), np.bool_)
     rewards = np.empty((rows if checked else 0, len(states)), np.float32)
-    state[0], arrived[0], control[1:] = states, docked, controls
+    state[0], arrived[0], control[1:] = states, before, controls
     goal, inverse = arrays.goal[None], arrays.inverse_initial_distance[None]
     nothing = np.empty((0, 0, 2 * goal.shape[-1] + 1), np.float32)
     moments = WorldArrays(goal, inverse, state, control, arrived, nothing, collided, violated, rewards)

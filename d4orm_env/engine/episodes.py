@@ -15,8 +15,8 @@ from d4orm_env.engine.observing import ObservationSpec, allocate_sensed, observe
 from d4orm_env.engine.simd import TILE, use_wide_registers
 from d4orm_env.engine.stepping import models_key
 from d4orm_env.engine.tiles import (
+    ARRIVED,
     DISTANCE2,
-    DOCKED,
     STRIDE,
     RobotMover,
     allocate_boxes,
@@ -31,12 +31,12 @@ from d4orm_env.engine.world_tiles import check_contacts, load, load_world, store
 
 @compiled
 def _restart(batch: WorldBatch, b: int) -> None:
-    for k in range(batch.docked.shape[1]):
+    for k in range(batch.arrived.shape[1]):
         for i in range(batch.state.shape[2]):
             batch.state[b, k, i] = batch.start[b, k, i]
         for i in range(batch.control.shape[2]):
             batch.control[b, k, i] = ZERO
-        batch.docked[b, k] = False
+        batch.arrived[b, k] = False
         batch.arrival[b, k] = batch.contacts[b, k] = batch.violations[b, k] = 0
     batch.steps[b] = 0
     batch.reward[b] = batch.total_reward[b] = 0
@@ -60,18 +60,18 @@ def _prepare_tile(batch: WorldBatch, orders: NDArray[np.uint8], first: int, coun
 @compiled
 def _tally(batch: WorldBatch, max_cycles: int, b: int) -> None:
     """Count the step that world ``b`` has just taken, and see whether its episode has ended."""
-    num_robots = batch.docked.shape[1]
+    num_robots = batch.arrived.shape[1]
     batch.steps[b] += 1
     total, everybody = 0.0, True
     for k in range(num_robots):
         total += batch.rewards[b, k]
         batch.contacts[b, k] += batch.collided[b, k]
         batch.violations[b, k] += batch.violated[b, k]
-        if not batch.docked[b, k]:
+        if not batch.arrived[b, k]:
             batch.arrival[b, k] = 0
         elif batch.arrival[b, k] == 0:
             batch.arrival[b, k] = batch.steps[b]
-        everybody &= batch.docked[b, k]
+        everybody &= batch.arrived[b, k]
     batch.reward[b] = total / num_robots
     batch.total_reward[b] += total
     batch.terminated[b] = everybody
@@ -83,7 +83,7 @@ def _close_step(batch: WorldBatch, order: np.uint8, max_cycles: int, b: int, s: 
     """Count a step of world ``b``, if it was moved, and note how far its robots are from their goals."""
     if order <= MOVED:
         _tally(batch, max_cycles, b)
-    for k in range(batch.docked.shape[1]):
+    for k in range(batch.arrived.shape[1]):
         batch.distance[b, k] = np.sqrt(w[k * STRIDE + DISTANCE2 * TILE + s])
 
 
@@ -98,11 +98,11 @@ def _move_tile(
     w: FloatArray,
 ) -> None:
     """Step the worlds of a tile that are to be stepped; the others wait as if all their robots had docked."""
-    num_robots = batch.docked.shape[1]
+    num_robots = batch.arrived.shape[1]
     for s in range(count):
         if orders[first + s] != STEP:
             for k in range(num_robots):
-                w[k * STRIDE + DOCKED * TILE + s] = ONE
+                w[k * STRIDE + ARRIVED * TILE + s] = ONE
     for k in range(num_robots):
         move_robot(arrays, k, w)
     for s in range(count):

@@ -84,13 +84,19 @@ def _place_own(f: FootprintArrays, i: Whole, poses: FloatArray, stride: int, beg
 
 @compiled
 def _meets_own(
-    f: FootprintArrays, k: Whole, poses: FloatArray, stride: int, begin: Whole, reach: np.float32, buffer: FloatArray
+    f: FootprintArrays,
+    k: Whole,
+    poses: FloatArray,
+    stride: int,
+    begin: Whole,
+    radius_sum: np.float32,
+    buffer: FloatArray,
 ) -> bool:
-    """Check whether a body of robot ``k`` is within ``reach`` of the core in the second row of ``buffer``."""
+    """Check whether a body of robot ``k`` is within ``radius_sum`` of the core in the second row of ``buffer``."""
     i = np.int64(k)
     while i >= 0:
         _place_own(f, i, poses, stride, begin, buffer[:TILE])
-        if cores_within(buffer[:TILE], buffer[TILE : 2 * TILE], reach):
+        if cores_within(buffer[:TILE], buffer[TILE : 2 * TILE], radius_sum):
             return True
         i = np.int64(f.following[i])
     return False
@@ -100,26 +106,26 @@ def _meets_own(
 def meets_body(
     f: FootprintArrays, k: Whole, own_radius: np.float32, poses: FloatArray, stride: int, begin: Whole,
     others: FootprintArrays, other: Whole, radius: np.float32, turns: FloatArray,
-    x: np.float32, y: np.float32, z: np.float32, planar: bool, reach: np.float32, buffer: FloatArray,
+    x: np.float32, y: np.float32, z: np.float32, planar: bool, radius_sum: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
-    """Check whether robot ``k`` is within ``reach`` of another body, offset by ``(x, y, z)`` from it.
+    """Check whether robot ``k`` is within ``radius_sum`` of another body, offset by ``(x, y, z)`` from it.
 
     That is number ``other`` of ``others``, its bodies' headings in ``turns``, or a disc or ball of its radius if it is
     number -1.
     """
     if not planar:
-        wider = _HALF * reach
+        wider = _HALF * radius_sum
         return balls_within(x, y, z, _semi_axes(f, k, own_radius, wider), _semi_axes(others, other, radius, wider))
     core = buffer[TILE : 2 * TILE]
     if other < 0:
         place_disc(radius, x, y, core)
-        return _meets_own(f, k, poses, stride, begin, reach, buffer)
+        return _meets_own(f, k, poses, stride, begin, radius_sum, buffer)
     j = np.int64(other)
     while j >= 0:
         c, s = (cosine(turns[j]), sine(turns[j])) if others.heading[j] >= 0 else (ONE, ZERO)
         x, y = x - others.hitch[j] * c, y - others.hitch[j] * s
         place_body(others, j, c, s, x, y, core)
-        if _meets_own(f, k, poses, stride, begin, reach, buffer):
+        if _meets_own(f, k, poses, stride, begin, radius_sum, buffer):
             return True
         j = np.int64(others.following[j])
     return False
@@ -127,55 +133,55 @@ def meets_body(
 
 @compiled
 def _refine_balls(
-    f: FootprintArrays, k: Whole, other: Whole, near: np.uint64, reach: np.float32, places: FloatArray,
+    f: FootprintArrays, k: Whole, other: Whole, near: np.uint64, radius_sum: np.float32, positions: FloatArray,
     a: Whole, b: Whole,
 ) -> np.uint64:  # fmt: skip
-    sure, unsure, wider = near, near, _HALF * reach
+    sure, unsure, wider = near, near, _HALF * radius_sum
     own, its = _semi_axes(f, k, ZERO, wider), _semi_axes(f, other, ZERO, wider)
     while unsure != NOWHERE:
         s = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
-        x, y = places[b + s] - places[a + s], places[b + TILE + s] - places[a + TILE + s]
-        if not balls_within(x, y, places[b + 2 * TILE + s] - places[a + 2 * TILE + s], own, its):
+        x, y = positions[b + s] - positions[a + s], positions[b + TILE + s] - positions[a + TILE + s]
+        if not balls_within(x, y, positions[b + 2 * TILE + s] - positions[a + 2 * TILE + s], own, its):
             sure &= ~(_BIT << np.uint64(s))
     return sure
 
 
 @compiled
 def _refine_cores(
-    f: FootprintArrays, i: Whole, j: Whole, near: np.uint64, reach: np.float32, places: FloatArray, a: Whole, b: Whole,
-    poses: FloatArray, p: Whole, q: Whole, buffer: FloatArray,
+    f: FootprintArrays, i: Whole, j: Whole, near: np.uint64, radius_sum: np.float32, positions: FloatArray, a: Whole,
+    b: Whole, poses: FloatArray, p: Whole, q: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     sure, unsure, own, core = near, near, buffer[:TILE], buffer[TILE : 2 * TILE]
     while unsure != NOWHERE:
         s = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
         m, n = p + s, q + s
-        x = (places[b + s] - places[a + s]) + (poses[n + 2 * TILE] - poses[m + 2 * TILE])
-        y = (places[b + TILE + s] - places[a + TILE + s]) + (poses[n + 3 * TILE] - poses[m + 3 * TILE])
+        x = (positions[b + s] - positions[a + s]) + (poses[n + 2 * TILE] - poses[m + 2 * TILE])
+        y = (positions[b + TILE + s] - positions[a + TILE + s]) + (poses[n + 3 * TILE] - poses[m + 3 * TILE])
         place_body(f, i, poses[m], poses[m + TILE], ZERO, ZERO, own)
         place_body(f, j, poses[n], poses[n + TILE], x, y, core)
-        if not cores_within(own, core, reach):
+        if not cores_within(own, core, radius_sum):
             sure &= ~(_BIT << np.uint64(s))
     return sure
 
 
 @inlined
 def refine_chunk(
-    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, reach: np.float32, dimension: int,
-    places: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
+    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, radius_sum: np.float32, dimension: int,
+    positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
-    """Return where, of the samples ``near`` among the first ``CHUNK``, two robots are within ``reach`` of each other.
+    """Return where, of the samples ``near`` among the first ``CHUNK``, two robots are as near as ``radius_sum``.
 
-    Their places are in the rows of ``places`` from ``a`` and ``b`` on. ``f`` is the team's footprints; of discs, for
-    which it is ``None``, it is known already. ``buffer`` is two rows to overwrite.
+    Their positions are in the rows of ``positions`` from ``a`` and ``b`` on. ``f`` is the team's footprints; of discs,
+    for which it is ``None``, it is known already. ``buffer`` is two rows to overwrite.
     """
     if f is None:
         return near
     if near == NOWHERE:
         return near
     if dimension == 3:
-        return _refine_balls(f, k, other, near, reach, places, a, b)
+        return _refine_balls(f, k, other, near, radius_sum, positions, a, b)
     touch, i = NOWHERE, np.int64(k)
     while i >= 0:
         j = np.int64(other)
@@ -186,10 +192,10 @@ def refine_chunk(
             if f.rectangles[i, 0] >= ZERO and f.rectangles[j, 0] >= ZERO:
                 one = (f.rectangles[i, 0], f.rectangles[i, 1], f.rectangles[i, 2])
                 its = (f.rectangles[j, 0], f.rectangles[j, 1], f.rectangles[j, 2])
-                total = f.rounding[i] + f.rounding[j] + reach
-                touch |= rectangles_within(one, its, left, total, places, a, b, poses, p, q, buffer)
+                total = f.rounding[i] + f.rounding[j] + radius_sum
+                touch |= rectangles_within(one, its, left, total, positions, a, b, poses, p, q, buffer)
             else:
-                touch |= _refine_cores(f, i, j, left, reach, places, a, b, poses, p, q, buffer)
+                touch |= _refine_cores(f, i, j, left, radius_sum, positions, a, b, poses, p, q, buffer)
             j = np.int64(f.following[j])
         i = np.int64(f.following[i])
     return touch
@@ -197,8 +203,8 @@ def refine_chunk(
 
 @inlined
 def refine_pair(
-    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, reach: np.float32, dimension: int,
-    places: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
+    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, radius_sum: np.float32, dimension: int,
+    positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     """:func:`refine_chunk` in all samples of a tile."""
     if f is None:
@@ -206,17 +212,19 @@ def refine_pair(
     touch = NOWHERE
     for s in range(0, TILE, CHUNK):
         part = (near >> np.uint64(s)) & _CHUNK_BITS
-        part = refine_chunk(f, k, other, part, reach, dimension, places, a + s, b + s, poses, stride, begin + s, buffer)
+        part = refine_chunk(
+            f, k, other, part, radius_sum, dimension, positions, a + s, b + s, poses, stride, begin + s, buffer
+        )
         touch |= part << np.uint64(s)
     return touch
 
 
 @compiled
 def _leaves_bounds(
-    f: FootprintArrays, bounds: FloatArray, i: Whole, place: tuple[np.float32, np.float32, np.float32],
+    f: FootprintArrays, bounds: FloatArray, i: Whole, position: tuple[np.float32, np.float32, np.float32],
     extra: np.float32, core: FloatArray,
 ) -> bool:  # fmt: skip
-    """Check whether body ``i``, whose core is placed about the robot's place, comes within ``extra`` of a bound."""
+    """Check whether body ``i``, whose core is placed about the robot's position, comes within ``extra`` of a bound."""
     dimension = bounds.shape[1]
     for axis in range(dimension):
         low = high = ZERO
@@ -228,46 +236,46 @@ def _leaves_bounds(
             for j in range(f.num_corners[i]):
                 low, high = min(low, core[CORNERS + 2 * j + axis]), max(high, core[CORNERS + 2 * j + axis])
             low, high = low - f.rounding[i], high + f.rounding[i]
-        if place[axis] + (low - extra) <= bounds[0, axis] or place[axis] + (high + extra) >= bounds[1, axis]:
+        if position[axis] + (low - extra) <= bounds[0, axis] or position[axis] + (high + extra) >= bounds[1, axis]:
             return True
     return False
 
 
 @compiled
 def _any_leaves_bounds(
-    f: FootprintArrays, bounds: FloatArray, k: Whole, place: tuple[np.float32, np.float32, np.float32],
+    f: FootprintArrays, bounds: FloatArray, k: Whole, position: tuple[np.float32, np.float32, np.float32],
     poses: FloatArray, stride: int, begin: Whole, extra: np.float32, core: FloatArray,
 ) -> bool:  # fmt: skip
     i = np.int64(k)
     while i >= 0:
         if bounds.shape[1] == 2:
             _place_own(f, i, poses, stride, begin, core)
-        if _leaves_bounds(f, bounds, i, place, extra, core):
+        if _leaves_bounds(f, bounds, i, position, extra, core):
             return True
         i = np.int64(f.following[i])
     return False
 
 
 @compiled
-def _is_beyond(boxes: FloatArray, i: Whole, reach: np.float32, x: np.float32, y: np.float32) -> bool:
+def _is_beyond(boxes: FloatArray, i: Whole, radius_sum: np.float32, x: np.float32, y: np.float32) -> bool:
     """Check whether a rounded box of the plane is farther from a place than this."""
     gap_x, gap_y = max(boxes[i, 0] - x, x - boxes[i, 2], ZERO), max(boxes[i, 1] - y, y - boxes[i, 3], ZERO)
-    reach += boxes[i, 4]
-    return bool(gap_x * gap_x + gap_y * gap_y > reach * reach)
+    radius_sum += boxes[i, 4]
+    return bool(gap_x * gap_x + gap_y * gap_y > radius_sum * radius_sum)
 
 
 @compiled
 def touches_static(
-    f: FootprintArrays, arrays: ProblemArrays, k: Whole, place: tuple[np.float32, np.float32, np.float32],
+    f: FootprintArrays, arrays: ProblemArrays, k: Whole, position: tuple[np.float32, np.float32, np.float32],
     poses: FloatArray, stride: int, begin: Whole, extra: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
-    """Check whether robot ``k`` at this place comes within ``extra`` of an obstacle or a bound."""
+    """Check whether robot ``k`` at this position comes within ``extra`` of an obstacle or a bound."""
     index, dimension = arrays.grid, arrays.goal.shape[1]
-    if _any_leaves_bounds(f, arrays.bounds, k, place, poses, stride, begin, extra, buffer[:TILE]):
+    if _any_leaves_bounds(f, arrays.bounds, k, position, poses, stride, begin, extra, buffer[:TILE]):
         return True
     if index.clearance.shape[0] == 0:
         return False
-    cell, (x, y, z) = cell_at(index, place, dimension), place
+    cell, (x, y, z) = cell_at(index, position, dimension), position
     for number in range(index.first[cell], index.first[cell + 1]):
         item = np.int64(index.items[number])
         if dimension == 3:
@@ -288,11 +296,11 @@ def touches_static(
 @compiled
 def refine_static(
     f: FootprintArrays | None, arrays: ProblemArrays, k: Whole, near: np.uint64, extra: np.float32,
-    places: FloatArray, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
+    positions: FloatArray, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     """Return where, of the samples ``near``, robot ``k`` comes within ``extra`` of an obstacle or a bound.
 
-    Its places are in the first rows of ``places``; ``buffer`` is two rows to overwrite. ``f`` is as in
+    Its places are in the first rows of ``positions``; ``buffer`` is two rows to overwrite. ``f`` is as in
     :func:`refine_chunk`.
     """
     if f is None:
@@ -301,7 +309,7 @@ def refine_static(
     while unsure != NOWHERE:
         s = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
-        place = (places[s], places[TILE + s], ZERO if planar else places[2 * TILE + s])
-        if not touches_static(f, arrays, k, place, poses, stride, begin + s, extra, buffer):
+        position = (positions[s], positions[TILE + s], ZERO if planar else positions[2 * TILE + s])
+        if not touches_static(f, arrays, k, position, poses, stride, begin + s, extra, buffer):
             sure &= ~(_BIT << np.uint64(s))
     return sure

@@ -72,9 +72,9 @@ Q0, Q1, Q2, Q3 = (
 )
 
 
-def xor_shift(x: Word, places: np.uint32, ops: BitOps) -> Word:
-    """``x ^ (x >> places)``; wrapped after every operation, because numba widens 32-bit integers to 64."""
-    return ops.uint32(x ^ ops.uint32(x >> places))
+def xor_shift(x: Word, positions: np.uint32, ops: BitOps) -> Word:
+    """``x ^ (x >> positions)``; wrapped after every operation, because numba widens 32-bit integers to 64."""
+    return ops.uint32(x ^ ops.uint32(x >> positions))
 
 
 def hash32(x: Word, key: Word, ops: BitOps) -> Word:

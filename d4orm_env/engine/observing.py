@@ -63,18 +63,18 @@ def allocate_sensed(num_robots: int, num_bodies: int, dimension: int, view: Obse
 
 @compiled
 def _hide(
-    place: FloatArray, positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32,
+    position: FloatArray, positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32,
     line_of_sight: bool, ray: FloatArray, hidden: BoolArray,
 ) -> None:  # fmt: skip
     """Mark who is not observed from a place: beyond a range, and behind obstacles if asked."""
     for other in range(hidden.shape[0]):
         gap2 = ZERO
-        for axis in range(place.shape[0]):
-            gap = positions[other, axis] - place[axis]
+        for axis in range(position.shape[0]):
+            gap = positions[other, axis] - position[axis]
             gap2 += gap * gap
         hidden[other] = gap2 > squared_range
         if line_of_sight and not hidden[other]:
-            hidden[other] = is_blocked(place, positions[other], boxes, triangles, ray)
+            hidden[other] = is_blocked(position, positions[other], boxes, triangles, ray)
 
 
 @cached_kernel(**OPTIONS)
@@ -96,8 +96,8 @@ def communication_links(
     """
     hidden = np.empty((len(positions), len(positions)), np.bool_)
     square = np.float32(np.inf if communication_range is None else communication_range**2)
-    places, ray = np.ascontiguousarray(positions, np.float32), np.empty((5, 1), np.float32)
-    _hide_each(places, problem.arrays.boxes, problem.arrays.triangles, square, line_of_sight, ray, hidden)
+    rows, ray = np.ascontiguousarray(positions, np.float32), np.empty((5, 1), np.float32)
+    _hide_each(rows, problem.arrays.boxes, problem.arrays.triangles, square, line_of_sight, ray, hidden)
     return ~hidden & ~np.eye(len(hidden), dtype=np.bool_)
 
 
@@ -131,9 +131,9 @@ def observe(
         for axis in range(dimension):
             sensed.position[k, axis] = w[k * STRIDE + (STATE + axis) * TILE + s]
         read_motion(arrays, k, s, w, sensed.velocity[k], sensed.heading[k])
-        sensed.arrived[k] = ONE if worlds.docked[b, k] else ZERO
+        sensed.arrived[k] = ONE if worlds.arrived[b, k] else ZERO
         for axis in range(dimension):
-            if transition.stands(worlds.docked[b, k], arrays.docks):
+            if transition.absorbed(worlds.arrived[b, k], arrays.docks):
                 sensed.velocity[k, axis] = ZERO
         sensed.radius[k] = arrays.radius[k]
     for k in range(num_robots):

@@ -37,13 +37,13 @@ def _count_steps(index: WorldIndex, axis: int, row: FloatArray, cells: NDArray[n
     low, scale, size = index.low[axis], index.scale, np.uint32(index.size[axis])
     last = np.float32(size - 1)
     for s in range(cells.shape[0]):
-        place = (row[s] - low) * scale
-        place = place if place > ZERO else ZERO
-        cells[s] = cells[s] * size + np.uint32(np.int32(place if place < last else last))
+        position = (row[s] - low) * scale
+        position = position if position > ZERO else ZERO
+        cells[s] = cells[s] * size + np.uint32(np.int32(position if position < last else last))
 
 
 @inlined
-def _touches_box(box: FloatArray, i: int, reach: np.float32, x: np.float32, y: np.float32, z: np.float32) -> bool:
+def _touches_box(box: FloatArray, i: int, radius: np.float32, x: np.float32, y: np.float32, z: np.float32) -> bool:
     d = box.shape[1] // 2
     gap = collision.axis_gap(x, box[i, 0], box[i, d], ZERO, OPS)
     gap2 = gap * gap
@@ -52,7 +52,7 @@ def _touches_box(box: FloatArray, i: int, reach: np.float32, x: np.float32, y: n
     if d == 3:
         gap = collision.axis_gap(z, box[i, 2], box[i, 2 + d], ZERO, OPS)
         gap2 += gap * gap
-    total = reach + box[i, 2 * d]
+    total = radius + box[i, 2 * d]
     return gap2 <= total * total
 
 
@@ -62,7 +62,7 @@ def _touches(
     boxes: FloatArray,
     triangles: FloatArray,
     cell: Whole,
-    reach: np.float32,
+    radius: np.float32,
     x: np.float32,
     y: np.float32,
     z: np.float32,
@@ -71,9 +71,9 @@ def _touches(
     for number in range(index.first[cell], index.first[cell + 1]):
         item = index.items[number]
         if item < boxes.shape[0]:
-            if _touches_box(boxes, item, reach, x, y, z):
+            if _touches_box(boxes, item, radius, x, y, z):
                 return True
-        elif collision.meets_triangle(to_fixed_tuple(triangles[item - boxes.shape[0]], 6), x, y, reach, ZERO, OPS):
+        elif collision.meets_triangle(to_fixed_tuple(triangles[item - boxes.shape[0]], 6), x, y, radius, ZERO, OPS):
             return True
     return False
 
@@ -88,30 +88,30 @@ def is_closed(arrays: ProblemArrays) -> bool:
 
 
 @inlined
-def cell_at(index: WorldIndex, place: Any, dimension: int) -> np.int64:
+def cell_at(index: WorldIndex, position: Any, dimension: int) -> np.int64:
     """The number of the cell that holds a place, of the outermost one beyond the grid."""
     cell = np.int64(0)
     for axis in range(dimension):
-        steps = np.int64(max((place[axis] - index.low[axis]) * index.scale, ZERO))
+        steps = np.int64(max((position[axis] - index.low[axis]) * index.scale, ZERO))
         cell = cell * index.size[axis] + min(steps, np.int64(index.size[axis]) - 1)
     return cell
 
 
 @inlined
-def touches_static(arrays: ProblemArrays, reach: np.float32, place: FloatArray) -> bool:
-    """Check whether a body of this radius, centred at ``place`` ``(d,)``, touches an obstacle or the bounds."""
+def touches_static(arrays: ProblemArrays, radius: np.float32, position: FloatArray) -> bool:
+    """Check whether a body of this radius, centred at ``position`` ``(d,)``, touches an obstacle or the bounds."""
     index = arrays.grid
-    for axis in range(place.shape[0]):
-        if collision.leaves(place[axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis]):
+    for axis in range(position.shape[0]):
+        if collision.leaves(position[axis], radius, arrays.bounds[0, axis], arrays.bounds[1, axis]):
             return True
     if index.clearance.shape[0] == 0:
         return False
-    cell = cell_at(index, place, place.shape[0])
+    cell = cell_at(index, position, position.shape[0])
     clearance = index.clearance[cell]
-    if clearance > reach + index.slack or clearance <= reach - index.slack:
-        return clearance <= reach
-    x, y, z = place[0], place[1], place[place.shape[0] - 1]
-    return _touches(index, arrays.boxes, arrays.triangles, cell, reach, x, y, z)
+    if clearance > radius + index.slack or clearance <= radius - index.slack:
+        return clearance <= radius
+    x, y, z = position[0], position[1], position[position.shape[0] - 1]
+    return _touches(index, arrays.boxes, arrays.triangles, cell, radius, x, y, z)
 
 
 @compiled
@@ -119,49 +119,49 @@ def _near_indexed(
     index: WorldIndex,
     boxes: FloatArray,
     triangles: FloatArray,
-    reach: np.float32,
-    places: FloatArray,
+    radius: np.float32,
+    positions: FloatArray,
     buffer: FloatArray,
 ) -> np.uint64:
-    """Return where a body of this radius, centred at the first rows of ``places``, touches an obstacle."""
+    """Return where a body of this radius, centred at the first rows of ``positions``, touches an obstacle."""
     use_wide_registers()
     third = 2 * TILE if index.low.shape[0] == 3 else 0
     cells = buffer[TILE : 2 * TILE].view(np.uint32)
     for s in range(TILE):
         cells[s] = 0
     for axis in range(index.low.shape[0]):
-        _count_steps(index, axis, places[axis * TILE : (axis + 1) * TILE], cells)
+        _count_steps(index, axis, positions[axis * TILE : (axis + 1) * TILE], cells)
     for s in range(TILE):
         buffer[s] = index.clearance[cells[s]]
-    near = at_most(buffer, 0, reach + index.slack)
+    near = at_most(buffer, 0, radius + index.slack)
     if near == NOWHERE:
         return near
-    sure = at_most(buffer, 0, reach - index.slack)
+    sure = at_most(buffer, 0, radius - index.slack)
     unsure = near & ~sure
     while unsure != NOWHERE:
         sample = np.int64(_trailing_zeros(unsure))
         unsure &= unsure - _BIT
-        x, y, z = places[sample], places[TILE + sample], places[third + sample]
-        if _touches(index, boxes, triangles, np.int64(cells[sample]), reach, x, y, z):
+        x, y, z = positions[sample], positions[TILE + sample], positions[third + sample]
+        if _touches(index, boxes, triangles, np.int64(cells[sample]), radius, x, y, z):
             sure |= _BIT << np.uint64(sample)
     return sure
 
 
 @inlined
-def near_obstacles(arrays: ProblemArrays, reach: np.float32, places: FloatArray, buffer: FloatArray) -> np.uint64:
-    """Return where a body of this radius, centred at the first rows of ``places``, touches an obstacle or the bounds.
+def near_obstacles(arrays: ProblemArrays, radius: np.float32, positions: FloatArray, buffer: FloatArray) -> np.uint64:
+    """Return where a body of this radius, centred at the first rows of ``positions``, touches an obstacle or a bound.
 
     ``buffer`` is two rows to overwrite.
     """
     mask = NOWHERE
     if arrays.grid.clearance.shape[0] > 0:
-        mask = _near_indexed(arrays.grid, arrays.boxes, arrays.triangles, reach, places, buffer)
+        mask = _near_indexed(arrays.grid, arrays.boxes, arrays.triangles, radius, positions, buffer)
     for axis in range(arrays.goal.shape[1]):
         lower, upper = arrays.bounds[0, axis], arrays.bounds[1, axis]
         if lower > -np.inf or upper < np.inf:
-            row = places[axis * TILE : (axis + 1) * TILE]
+            row = positions[axis * TILE : (axis + 1) * TILE]
             for s in range(TILE):
-                buffer[s] = ZERO if collision.leaves(row[s], reach, lower, upper) else ONE
+                buffer[s] = ZERO if collision.leaves(row[s], radius, lower, upper) else ONE
             mask |= at_most(buffer, 0, ZERO)
     return mask
 
@@ -169,7 +169,7 @@ def near_obstacles(arrays: ProblemArrays, reach: np.float32, places: FloatArray,
 @compiled
 def may_touch(
     index: WorldIndex,
-    reach: np.float32,
+    radius: np.float32,
     widening: np.float32,
     boxes: FloatArray,
     begin: Whole,
@@ -180,7 +180,7 @@ def may_touch(
 
     Args:
         index: Index of the obstacles; there must be some.
-        reach: The body's.
+        radius: The body's.
         widening: Excess of its lanes over its positions.
         boxes: The lanes, those of the first axis from ``begin`` on, those of the next ``axis_step`` later.
         begin: See ``boxes``.
@@ -209,5 +209,5 @@ def may_touch(
         # along an axis on which some have no end.
         clearance, far2 = index.clearance[cells[lane]], beyond[lane]
         clearance = np.sqrt(far2 + clearance * clearance) if far2 > ZERO else clearance
-        unclear |= not clearance > reach + index.slack + np.sqrt(squares[lane])
+        unclear |= not clearance > radius + index.slack + np.sqrt(squares[lane])
     return unclear

@@ -50,11 +50,11 @@ class Surroundings(NamedTuple):
     footprints: FootprintArrays | None  #: Of the robots; ``None`` where all are discs
 
     @classmethod
-    def of(cls, arrays: ProblemArrays, directions: FloatArray, reach: float) -> Surroundings:
+    def of(cls, arrays: ProblemArrays, directions: FloatArray, max_range: float) -> Surroundings:
         """The surroundings of a problem's robots that have these rays of so many metres."""
         heading = _heading_indices(arrays.model_codes.tobytes())
         shapes = arrays.boxes, arrays.triangles, arrays.bounds
-        return cls(arrays.radius, heading, *shapes, directions, np.float32(reach), arrays.footprints)
+        return cls(arrays.radius, heading, *shapes, directions, np.float32(max_range), arrays.footprints)
 
 
 @lru_cache(maxsize=256)
@@ -115,7 +115,7 @@ def _direction(x: np.float32, y: np.float32) -> tuple[np.float32, np.float32]:
 
 @compiled
 def _find_spans(
-    discs: FloatArray, x: np.float32, y: np.float32, fan: FloatArray, num_rays: int, reach: np.float32, spans: Ints
+    discs: FloatArray, x: np.float32, y: np.float32, fan: FloatArray, num_rays: int, max_range: np.float32, spans: Ints
 ) -> None:
     """Fill ``spans`` ``(2, N)``, the first ray from ``(x, y)`` that may meet each thing and the one after the last.
 
@@ -128,7 +128,7 @@ def _find_spans(
         for lane in range(np.uint64(CHUNK)):
             j = chunk * np.uint64(CHUNK) + lane
             gap_x, gap_y, radius = discs[0, j] - x, discs[1, j] - y, discs[2, j]
-            square, limit = gap_x * gap_x + gap_y * gap_y, reach * _SPARE_SHARE + radius
+            square, limit = gap_x * gap_x + gap_y * gap_y, max_range * _SPARE_SHARE + radius
             angle, inverse = _direction(cosine * gap_x + sine * gap_y, cosine * gap_y - sine * gap_x)
             share = radius * inverse
             half = (share + _ABOVE_ARCSINE * share * share * share + _SPARE_ANGLE) * per_angle

@@ -160,13 +160,13 @@ def _meet_nearby(
 
 @compiled
 def is_blocked(
-    place: FloatArray, other: FloatArray, boxes: FloatArray, triangles: FloatArray, scratch: FloatArray
+    position: FloatArray, other: FloatArray, boxes: FloatArray, triangles: FloatArray, scratch: FloatArray
 ) -> bool:
     """Check whether an obstacle lies between two positions; ``scratch`` ``(5, 1)`` is overwritten."""
     fan, row = scratch[:4], scratch[4]
-    x, y = other[0] - place[0], other[1] - place[1]
+    x, y = other[0] - position[0], other[1] - position[1]
     distance = np.sqrt(x * x + y * y)
     fan[0, 0], fan[1, 0], row[0] = x / distance, y / distance, distance
     invert(fan, 1)
-    _meet_nearby(place[0], place[1], boxes, triangles, distance, fan, row)
+    _meet_nearby(position[0], position[1], boxes, triangles, distance, fan, row)
     return row[0] < distance

@@ -42,11 +42,11 @@ def _mover(model: Model) -> Callable[..., None]:
         dt, docking = arrays.time_step, docking_of(arrays, k)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
         limits, goal = to_fixed_tuple(arrays.limits[k], num_limits), to_fixed_tuple(moments.goal[0, k], d)
-        standing = transition.stands(moments.docked[t - 1, k], arrays.docks)
+        standing = transition.absorbed(moments.arrived[t - 1, k], arrays.docks)
         u = limit_control(to_fixed_tuple(moments.control[t, k], m), limits, OPS)
         u = pick_u(standing, no_control, u)
         x = move(standing, to_fixed_tuple(moments.state[t - 1, k], n), u, limits, h)
-        x, _, moments.docked[t, k] = dock(standing, x, u, limits, goal, docking)
+        x, _, moments.arrived[t, k] = dock(standing, x, u, limits, goal, docking)
         for i in range(m):
             moments.control[t, k, i] = u[i]
         for i in range(n):
@@ -73,15 +73,15 @@ def roll_out_kernel(names: tuple[str, ...]) -> RollOut:
         use_wide_registers()
         arrays, moments = borrow(arrays), borrow(moments)
         num_robots, dimension = arrays.goal.shape
-        state, docked = moments.state, moments.docked
+        state, arrived = moments.state, moments.arrived
         for t in range(1, state.shape[0]):
             # Loops, because numba takes seconds to compile assignments of slices.
             idle = arrays.docks
             for k in range(num_robots):
                 for i in range(state.shape[2]):
                     state[t, k, i] = state[t - 1, k, i]
-                docked[t, k] = docked[t - 1, k]
-                idle &= docked[t, k]
+                arrived[t, k] = arrived[t - 1, k]
+                idle &= arrived[t, k]
                 for i in range(moments.control.shape[2]):
                     idle &= moments.control[t, k, i] == 0
             if idle:

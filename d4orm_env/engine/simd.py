@@ -118,14 +118,14 @@ def _instructions(result: Type, *kinds: Type | None) -> Callable[[Callable[[_Wri
 
 
 def _within(dimension: int, count: int) -> Callable[..., np.uint64]:
-    """``(w, a, b, squared_reach) -> mask``: where the places in the rows from ``w[a]`` and ``w[b]`` on are near, in the
-    first ``count`` worlds.
+    """``(w, a, b, squared_radius_sum) -> mask``: where the positions in the rows from ``w[a]`` and ``w[b]`` on are
+    near, in the first ``count`` worlds.
     """
 
     @_instructions(uint64, _ARRAY, int64, int64, float32)
     def within(writer: _Writer) -> Value:
-        _, a, b, squared_reach = writer.arguments
-        bound = writer.splat(squared_reach)
+        _, a, b, squared_radius_sum = writer.arguments
+        bound = writer.splat(squared_radius_sum)
 
         def near(first: int) -> Value:
             total = None

@@ -199,7 +199,7 @@ def make_stepper(model: Model) -> tuple[Mover, Docker]:
         gap2 = squared_gap(x, goal)
         speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, docking[0], docking[1]) & faces(docking[3][0], x, docking[3])
-        docks = transition.stands(arrives, docking[2])
+        docks = transition.absorbed(arrives, docking[2])
         return pick_x(docks, functions.rest(x, ZERO), x), gap2, standing | arrives
 
     return move, dock

@@ -43,7 +43,7 @@ from d4orm_env.engine.stepping import (
 
 # First rows of a robot in the workspace. A power of two in all would map the same row of every robot to the same cache
 # set.
-STATE, CONTROL, GOAL, DOCKED, DISTANCE2, BUFFER, ROWS = 0, 6, 10, 13, 14, 15, 17
+STATE, CONTROL, GOAL, ARRIVED, DISTANCE2, BUFFER, ROWS = 0, 6, 10, 13, 14, 15, 17
 STRIDE = ROWS * TILE
 
 BIG_TEAM = 128
@@ -74,19 +74,19 @@ def _mover(model: Model) -> Callable[..., None]:
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
         for s in range(TILE):
-            standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
+            standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
             u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
             write_u(w, CONTROL * TILE, s, pick_u(standing, no_control, u))
         for s in range(TILE):
-            standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
+            standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
             u = read_u(w, CONTROL * TILE, s)
             write_x(w, STATE * TILE, s, move(standing, read_x(w, STATE * TILE, s), u, limits, h))
         for s in range(TILE):
-            standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
+            standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
             x, u = read_x(w, STATE * TILE, s), read_u(w, CONTROL * TILE, s)
-            x, gap2, docked = dock(standing, x, u, limits, read_goal(w, GOAL * TILE, s), docking)
+            x, gap2, arrived = dock(standing, x, u, limits, read_goal(w, GOAL * TILE, s), docking)
             write_x(w, STATE * TILE, s, x)
-            w[DOCKED * TILE + s] = ONE if docked else ZERO
+            w[ARRIVED * TILE + s] = ONE if arrived else ZERO
             w[DISTANCE2 * TILE + s] = gap2
 
     return run
@@ -122,11 +122,11 @@ def measure_goal_distance(num_robots: int, dimension: int, w: FloatArray) -> Non
 
 
 @inlined
-def near_pair(reach: np.float32, a: int, b: int, dimension: int, w: FloatArray) -> np.uint64:
-    """Return where two centres, in the rows of ``w`` from ``a`` and from ``b`` on, are within ``reach``."""
+def near_pair(radius_sum: np.float32, a: int, b: int, dimension: int, w: FloatArray) -> np.uint64:
+    """Return where two centres, in the rows of ``w`` from ``a`` and from ``b`` on, are within ``radius_sum``."""
     if dimension == 2:
-        return within_2(w, a, b, reach * reach)
-    return within_3(w, a, b, reach * reach)
+        return within_2(w, a, b, radius_sum * radius_sum)
+    return within_3(w, a, b, radius_sum * radius_sum)
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -147,7 +147,7 @@ class TeamBoxes(NamedTuple):
     """Boxes round the places of a team's robots in a tile, for all pairs but those near to each other to be left out.
 
     Attributes:
-        corners: ``(K, 2, d)`` float32 lowest and highest places [m]; ``(0, 2, d)`` for a team that is not big.
+        corners: ``(K, 2, d)`` float32 lowest and highest positions [m]; ``(0, 2, d)`` for a team that is not big.
         order: ``(K,)`` int64 numbers of the robots, of a big team by where its boxes begin along the first axis.
     """
 
@@ -185,8 +185,8 @@ def _sort_boxes(corners: FloatArray, order: IntArray) -> None:
     """Sort the numbers of boxes by where these begin, quickly if they nearly are (Shell, 1959)."""
     stride = corners.shape[0] // 2
     while stride > 0:
-        for place in range(stride, corners.shape[0]):
-            k, at = order[place], place
+        for position in range(stride, corners.shape[0]):
+            k, at = order[position], position
             while at >= stride and corners[order[at - stride], 0, 0] > corners[k, 0, 0]:
                 order[at], at = order[at - stride], at - stride
             order[at] = k
@@ -194,12 +194,12 @@ def _sort_boxes(corners: FloatArray, order: IntArray) -> None:
 
 
 @inlined
-def _is_apart(corners: FloatArray, k: Whole, other: Whole, reach: np.float32) -> bool:
-    """Check whether two robots' boxes are farther apart than ``reach``."""
+def _is_apart(corners: FloatArray, k: Whole, other: Whole, radius_sum: np.float32) -> bool:
+    """Check whether two robots' boxes are farther apart than ``radius_sum``."""
     apart = False
     for axis in range(corners.shape[2]):
         gap = max(corners[k, 0, axis] - corners[other, 1, axis], corners[other, 0, axis] - corners[k, 1, axis])
-        apart |= gap > WIDER * reach
+        apart |= gap > WIDER * radius_sum
     return apart
 
 
@@ -220,13 +220,13 @@ def mark_pairs(
     corners, order, largest = boxes.corners, boxes.order, ZERO
     for k in range(arrays.radius.shape[0]):
         largest = max(largest, arrays.radius[k])
-    for place in range(order.shape[0]):
-        for later in range(place + 1, order.shape[0]):
-            k, other = max(order[place], order[later]), min(order[place], order[later])
+    for position in range(order.shape[0]):
+        for later in range(position + 1, order.shape[0]):
+            k, other = max(order[position], order[later]), min(order[position], order[later])
             if corners.shape[0] > 0:
                 # Those that begin even later are as far apart.
-                end = WIDER * (arrays.radius[order[place]] + largest + extra)
-                if corners[order[later], 0, 0] - corners[order[place], 1, 0] > end:
+                end = WIDER * (arrays.radius[order[position]] + largest + extra)
+                if corners[order[later], 0, 0] - corners[order[position], 1, 0] > end:
                     break
                 if _is_apart(corners, k, other, arrays.radius[k] + arrays.radius[other] + extra):
                     continue
@@ -238,20 +238,22 @@ def mark_pairs(
 
 
 @inlined
-def near_round(reach: np.float32, centre: FloatArray, axes: int, places: FloatArray, buffer: FloatArray) -> np.uint64:
-    """Return where the first rows of ``places`` are within ``reach`` of a centre, over two or three axes.
+def near_round(
+    radius_sum: np.float32, centre: FloatArray, axes: int, positions: FloatArray, buffer: FloatArray
+) -> np.uint64:
+    """Return where the first rows of ``positions`` are within ``radius_sum`` of a centre, over two or three axes.
 
     ``buffer`` is a row to overwrite.
     """
     if axes == 2:
         point = (centre[0], centre[1])
         for s in range(TILE):
-            buffer[s] = squared_gap2(read2(places, 0, s), point)
+            buffer[s] = squared_gap2(read2(positions, 0, s), point)
     else:
         spot = (centre[0], centre[1], centre[2])
         for s in range(TILE):
-            buffer[s] = squared_gap3(read3(places, 0, s), spot)
-    return at_most(buffer, 0, reach * reach)
+            buffer[s] = squared_gap3(read3(positions, 0, s), spot)
+    return at_most(buffer, 0, radius_sum * radius_sum)
 
 
 def _motion_reader(model: Model) -> Callable[..., None]:

@@ -58,7 +58,7 @@ class ObservationInputs(NamedTuple):
     goal: FloatArray  #: ``(B, K, d)`` [m]
     state: FloatArray  #: ``(B, K, n)``
     control: FloatArray  #: ``(B, K, m)`` executed last
-    docked: BoolArray  #: ``(B, K)`` bool
+    arrived: BoolArray  #: ``(B, K)`` bool
     #: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is none; a
     #: radius of zero for one that is not seen
     bodies: FloatArray
@@ -84,7 +84,7 @@ class WorldBatch(NamedTuple):
     inverse: FloatArray  #: ``(B, K)`` one over the start distances
     state: FloatArray  #: ``(B, K, n)``
     control: FloatArray  #: ``(B, K, m)``; what to do goes in, what was executed comes out
-    docked: BoolArray  #: ``(B, K)`` bool
+    arrived: BoolArray  #: ``(B, K)`` bool
     steps: IntArray  #: ``(B,)`` int64 steps since the reset
     distance: FloatArray  #: ``(B, K)`` to the goals
     bodies: FloatArray  #: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, after the step
@@ -110,7 +110,7 @@ class WorldBatch(NamedTuple):
             inverse=inverse,
             state=start.copy(),
             control=np.zeros((*inverse.shape, problem.control_size), np.float32),
-            docked=flags.copy(),
+            arrived=flags.copy(),
             steps=np.zeros(num_worlds, np.int64),
             distance=np.zeros_like(inverse),
             bodies=np.zeros((num_worlds, num_bodies, 2 * problem.dimension + 1), np.float32),

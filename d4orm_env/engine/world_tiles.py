@@ -16,10 +16,10 @@ from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
 from d4orm_env.engine.footprint_contacts import POSE, meets_body, refine_static
 from d4orm_env.engine.simd import NOWHERE, TILE
 from d4orm_env.engine.tiles import (
+    ARRIVED,
     BUFFER,
     CONTROL,
     DISTANCE2,
-    DOCKED,
     DYNAMIC,
     GOAL,
     OBSTACLE,
@@ -42,7 +42,7 @@ class WorldArrays(NamedTuple):
     inverse: FloatArray  #: ``(B, K)`` one over the start distances, or ``(1, K)``
     state: FloatArray  #: ``(B, K, n)``
     control: FloatArray  #: ``(B, K, m)``; what to do goes in, what was executed comes out
-    docked: BoolArray  #: ``(B, K)`` bool
+    arrived: BoolArray  #: ``(B, K)`` bool
     #: ``(B, N, 2 d + 1)`` position, velocity and radius of dynamic obstacles, or ``(0, 0, 2 d + 1)``
     bodies: FloatArray
     collided: BoolArray  #: ``(B, K)`` bool, hard contact; those known already go in, all come out
@@ -62,7 +62,7 @@ def load_world(worlds: WorldArrays | ObservationInputs | WorldBatch, b: int, s: 
             w[o + (CONTROL + i) * TILE] = worlds.control[b, k, i]
         for axis in range(worlds.goal.shape[2]):
             w[o + (GOAL + axis) * TILE] = worlds.goal[own, k, axis]
-        w[o + DOCKED * TILE] = ONE if worlds.docked[b, k] else ZERO
+        w[o + ARRIVED * TILE] = ONE if worlds.arrived[b, k] else ZERO
 
 
 @compiled
@@ -81,7 +81,7 @@ def store_world(worlds: WorldArrays | WorldBatch, b: int, s: Whole, w: FloatArra
             worlds.state[b, k, i] = w[o + (STATE + i) * TILE]
         for i in range(worlds.control.shape[2]):
             worlds.control[b, k, i] = w[o + (CONTROL + i) * TILE]
-        worlds.docked[b, k] = w[o + DOCKED * TILE] > ZERO
+        worlds.arrived[b, k] = w[o + ARRIVED * TILE] > ZERO
 
 
 @compiled
@@ -93,9 +93,9 @@ def _meets_body(
     """
     if f is None:
         return True
-    dimension, place = arrays.goal.shape[1], k * STRIDE + STATE * TILE + s
-    x, y = body[0] - w[place], body[1] - w[place + TILE]
-    z = body[2] - w[place + 2 * TILE] if dimension == 3 else ZERO
+    dimension, position = arrays.goal.shape[1], k * STRIDE + STATE * TILE + s
+    x, y = body[0] - w[position], body[1] - w[position + TILE]
+    z = body[2] - w[position + 2 * TILE] if dimension == 3 else ZERO
     buffer, poses = w[k * STRIDE + BUFFER * TILE : k * STRIDE + ROWS * TILE], arrays.radius.shape[0] * STRIDE + s
     return meets_body(
         f, k, arrays.radius[k], w, POSE * TILE, poses, f, -1, body[2 * dimension], w, x, y, z, dimension == 2, extra,
@@ -109,9 +109,9 @@ def _mark_static(arrays: ProblemArrays, extra: np.float32, w: FloatArray, near: 
     num_robots, f = arrays.radius.shape[0], arrays.footprints
     for k in range(num_robots):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
-        places, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
-        touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, places, buffer)
-        touch = refine_static(f, arrays, k, touch, extra, places, w, POSE * TILE, num_robots * STRIDE, buffer)
+        positions, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
+        touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, positions, buffer)
+        touch = refine_static(f, arrays, k, touch, extra, positions, w, POSE * TILE, num_robots * STRIDE, buffer)
         near[k, OBSTACLE] |= touch
 
 

@@ -15,7 +15,7 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import DisturbanceEvents
-from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, marks_of
+from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, events_of
 from d4orm_env.envs.joint_state import JointState, join_state
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import no_terms
@@ -63,7 +63,7 @@ class TeamSimulation(Simulation):
     @property
     def arrived(self) -> BoolArray:
         """``(K,)`` docked robots, which the next step may change."""
-        return self.worlds.docked[0]
+        return self.worlds.arrived[0]
 
     @property
     def finished(self) -> BoolArray:
@@ -90,7 +90,7 @@ class TeamSimulation(Simulation):
         # One draw per episode, so that an episode does not depend on how long those before it were.
         observations, self._running = self._unseen(), True
         self.reset_worlds({0: int(random.integers(2**63))}, observations)
-        self.terms = no_terms(self.setup.reward, self.worlds.docked.shape)
+        self.terms = no_terms(self.setup.reward, self.worlds.arrived.shape)
         self._trail: deque[FloatArray] = deque(maxlen=_TRAIL_LENGTH)
         return self._unpaid(observations)
 
@@ -126,9 +126,9 @@ class TeamSimulation(Simulation):
         self.require_reset()
         return super().effect()
 
-    def marks(self) -> DisturbanceEvents | None:
+    def events(self) -> DisturbanceEvents | None:
         """Return the disturbances of the present moment, as far as they can be drawn; ``None`` without any."""
-        return marks_of([self.effect()], self.problem) if self.setup.disturbances else None
+        return events_of([self.effect()], self.problem) if self.setup.disturbances else None
 
     def _joined(self, shown: Observed) -> FloatArray:
         self.require_reset()
@@ -183,7 +183,7 @@ class Viewer:
             simulation.worlds.collided[0],
             goals=simulation.goals,
             trail=simulation.trail,
-            marks=simulation.marks(),
+            events=simulation.events(),
         )
         return frame if self._mode == "rgb_array" else None
 

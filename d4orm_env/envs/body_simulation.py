@@ -13,7 +13,7 @@ from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.dynamics.transition import stands
+from d4orm_env.dynamics.transition import absorbed
 from d4orm_env.engine.types import MOVED
 from d4orm_env.envs.base_env import TeamSimulation
 from d4orm_env.envs.lifelong import reached_goals
@@ -112,7 +112,7 @@ class BodySimulation(TeamSimulation):
         true = self.worlds.state
         if not self._moving or self.bodies is None or self.bodies.sensed is None:
             return true
-        standing = np.asarray(stands(self.worlds.docked, self.problem.docks))
+        standing = np.asarray(absorbed(self.worlds.arrived, self.problem.docks))
         return np.where(standing[..., None], true, self.bodies.sensed)
 
     def _begin(self, seeds: Mapping[int, int]) -> None:
@@ -129,19 +129,19 @@ class BodySimulation(TeamSimulation):
         assert self.bodies is not None
         worlds, true = self.worlds, self.problems.true[0]
         team, docks = self.problem.team, self.problem.docks
-        standing = np.asarray(stands(self.arrived, docks))
+        standing = np.asarray(absorbed(self.arrived, docks))
         limited = self._limited(controls[0], true.limits, standing)
         true = true._replace(goal=self.goals)
-        there = worlds.bodies[0, :, -1:] > 0
-        states, touched = self.bodies.advance(limited, true, np.where(there, worlds.bodies[0], _OUT_OF_THE_WAY))
+        present = worlds.bodies[0, :, -1:] > 0
+        states, touched = self.bodies.advance(limited, true, np.where(present, worlds.bodies[0], _OUT_OF_THE_WAY))
         states = self._measured(states, standing)
         arrived = standing | reached_goals(team, true, states, limited)
-        docking = np.flatnonzero(np.asarray(stands(arrived, docks)) & ~standing)
+        docking = np.flatnonzero(np.asarray(absorbed(arrived, docks)) & ~standing)
         for robot in docking:
             model = team.robot_models[robot]
             states[robot, : model.state_size] = model.functions.rest(states[robot, : model.state_size], np.float32(0))
         self.bodies.hold(docking)
-        worlds.state[0], worlds.control[0], worlds.docked[0], worlds.collided[0] = states, limited, arrived, touched
+        worlds.state[0], worlds.control[0], worlds.arrived[0], worlds.collided[0] = states, limited, arrived, touched
         return MOVED
 
     def _limited(self, controls: FloatArray, limits: FloatArray, standing: BoolArray) -> FloatArray:

@@ -27,19 +27,19 @@ def checked_cycles(value: object) -> int:
 def checked_states(
     problem: Problem,
     states: ArrayLike,
-    docked: BoolArray,
+    arrived: BoolArray,
     bounds: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """``states`` as an array ``(..., K, n)``, as robots may be put into; those ``docked`` ``(..., K)`` must be at rest.
+    """``states`` as an array ``(..., K, n)``, as robots may be put into; those ``arrived`` ``(..., K)`` are at rest.
 
     The bounds are the lowest and highest joint state; see :func:`d4orm_env.envs.joint_state.state_bounds`.
     """
-    array = frozen_array(states, "states", (*docked.shape, problem.state_size), largest=LARGEST)
+    array = frozen_array(states, "states", (*arrived.shape, problem.state_size), largest=LARGEST)
     low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
     for team in array.reshape(-1, *problem.start.shape):
         check_states(problem.team, team, "state")
     array = unwound_states(problem.team, array)
-    for team, parked in zip(array.reshape(-1, *problem.start.shape), docked.reshape(-1, problem.num_robots)):
+    for team, parked in zip(array.reshape(-1, *problem.start.shape), arrived.reshape(-1, problem.num_robots)):
         outside = ((team < low) | (team > high)).any(axis=1)
         if outside.any():
             robot = int(np.argmax(outside))

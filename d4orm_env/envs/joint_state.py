@@ -108,28 +108,28 @@ def _fits(rest: FloatArray, team_size: int, body: int) -> bool:
 
 def state_bounds(
     problem: Problem,
-    places: FloatArray,
+    positions: FloatArray,
     max_cycles: int,
     slack: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
     num_bodies: int = 0,
 ) -> tuple[FloatArray, FloatArray]:
     """Finite bounds that every joint state of an episode keeps.
 
-    A robot gets no farther from its start, in the box ``places`` ``(2, d)`` [m], than its limits and the slack allow in
-    ``max_cycles`` steps, and angles do not wind up.
+    A robot gets no farther from its start, in the box ``positions`` ``(2, d)`` [m], than its limits and the slack allow
+    in ``max_cycles`` steps, and angles do not wind up.
 
     Returns:
         Lowest and highest joint state vector.
     """
-    low, high = _robot_bounds(problem, places, max_cycles * problem.dt, slack)
+    low, high = _robot_bounds(problem, positions, max_cycles * problem.dt, slack)
     limits = problem.team.control_limits
     controls = np.where(limits > 0, limits, 1.0).ravel()
-    lowest = np.concatenate([low.ravel(), np.tile(places[0], problem.num_robots), -controls])
-    highest = np.concatenate([high.ravel(), np.tile(places[1], problem.num_robots), controls])
+    lowest = np.concatenate([low.ravel(), np.tile(positions[0], problem.num_robots), -controls])
+    highest = np.concatenate([high.ravel(), np.tile(positions[1], problem.num_robots), controls])
     lowest, highest = lowest - 1e-3 * (1 + np.abs(lowest)), highest + 1e-3 * (1 + np.abs(highest))
     flags = np.ones(problem.num_robots)
     # An unseen body is all zeros, and its like may be anywhere round the team.
-    far = np.abs(places).max() + 2 * np.linalg.norm(np.ptp(places, axis=0)) + slack.distance + 1.0
+    far = np.abs(positions).max() + 2 * np.linalg.norm(np.ptp(positions, axis=0)) + slack.distance + 1.0
     fastest = float(problem.team.max_speed.max()) + slack.speed
     d = problem.dimension
     body = np.tile([far] * d + [fastest] * d + [max(slack.radius, 1.0)], num_bodies)
@@ -140,7 +140,9 @@ def state_bounds(
     )
 
 
-def _robot_bounds(problem: Problem, places: FloatArray, duration: float, slack: BoundsSlack) -> tuple[Floats, Floats]:
+def _robot_bounds(
+    problem: Problem, positions: FloatArray, duration: float, slack: BoundsSlack
+) -> tuple[Floats, Floats]:
     """``(K, n)`` lowest and highest states within that time [s]."""
     team, dimension = problem.team, problem.dimension
     limits = team.limits.astype(np.float64)
@@ -155,6 +157,6 @@ def _robot_bounds(problem: Problem, places: FloatArray, duration: float, slack: 
         for index, column in model.state_limits:
             high[robot, index] = limits[robot, column]
     low = -high
-    low[:, :dimension] = places[0] - reach[:, None]
-    high[:, :dimension] = places[1] + reach[:, None]
+    low[:, :dimension] = positions[0] - reach[:, None]
+    high[:, :dimension] = positions[1] + reach[:, None]
     return low, high

@@ -24,9 +24,9 @@ def goal_region(problem: Problem) -> FloatArray:
     """
     if problem.world.lower is not None:
         return problem.world.bounds
-    places = np.concatenate([problem.start[:, : problem.dimension], problem.goal])
+    positions = np.concatenate([problem.start[:, : problem.dimension], problem.goal])
     room = 2 * (2 * float(np.max(problem.team.radius)) + problem.margin)
-    return np.stack([places.min(axis=0) - room, places.max(axis=0) + room]).astype(np.float32)
+    return np.stack([positions.min(axis=0) - room, positions.max(axis=0) + room]).astype(np.float32)
 
 
 def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, controls: FloatArray) -> BoolArray:
@@ -65,21 +65,21 @@ def fresh_goal(
     the present ones [m].
     """
     radius = np.asarray(problem.team.radius, np.float64)
-    reach = radius + radius[robot] + problem.margin
+    safety_distance = radius + radius[robot] + problem.margin
     others = np.arange(problem.num_robots) != robot
     bodies = np.concatenate([positions, goals[others]]).astype(np.float64)
-    keep_off = np.concatenate([reach, reach[others]])
+    keep_off = np.concatenate([safety_distance, safety_distance[others]])
     keep_off[robot] = problem.goal_radius + radius[robot] + problem.margin
     low, high = goal_region(problem).astype(np.float64)
     for _ in range(_ATTEMPTS):
-        places = random.uniform(low, high, (_BATCH, problem.dimension))
-        free = problem.world.clearance(places) > radius[robot] + problem.margin
-        gaps = np.linalg.norm(places[:, None] - bodies, axis=-1) - keep_off
+        candidates = random.uniform(low, high, (_BATCH, problem.dimension))
+        free = problem.world.clearance(candidates) > radius[robot] + problem.margin
+        gaps = np.linalg.norm(candidates[:, None] - bodies, axis=-1) - keep_off
         free &= (gaps > 0).all(axis=1)
         if free.any() and problem.world.num_obstacles and np.isfinite(problem.shortest_paths.length[robot]):
-            free[free] = np.isfinite(problem.shortest_paths.distance_from(robot, places[free]))
+            free[free] = np.isfinite(problem.shortest_paths.distance_from(robot, candidates[free]))
         if free.any():
-            return as_float32(places[np.argmax(free)])
+            return as_float32(candidates[np.argmax(free)])
     raise RuntimeError(
         f"no free place for a new goal of robot_{robot} between {low.tolist()} and {high.tolist()}; "
         "use a larger world, fewer robots or a smaller margin for lifelong mode"

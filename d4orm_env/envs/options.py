@@ -10,7 +10,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.controls import ControlNoise
@@ -139,12 +139,14 @@ class EnvOptions:
 
     def _check(self) -> None:
         if not isinstance(self.randomize_instance, bool | None):
-            raise ValueError(f"randomize_instance is {shown(self.randomize_instance)}; it must be True, False or None")
+            raise ValueError(
+                f"randomize_instance is {short_repr(self.randomize_instance)}; it must be True, False or None"
+            )
         if self.progress not in ("straight", "path"):
-            raise ValueError(f"progress is {shown(self.progress)}; it must be 'straight' or 'path'")
+            raise ValueError(f"progress is {short_repr(self.progress)}; it must be 'straight' or 'path'")
         for name in ("observed_path", "line_of_sight", "egocentric"):
             if not isinstance(value := getattr(self, name), bool):
-                raise ValueError(f"{name} is {shown(value)}; it must be True or False")
+                raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
         if not self.observed_rays and any(isinstance(one, RayNoise) for one in self.disturbances):
             raise ValueError("RayNoise is of range sensors, and these robots have none; give observed_rays")
         if self.lifelong and (self.progress == "path" or self.observed_path):

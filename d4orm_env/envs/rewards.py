@@ -78,7 +78,7 @@ class RewardInput:
         """The step of the worlds in ``rows``, all or one, with what :class:`WorldBatch` does not know."""
         arrays = {
             "previous_states": before.state, "states": after.state, "controls": after.control, "goals": after.goal,
-            "previous_distances": before.distance, "distances": after.distance, "previously_arrived": before.docked,
+            "previous_distances": before.distance, "distances": after.distance, "previously_arrived": before.arrived,
             "arrived": arrived, "collided": after.collided, "margin_violated": after.violated, "paper": paper,
         }  # fmt: skip
         parts: dict[str, Any] = {name: array[rows] for name, array in arrays.items()}

@@ -23,7 +23,7 @@ from d4orm_env.envs.setup import EnvSetup, WorldPaths, WorldProblems
 from d4orm_env.envs.team_step import EpisodeCounts, episode_metrics
 from d4orm_env.paths.shortest_paths import observe_paths
 
-_READ_BEFORE = ("state", "distance", "docked", "total_reward")
+_READ_BEFORE = ("state", "distance", "arrived", "total_reward")
 """Inputs of rewards that a step overwrites."""
 
 
@@ -64,7 +64,7 @@ class Simulation:
         self._seen: Observed | None = None
         self._random: dict[int, np.random.Generator] = {}
         self.problems = WorldProblems(self.setup, self._disturbed, num_worlds)
-        shape = self.worlds.docked.shape
+        shape = self.worlds.arrived.shape
         self.robot_rewards, self.reached = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
         self._goals_reached, self._frames = np.zeros(shape, np.int64), np.zeros((*shape, 2), np.float32)
         self.terms = no_terms(self.setup.reward, shape)
@@ -119,21 +119,21 @@ class Simulation:
             self._begin(restarts)
             orders[list(restarts)] = RESET
         self._advance(orders, out)
-        self.reached = self._reached() if self.setup.lifelong else worlds.docked.copy()
+        self.reached = self._reached() if self.setup.lifelong else worlds.arrived.copy()
         self._reward(before, length, list(restarts or ()))
         if self.setup.lifelong:
             self._assign_goals()
         self._observe(orders, out)
 
-    def put_robots(self, states: ArrayLike, docked: BoolArray, out: FloatArray) -> None:
+    def put_robots(self, states: ArrayLike, arrived: BoolArray, out: FloatArray) -> None:
         """Put the robots elsewhere, ``(B, K, n)`` or ``(K, n)`` of one world, in the middle of an episode.
 
         Goals, clock, the controls executed last and the metrics so far are kept. A robot that has docked stays docked
         where it is put, and must be at rest; one that is put at its goal docks at the end of the next step, if it is
         still there. Contact is allowed. ``out`` ``(B, K, D)`` are the observations.
         """
-        problem, shape = self.problems.all[0], self.worlds.docked.shape
-        checked = checked_states(problem, states, docked & problem.docks, self.state_bounds)
+        problem, shape = self.problems.all[0], self.worlds.arrived.shape
+        checked = checked_states(problem, states, arrived & problem.docks, self.state_bounds)
         self._put(checked.reshape(*shape, -1))
         self.terms, orders = no_terms(self.setup.reward, shape), np.full(shape[0], LOOK)
         self._advance(orders, out)
@@ -143,7 +143,7 @@ class Simulation:
         """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.team_step.episode_metrics`."""
         worlds = self.worlds
         arrival = None if self.setup.lifelong else np.where(worlds.arrival > 0, worlds.arrival, np.inf)
-        goals = self._goals_reached if self.setup.lifelong else worlds.docked
+        goals = self._goals_reached if self.setup.lifelong else worlds.arrived
         counts = (goals, worlds.contacts, worlds.violations, arrival, self.effect().lost)
         return episode_metrics(EpisodeCounts(worlds.steps, worlds.total_reward, *counts), self.problems.all[0].dt)
 
@@ -182,7 +182,7 @@ class Simulation:
 
     def _scene_of(self, states: FloatArray) -> Scene:
         now = self.worlds
-        return self._disturbed.scene(now.start, now.goal, states, now.control, now.docked, now.steps)
+        return self._disturbed.scene(now.start, now.goal, states, now.control, now.arrived, now.steps)
 
     @property
     def _sensed(self) -> FloatArray:
@@ -260,7 +260,7 @@ class Simulation:
                 past[worlds] = new
         rows = slice(None) if every else worlds
         time_left = np.maximum(0.0, 1.0 - batch.steps[rows] / self.max_cycles).astype(np.float32)
-        return ObservationInputs(batch.goal[rows], *seen[:2], batch.docked[rows], seen.bodies, time_left)
+        return ObservationInputs(batch.goal[rows], *seen[:2], batch.arrived[rows], seen.bodies, time_left)
 
     def _reward(self, before: WorldBatch | None, length: Floats, restarted: list[int]) -> None:
         """Give the robots rewards for the step from ``before``, with paths of ``length``; none where one restarted."""
@@ -278,8 +278,8 @@ class Simulation:
             length[restarted] = self._paths.length[restarted]
             step = along_paths(step, self._paths.first_length[rows], length[rows], self._paths.length[rows])
         rewards, terms = compute_rewards(self.setup.reward, step)
-        self.robot_rewards = rewards.reshape(worlds.docked.shape)
-        self.terms = {name: term.reshape(worlds.docked.shape) for name, term in terms.items()}
+        self.robot_rewards = rewards.reshape(worlds.arrived.shape)
+        self.terms = {name: term.reshape(worlds.arrived.shape) for name, term in terms.items()}
         for values in (self.robot_rewards, *self.terms.values()) if restarted else ():
             values[restarted] = 0
         worlds.reward[:] = self.robot_rewards.mean(axis=1)

@@ -107,9 +107,9 @@ def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
     Returns:
         ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
         ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin; ``collided`` and
-        ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots docked; ``success``:
+        ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots arrived; ``success``:
         1.0 when all have docked, but for those that are lost, and none was ever in contact; ``travel_time`` and
-        ``makespan``: mean and latest arrival [s], with the time so far for a robot that has not docked. Each ``(...)``
+        ``makespan``: mean and latest arrival [s], with the time so far for a robot that has not arrived. Each ``(...)``
         float64.
     """
     team_size, steps = counts.contacts.shape[-1], np.asarray(counts.steps, np.float64)
@@ -129,7 +129,7 @@ def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
     if counts.arrival_step is None:
         return metrics
     times = np.minimum(counts.arrival_step * dt, (steps * dt)[..., None])
-    there = counts.goals > 0 if counts.lost is None else (counts.goals > 0) | counts.lost
-    success = (there.all(axis=-1) & (np.asarray(collided) == 0)).astype(np.float64)
+    done = counts.goals > 0 if counts.lost is None else (counts.goals > 0) | counts.lost
+    success = (done.all(axis=-1) & (np.asarray(collided) == 0)).astype(np.float64)
     arrivals = {"travel_time": times.mean(axis=-1), "makespan": times.max(axis=-1)}
     return metrics | {"arrived": reached.copy(), "success": success} | arrivals

@@ -197,8 +197,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             ValueError: If a state is none that the robot may be in; the message names it.
         """
         self._require_reset()
-        observations, docked = self._unseen(), self._simulation.worlds.docked & ~self._simulation.ended[:, None]
-        self._simulation.put_robots(states, docked, observations)
+        observations, arrived = self._unseen(), self._simulation.worlds.arrived & ~self._simulation.ended[:, None]
+        self._simulation.put_robots(states, arrived, observations)
         return self._simulation.show(observations).reshape(self.num_envs, -1), self._infos()
 
     def state(self) -> FloatArray:
@@ -209,7 +209,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         """
         self._require_reset()
         worlds, (states, controls, bodies) = self._simulation.worlds, self._simulation.seen
-        parts = (states, worlds.goal, controls, worlds.docked, worlds.steps, bodies)
+        parts = (states, worlds.goal, controls, worlds.arrived, worlds.steps, bodies)
         return np.concatenate([part.reshape(self.num_envs, -1).astype(np.float32) for part in parts], axis=1)
 
     def metrics(self) -> dict[str, NDArray[np.float64]]:
@@ -251,13 +251,13 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
     def _infos(self, mask: BoolArray | None = None) -> Info:
         """Fresh infos, present for the worlds in ``mask``, or for all."""
         worlds, lost = self._simulation.worlds, self._simulation.effect().lost
-        there = worlds.docked if lost is None else worlds.docked | lost
+        done = worlds.arrived if lost is None else worlds.arrived | lost
         values = {
-            "arrived": worlds.docked,
+            "arrived": worlds.arrived,
             "collided": worlds.collided,
             "margin_violated": worlds.violated,
             "distance_to_goal": worlds.distance,
             **{f"reward_{name}": term for name, term in self._simulation.terms.items()},
-            "is_success": np.asarray(there.all(axis=1) & ~worlds.contacts.any(axis=1)),
+            "is_success": np.asarray(done.all(axis=1) & ~worlds.contacts.any(axis=1)),
         }
         return masked(values, np.ones(self.num_envs, np.bool_) if mask is None else mask)

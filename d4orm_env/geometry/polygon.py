@@ -59,7 +59,7 @@ class _Ears:
 
     def __init__(self, points: Floats) -> None:
         count = len(points)
-        self._points, self._places = points, points.tolist()
+        self._points, self._positions = points, points.tolist()
         ring = list(range(count))
         if float(_cross(points, np.roll(points, -1, axis=0)).sum()) < 0:
             ring.reverse()
@@ -93,7 +93,7 @@ class _Ears:
     def _turn_at(self, corner: int) -> float:
         """Twice the area of the triangle at a corner, negative where it turns to the right."""
         (ax, ay), (bx, by), (cx, cy) = (
-            self._places[which] for which in (self._before[corner], corner, self._after[corner])
+            self._positions[which] for which in (self._before[corner], corner, self._after[corner])
         )
         return (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
 
@@ -206,11 +206,11 @@ class _Sweep:
 
     def _pass(self, corner: int) -> tuple[int, int] | None:
         """Move the line over a corner; a pair of edges that meet where they must not, if that shows one."""
-        place, own = self._corners[corner], ((corner - 1) % self._count, corner)
-        begins = [edge for edge in own if self._ends[edge][0] == place]
-        below = self._first_not_below(place)
+        position, own = self._corners[corner], ((corner - 1) % self._count, corner)
+        begins = [edge for edge in own if self._ends[edge][0] == position]
+        below = self._first_not_below(position)
         above = below
-        while above < len(self._met) and self._side(self._met[above], place) == 0:
+        while above < len(self._met) and self._side(self._met[above], position) == 0:
             if self._met[above] not in own:
                 return self._met[above], corner
             above += 1
@@ -227,19 +227,19 @@ class _Sweep:
                 return self._met[index - 1], self._met[index]
         return None
 
-    def _first_not_below(self, place: Corner) -> int:
+    def _first_not_below(self, position: Corner) -> int:
         low, high = 0, len(self._met)
         while low < high:
             middle = (low + high) // 2
-            if self._side(self._met[middle], place) > 0:
+            if self._side(self._met[middle], position) > 0:
                 low = middle + 1
             else:
                 high = middle
         return low
 
-    def _side(self, edge: int, place: Corner) -> int:
+    def _side(self, edge: int, position: Corner) -> int:
         """1 if a place is above an edge, -1 if it is below."""
-        return orientation(*self._ends[edge], place)
+        return orientation(*self._ends[edge], position)
 
     def _meet(self, one: int, other: int) -> bool:
         """Check whether two edges have a point in common, but for the corner of neighbours: these show at a corner."""

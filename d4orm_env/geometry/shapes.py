@@ -55,15 +55,15 @@ class Shapes:
         ends = finite.any(axis=0)
         return np.where(ends, lowest, 0.0), np.where(ends, highest, 0.0)
 
-    def within(self, points: Floats, reach: float) -> tuple[IntArray, IntArray]:
+    def within(self, points: Floats, max_distance: float) -> tuple[IntArray, IntArray]:
         """Pairs ``(P,)``, ``(P,)`` of points ``(N, d)`` and obstacles that may be within reach of each other; all that
         are.
         """
         low, high = self.corners()
         pairs = np.ones((len(points), len(low)), bool)
         for axis in range(self.dimension):
-            place = points[:, axis, None]
-            pairs &= (place >= low[:, axis] - reach) & (place <= high[:, axis] + reach)
+            position = points[:, axis, None]
+            pairs &= (position >= low[:, axis] - max_distance) & (position <= high[:, axis] + max_distance)
         rows, items = pairs.nonzero()
         return rows, items
 

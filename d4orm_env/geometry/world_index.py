@@ -61,14 +61,14 @@ class WorldIndex(NamedTuple):
 
 
 def build_index(
-    shapes: Shapes, cell: float, reach: float, nearest: int = 1, levels: int = 1, within: float = 0.0
+    shapes: Shapes, cell: float, max_distance: float, nearest: int = 1, levels: int = 1, within: float = 0.0
 ) -> WorldIndex:
     """The index of some obstacles.
 
     Args:
         shapes: The obstacles.
         cell: Size of a cell [m]; larger where there would be more cells than is worthwhile.
-        reach: Distance from the obstacles that the grid covers [m]; at least to where none of them counts.
+        max_distance: Distance from the obstacles that the grid covers [m]; at least to where none of them counts.
         nearest: Number of nearest obstacles of any point that a cell's list is sure to hold.
         levels: Number of grids, one round the other.
         within: Distance of all those that a cell's list is sure to hold [m]; zero for the nearest only.
@@ -79,7 +79,7 @@ def build_index(
         ends = np.stack([corner, corner])
         return _frozen(corner, 1.0, ends, corner, 0.0, nothing, nothing, nothing, 0, nearest, levels)
     while True:
-        low, size, cell = _layout(shapes, cell, reach)
+        low, size, cell = _layout(shapes, cell, max_distance)
         index = _filled(shapes, low, size, cell, nearest, levels, within)
         if index.num_bytes <= MAX_BYTES or index.size.max() == 1:
             return index
@@ -123,19 +123,19 @@ def is_farther(shapes: Shapes, index: WorldIndex, points: Floats, distance: floa
 
 def _cells_of(points: Floats, index: WorldIndex) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """``(N,)`` true where a point lies within the grid, and the number of its cell, 0 elsewhere."""
-    place = (points - index.low) * index.scale
-    inside: NDArray[np.bool_] = np.all((place > 0) & (place < index.size), axis=1)
+    position = (points - index.low) * index.scale
+    inside: NDArray[np.bool_] = np.all((position > 0) & (position < index.size), axis=1)
     cell = np.zeros(len(points), np.int64)
-    cell[inside] = np.ravel_multi_index(tuple(place[inside].astype(np.int64).T), tuple(index.size))
+    cell[inside] = np.ravel_multi_index(tuple(position[inside].astype(np.int64).T), tuple(index.size))
     return inside, cell
 
 
-def _layout(shapes: Shapes, cell: float, reach: float) -> tuple[Floats, NDArray[np.int64], float]:
+def _layout(shapes: Shapes, cell: float, max_distance: float) -> tuple[Floats, NDArray[np.int64], float]:
     lower, upper = shapes.extent()
     most = min(MAX_CELLS, FREE_CELLS + CELLS_PER_OBSTACLE * shapes.count)
     while True:
         # So far that even a point beyond the grid is found to be clear in the outermost cell next to it.
-        pad = reach + (1.5 + 2 * np.sqrt(len(lower)) / 2) * cell + 1e-3 * cell
+        pad = max_distance + (1.5 + 2 * np.sqrt(len(lower)) / 2) * cell + 1e-3 * cell
         size = np.ceil((upper - lower + 2 * pad) / cell)
         if size.prod() <= most:
             return (lower + upper - size * cell) / 2, size.astype(np.int64), cell

@@ -119,14 +119,14 @@ def step(
     steps = state.steps + 1
     happened = Step(
         rewards[:, 0],
-        worlds.docked[:, 0],
+        worlds.arrived[:, 0],
         collided[:, 0],
         margin_violated[:, 0],
         steps >= problem.horizon,
         worlds.control[..., 0],
         after,
     )
-    following = State(worlds.state[..., 0], worlds.docked[..., 0], steps, happened.controls)
+    following = State(worlds.state[..., 0], worlds.arrived[..., 0], steps, happened.controls)
     if function is None:
         return following, happened
     given = _reward_input(problem, state, following, happened, before)

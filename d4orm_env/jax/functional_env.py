@@ -54,7 +54,7 @@ class Transition(NamedTuple):
 
     Attributes:
         observations: ``(K, D)``; after the end of an episode those of the next one.
-        rewards: ``(K,)`` of all robots, docked ones too, as ``robot_rewards`` of the batched environment.
+        rewards: ``(K,)`` of all robots, arrived ones too, as ``robot_rewards`` of the batched environment.
         acted: ``(K,)`` bool: was still under way when the step began.
         finished: ``(K,)`` bool: is done, which is terminated.
         done: ``()`` bool: the episode is over; all have finished, or the time is up.
@@ -165,9 +165,9 @@ class FunctionalEnv:
         seen = functional.observe(self.instance(state.instance), state.team, self.layout, self.max_cycles)
         if not self._ray_noise:
             return seen
-        rays, reach = self.layout.rays, self.layout.ray_range
+        rays, max_range = self.layout.rays, self.layout.ray_range
         true = seen[:, rays]
-        return seen.at[:, rays].set(jnp.where(true < reach, jnp.clip(true + state.ray_noise, 0, reach), true))
+        return seen.at[:, rays].set(jnp.where(true < max_range, jnp.clip(true + state.ray_noise, 0, max_range), true))
 
     def advance(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         """One step, without reset at the end of an episode.

@@ -24,7 +24,7 @@ else:
 
 Components: TypeAlias = tuple[Array, ...]
 Advance: TypeAlias = Callable[[Any, Components, Components, Array], tuple[Components, Components, Array]]
-"""``(numbers, x, u, docked)`` of one robot to what they are after a step, and the executed control."""
+"""``(numbers, x, u, arrived)`` of one robot to what they are after a step, and the executed control."""
 
 LANES = 128
 """Samples of a program."""
@@ -50,11 +50,11 @@ def _params() -> triton.CompilerParams:
 
 
 def move_robots(
-    advance: Advance, numbers: Any, state: Array, docked: Array, controls: Array
+    advance: Advance, numbers: Any, state: Array, arrived: Array, controls: Array
 ) -> tuple[Array, Array, Array]:
     """Roll robots of one model out, each on its own, by ``advance`` and a tree of numbers ``(R, 1)`` for it.
 
-    From ``state`` ``(R, n, S)`` and ``docked`` ``(R, S)`` on under ``controls`` ``(H, R, m, S)``. Returned is the same
+    From ``state`` ``(R, n, S)`` and ``arrived`` ``(R, S)`` on under ``controls`` ``(H, R, m, S)``. Returned is the same
     after each step ``(H, ...)``, the controls as executed.
     """
     horizon, num_robots, _, num_samples = controls.shape
@@ -70,12 +70,12 @@ def move_robots(
         compiler_params=_params(),
     )
     table = jnp.concatenate([column.astype(jnp.float32) for column in columns], axis=1)
-    after, stands, executed = kernel(table, state, docked.astype(jnp.int32), controls)
-    return after, stands > 0, executed
+    after, arrived, executed = kernel(table, state, arrived.astype(jnp.int32), controls)
+    return after, arrived > 0, executed
 
 
 def _move(
-    advance: Advance, structure: jax.tree_util.PyTreeDef, table: Any, state: Any, docked: Any, controls: Any, *out: Any
+    advance: Advance, structure: jax.tree_util.PyTreeDef, table: Any, state: Any, arrived: Any, controls: Any, *out: Any
 ) -> None:
     robot = pl.program_id(0)
     samples, inside = _samples(state.shape[-1])
@@ -91,24 +91,24 @@ def _move(
         return tuple(load(controls, time, robot, i) for i in range(controls.shape[2]))
 
     def step(time: Array, carry: tuple[Components, Array, Components]) -> tuple[Components, Array, Components]:
-        x, stands, control = carry
+        x, arrived, control = carry
         # Read while this step is computed.
         following = control_at(jnp.minimum(time + 1, controls.shape[0] - 1))
-        x, executed, stands = advance(numbers, x, control, stands)
+        x, executed, arrived = advance(numbers, x, control, arrived)
         for array, components in ((out[0], x), (out[2], executed)):
             for i, component in enumerate(components):
                 triton.store(lanes(array, time, robot, i), component, mask=inside)
-        triton.store(lanes(out[1], time, robot), stands.astype(jnp.int32), mask=inside)
-        return x, stands, following
+        triton.store(lanes(out[1], time, robot), arrived.astype(jnp.int32), mask=inside)
+        return x, arrived, following
 
     x = tuple(load(state, robot, i) for i in range(state.shape[1]))
-    jax.lax.fori_loop(0, controls.shape[0], step, (x, load(docked, robot) > 0, control_at(0)))
+    jax.lax.fori_loop(0, controls.shape[0], step, (x, load(arrived, robot) > 0, control_at(0)))
 
 
-def count_near(dimension: int, state: Array, squared_reach: Array) -> Array:
+def count_near(dimension: int, state: Array, squared_radius_sum: Array) -> Array:
     """``(K, S)`` how many others each robot in ``state`` ``(K, n, S)`` is near.
 
-    ``squared_reach`` ``(K, K)`` are squared distances up to which two are near; negative for a robot and itself.
+    ``squared_radius_sum`` ``(K, K)`` are squared distances up to which two are near; negative for a robot and itself.
     """
     num_robots, _, num_samples = state.shape
     kernel = pl.pallas_call(
@@ -117,27 +117,27 @@ def count_near(dimension: int, state: Array, squared_reach: Array) -> Array:
         grid=(pl.cdiv(num_robots, ROWS), pl.cdiv(num_samples, LANES)),
         compiler_params=_params(),
     )
-    return kernel(state, squared_reach)
+    return kernel(state, squared_radius_sum)
 
 
-def _count_near(dimension: int, state: Any, squared_reach: Any, out: Any) -> None:
+def _count_near(dimension: int, state: Any, squared_radius_sum: Any, out: Any) -> None:
     rows = pl.program_id(0) * ROWS + jnp.arange(ROWS, dtype=jnp.int32)
     samples, inside = _samples(state.shape[-1])
-    there = rows < state.shape[0]
-    mask = there[:, None] & inside[None]
+    valid = rows < state.shape[0]
+    mask = valid[:, None] & inside[None]
 
     def load(robot: Array, axis: int, mask: Array) -> Array:
         return triton.load(state.at[robot, jnp.int32(axis), samples], mask=mask, other=0)
 
-    place = [
+    position = [
         triton.load(state.at[rows[:, None], jnp.int32(axis), samples[None]], mask=mask, other=0)
         for axis in range(dimension)
     ]
 
     def compare(other: Array, count: Array) -> Array:
-        gaps = [place[axis] - load(other, axis, inside)[None] for axis in range(dimension)]
-        reach = triton.load(squared_reach.at[rows, other], mask=there, other=-1)
-        return count + (sum(gap * gap for gap in gaps) <= reach[:, None]).astype(jnp.int32)
+        gaps = [position[axis] - load(other, axis, inside)[None] for axis in range(dimension)]
+        radius_sum = triton.load(squared_radius_sum.at[rows, other], mask=valid, other=-1)
+        return count + (sum(gap * gap for gap in gaps) <= radius_sum[:, None]).astype(jnp.int32)
 
     count = jax.lax.fori_loop(0, state.shape[0], compare, jnp.zeros((ROWS, LANES), jnp.int32))
     triton.store(out.at[rows[:, None], samples[None]], count, mask=mask)

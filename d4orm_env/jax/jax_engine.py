@@ -48,12 +48,12 @@ Contacts: TypeAlias = tuple[Array, Array, Array]
 def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` how many others a robot in ``state`` ``(K, n, S)`` is within ``extra`` of."""
     dimension = arrays.goal.shape[1]
-    reach = arrays.radius[:, None] + arrays.radius[None, :] + extra
-    reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, reach * reach)
+    radius_sum = arrays.radius[:, None] + arrays.radius[None, :] + extra
+    reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, radius_sum * radius_sum)
 
     def count(state: Array, reach2: Array) -> Array:
-        place = state[:, :dimension]
-        near = ((place[:, None] - place[None, :]) ** 2).sum(axis=2) <= reach2[..., None]
+        position = state[:, :dimension]
+        near = ((position[:, None] - position[None, :]) ** 2).sum(axis=2) <= reach2[..., None]
         if arrays.footprints is not None:
             bodies = footprints.place_robots(arrays.footprints, state, dimension)
             near &= _robots_within(arrays.footprints, bodies, arrays.footprints, bodies, extra, near.shape)
@@ -76,10 +76,10 @@ def _robots_within(
 def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, extra: Array | np.float32) -> Array:
     """``(K, S)`` the same towards other bodies."""
     d = arrays.goal.shape[1]
-    place = state[:, :d]
-    gaps = (place[:, None] - others.places[None, :, :, None]) ** 2
-    reach = arrays.radius[:, None] + others.radius[None, :] + extra
-    near = gaps.sum(axis=2) <= (reach * reach)[..., None]
+    position = state[:, :d]
+    gaps = (position[:, None] - others.positions[None, :, :, None]) ** 2
+    radius_sum = arrays.radius[:, None] + others.radius[None, :] + extra
+    near = gaps.sum(axis=2) <= (radius_sum * radius_sum)[..., None]
     if arrays.footprints is not None or others.footprints is not None:
         bodies = footprints.place_robots(arrays.footprints, state, d, arrays.radius)
         its = footprints.place_bodies(others)
@@ -89,21 +89,21 @@ def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, e
 
 def obstacle_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` bool: whether it is within that of static obstacles or bounds."""
-    place = state[:, : arrays.goal.shape[1]]
+    position = state[:, : arrays.goal.shape[1]]
     if arrays.footprints is not None:
         return footprints.static_contacts(arrays, state, extra)
-    reach = (arrays.radius + extra)[:, None]
-    hit = jnp.zeros((place.shape[0], place.shape[2]), bool)
-    for axis in range(place.shape[1]):
-        hit |= collision.leaves(place[:, axis], reach, arrays.bounds[0, axis], arrays.bounds[1, axis])
+    radius_sum = (arrays.radius + extra)[:, None]
+    hit = jnp.zeros((position.shape[0], position.shape[2]), bool)
+    for axis in range(position.shape[1]):
+        hit |= collision.leaves(position[:, axis], radius_sum, arrays.bounds[0, axis], arrays.bounds[1, axis])
     if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.grid is not None:
-        return hit | _indexed_contacts(arrays, place, reach)
+        return hit | _indexed_contacts(arrays, position, radius_sum)
     if len(arrays.boxes):
         box = jnp.moveaxis(arrays.boxes, 1, 0)[..., None, :, None]
-        hit |= _touches_box(box, reach[:, None], place[:, None]).any(axis=1)
+        hit |= _touches_box(box, radius_sum[:, None], position[:, None]).any(axis=1)
     if len(arrays.triangles):
         corners = jnp.moveaxis(arrays.triangles, 1, 0)[..., None, :, None]
-        hit |= _touches_triangle(corners, reach[:, None], place[:, None]).any(axis=1)
+        hit |= _touches_triangle(corners, radius_sum[:, None], position[:, None]).any(axis=1)
     return hit
 
 
@@ -111,31 +111,33 @@ FEW = 8
 """So many obstacles are sooner tested all than looked up."""
 
 
-def _touches_box(box: Given, reach: Given, place: Array) -> Array:
-    """Return where places ``(K, ., d, S)`` are within reach of rounded boxes, given as ``2 d + 1`` columns."""
-    d, gap2 = place.shape[-2], jnp.float32(0)
+def _touches_box(box: Given, radius_sum: Given, position: Array) -> Array:
+    """Return where places ``(K, ., d, S)`` are within radius_sum of rounded boxes, given as ``2 d + 1`` columns."""
+    d, gap2 = position.shape[-2], jnp.float32(0)
     for axis in range(d):
-        gap = collision.axis_gap(place[..., axis, :], box[axis], box[d + axis], jnp.float32(0), OPS)
+        gap = collision.axis_gap(position[..., axis, :], box[axis], box[d + axis], jnp.float32(0), OPS)
         gap2 = gap2 + gap * gap
-    total = reach + box[2 * d]
+    total = radius_sum + box[2 * d]
     return gap2 <= total * total
 
 
-def _touches_triangle(corners: Given, reach: Given, place: Array) -> Array:
+def _touches_triangle(corners: Given, radius_sum: Given, position: Array) -> Array:
     """The same for triangles, ``corners`` being their six columns."""
-    return collision.meets_triangle(tuple(corners), place[..., 0, :], place[..., 1, :], reach, jnp.float32(0), OPS)
+    return collision.meets_triangle(
+        tuple(corners), position[..., 0, :], position[..., 1, :], radius_sum, jnp.float32(0), OPS
+    )
 
 
-def _indexed_contacts(arrays: ProblemArrays, place: Array, reach: Given) -> Array:
+def _indexed_contacts(arrays: ProblemArrays, position: Array, radius_sum: Given) -> Array:
     """``(K, S)`` bool: contacts with obstacles, see :mod:`d4orm_env.engine.obstacles`."""
     index, cell = arrays.grid, jnp.int32(0)
-    for axis in range(place.shape[1]):
-        step = (place[:, axis] - index.low[axis]) * index.scale
+    for axis in range(position.shape[1]):
+        step = (position[:, axis] - index.low[axis]) * index.scale
         # Asked this way round, what is not a number counts as zero.
         step = jnp.minimum(jnp.where(step > 0, step, 0), (index.size[axis] - 1).astype(jnp.float32))
         cell = cell * index.size[axis] + step.astype(jnp.int32)
     clearance, begin, end = index.clearance[cell], index.first[cell], index.first[cell + 1]
-    sure, near = clearance <= reach - index.slack, clearance <= reach + index.slack
+    sure, near = clearance <= radius_sum - index.slack, clearance <= radius_sum + index.slack
     num_boxes = len(arrays.boxes)
 
     def test(number: Array, hit: Array) -> Array:
@@ -143,28 +145,32 @@ def _indexed_contacts(arrays: ProblemArrays, place: Array, reach: Given) -> Arra
         here = jnp.zeros_like(hit)
         if num_boxes:
             box = jnp.moveaxis(arrays.boxes[jnp.minimum(item, num_boxes - 1)], -1, 0)
-            here |= _touches_box(box, reach, place) & (item < num_boxes)
+            here |= _touches_box(box, radius_sum, position) & (item < num_boxes)
         if len(arrays.triangles):
             corners = jnp.moveaxis(arrays.triangles[jnp.maximum(item - num_boxes, 0)], -1, 0)
-            here |= _touches_triangle(corners, reach, place) & (item >= num_boxes)
+            here |= _touches_triangle(corners, radius_sum, position) & (item >= num_boxes)
         return hit | (near & here)
 
     return jax.lax.fori_loop(jnp.int32(0), index.longest, test, sure)
 
 
-def goal_distance(arrays: ProblemArrays, place: Array) -> Array:
+def goal_distance(arrays: ProblemArrays, position: Array) -> Array:
     """``(K, S)`` distance of every robot to its goal; its gradient at the goal itself is zero."""
-    gap2 = ((place - arrays.goal[..., None]) ** 2).sum(axis=1)
+    gap2 = ((position - arrays.goal[..., None]) ** 2).sum(axis=1)
     tiny = arrays.squared_goal_radius * jnp.float32(2.0**-32)
     # Asked this way round, a place that is not a number stays one: it must not pass for the goal.
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 
 def rewards_of(
-    arrays: ProblemArrays, place: Array, pair_violation: Array, obstacle_violation: Array, penalty: Array | np.float32
+    arrays: ProblemArrays,
+    position: Array,
+    pair_violation: Array,
+    obstacle_violation: Array,
+    penalty: Array | np.float32,
 ) -> Array:
     """``(K, S)`` reward of one step."""
-    distance, one = goal_distance(arrays, place), jnp.float32(1)
+    distance, one = goal_distance(arrays, position), jnp.float32(1)
     violations = pair_violation.astype(jnp.float32), obstacle_violation.astype(jnp.float32), jnp.float32(0)
     return transition.step_reward(distance, arrays.inverse_initial_distance[:, None], violations, penalty, one)
 
@@ -174,8 +180,8 @@ def check_contacts(arrays: ProblemArrays, state: Array) -> Contacts:
     zero = jnp.float32(0)
     contact = (robot_contacts(arrays, state, zero) > 0) | obstacle_contacts(arrays, state, zero)
     pair, obstacle = robot_contacts(arrays, state, arrays.margin) > 0, obstacle_contacts(arrays, state, arrays.margin)
-    place = state[:, : arrays.goal.shape[1]]
-    return contact, pair | obstacle, rewards_of(arrays, place, pair, obstacle, arrays.collision_penalty)
+    position = state[:, : arrays.goal.shape[1]]
+    return contact, pair | obstacle, rewards_of(arrays, position, pair, obstacle, arrays.collision_penalty)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -220,8 +226,8 @@ class JaxEngine:
         before = states[..., None], np.asarray(arrived)[..., None], np.zeros_like(controls)[..., None]
         worlds, contacts = _step(models, arrays, Worlds(*map(jnp.asarray, before)), jnp.asarray(controls)[..., None])
         collided, margin_violated, rewards = (np.asarray(value)[..., 0] for value in contacts)
-        state, docked, control = (np.asarray(value)[..., 0] for value in worlds)
-        return StepResult(state, control, docked, collided, margin_violated, rewards)
+        state, arrived, control = (np.asarray(value)[..., 0] for value in worlds)
+        return StepResult(state, control, arrived, collided, margin_violated, rewards)
 
     def move(self, arrays: ProblemArrays, states: FloatArray, arrived: BoolArray, controls: FloatArray) -> FloatArray:
         """See :meth:`d4orm_env.engine.types.Engine.move`."""
@@ -243,7 +249,7 @@ class JaxEngine:
             positions=np.ascontiguousarray(states[..., : problem.dimension]),
             controls=np.asarray(worlds.control)[..., 0],
             rewards=np.asarray(contacts[2])[..., 0],
-            arrived=np.concatenate([np.zeros((1, num_robots), bool), np.asarray(worlds.docked)[..., 0]]),
+            arrived=np.concatenate([np.zeros((1, num_robots), bool), np.asarray(worlds.arrived)[..., 0]]),
             collided=collided,
             margin_violated=margin_violated,
         )

@@ -25,7 +25,7 @@ Given: TypeAlias = Array | FloatArray | np.float32
 class MovingBodies(NamedTuple):
     """Bodies that are not simulated, at one time."""
 
-    places: Array | FloatArray  #: ``(O, d)``
+    positions: Array | FloatArray  #: ``(O, d)``
     headings: Array | FloatArray | None  #: ``(F,)`` of the bodies and their trailers, or ``None`` where all are discs
     radius: Array | FloatArray  #: ``(O,)`` outer radii
     footprints: FootprintArrays | None  #: Theirs; ``None`` where all are discs
@@ -34,7 +34,7 @@ class MovingBodies(NamedTuple):
 class PlacedBodies(NamedTuple):
     """Placed bodies: ``R`` robots in ``S`` samples, or one."""
 
-    place: Array  #: ``(d, R, S)`` reference points
+    position: Array  #: ``(d, R, S)`` reference points
     corners: Array  #: ``(2, n, R, S)`` of the cores, relative to them; ``None`` in space
     axes: Array  #: ``(2, m, R, S)``; zeros tell nothing
     extents: Array  #: ``(m, R, S)`` how far the cores reach along them
@@ -44,15 +44,15 @@ class PlacedBodies(NamedTuple):
 
 def place_robots(f: FootprintArrays | None, state: Array, dimension: int, radius: Given | None = None) -> PlacedBodies:
     """Bodies of robots in ``state`` ``(K, n, S)``; discs of this ``radius`` ``(K,)`` if there are no footprints."""
-    place = jnp.moveaxis(state[:, :dimension], 1, 0)
+    position = jnp.moveaxis(state[:, :dimension], 1, 0)
     if f is None:
-        return _discs(place, jnp.asarray(radius))
+        return _discs(position, jnp.asarray(radius))
     robot, column = jnp.asarray(f.robot), jnp.asarray(f.heading)
     turn = jnp.where(column[:, None] >= 0, state[robot, jnp.maximum(column, 0)], 0)
     if len(column) == len(state):
-        return _bodies(f, place, turn)
+        return _bodies(f, position, turn)
     heading = _lagging(f, turn)
-    return _bodies(f, place[:, robot] + _hitched(f, heading), heading)
+    return _bodies(f, position[:, robot] + _hitched(f, heading), heading)
 
 
 def _lagging(f: FootprintArrays, turn: Array) -> Array:
@@ -84,22 +84,22 @@ def of_robots(f: FootprintArrays | None, touch: Array, count: int) -> Array:
 
 def place_bodies(bodies: MovingBodies) -> PlacedBodies:
     """Other bodies, the same in all samples."""
-    place = jnp.asarray(bodies.places).T[..., None]
+    position = jnp.asarray(bodies.positions).T[..., None]
     if bodies.footprints is None or bodies.headings is None:
-        return _discs(place, jnp.asarray(bodies.radius))
+        return _discs(position, jnp.asarray(bodies.radius))
     f, heading = bodies.footprints, jnp.asarray(bodies.headings)[:, None]
-    if len(f.robot) > len(bodies.places):
-        place = place[:, jnp.asarray(f.robot)] + _hitched(f, heading)
-    return _bodies(f, place, heading)
+    if len(f.robot) > len(bodies.positions):
+        position = position[:, jnp.asarray(f.robot)] + _hitched(f, heading)
+    return _bodies(f, position, heading)
 
 
-def _discs(place: Array, radius: Array) -> PlacedBodies:
+def _discs(position: Array, radius: Array) -> PlacedBodies:
     size = radius[:, None]
     nothing = jnp.zeros((2, 1, *size.shape), jnp.float32)
-    return PlacedBodies(place, nothing, nothing, nothing[0], size, jnp.broadcast_to(size, (3, *size.shape)))
+    return PlacedBodies(position, nothing, nothing, nothing[0], size, jnp.broadcast_to(size, (3, *size.shape)))
 
 
-def _bodies(f: FootprintArrays, place: Array, heading: Array) -> PlacedBodies:
+def _bodies(f: FootprintArrays, position: Array, heading: Array) -> PlacedBodies:
     turns = jnp.asarray(f.heading)[:, None] >= 0
     cosine, sine = jnp.where(turns, jnp.cos(heading), 1), jnp.where(turns, jnp.sin(heading), 0)
 
@@ -109,22 +109,22 @@ def _bodies(f: FootprintArrays, place: Array, heading: Array) -> PlacedBodies:
 
     extents = jnp.asarray(f.extents).T[..., None]
     rounding, semi_axes = jnp.asarray(f.rounding)[:, None], jnp.asarray(f.semi_axes).T[..., None]
-    return PlacedBodies(place, turned(f.corners), turned(f.axes), extents, rounding, semi_axes)
+    return PlacedBodies(position, turned(f.corners), turned(f.axes), extents, rounding, semi_axes)
 
 
-def pairs_within(bodies: PlacedBodies, others: PlacedBodies, reach: Given) -> Array:
-    """``(R, O, S)`` whether bodies are within ``reach`` of others."""
+def pairs_within(bodies: PlacedBodies, others: PlacedBodies, radius_sum: Given) -> Array:
+    """``(R, O, S)`` whether bodies are within ``radius_sum`` of others."""
     a = PlacedBodies(*(jnp.expand_dims(part, part.ndim - 1) for part in bodies))
     b = PlacedBodies(*(jnp.expand_dims(part, part.ndim - 2) for part in others))
-    offset, reach = b.place - a.place, jnp.asarray(reach)
+    offset, radius_sum = b.position - a.position, jnp.asarray(radius_sum)
     if len(offset) == 3:
-        return _balls_within(offset, a.semi_axes + reach / 2, b.semi_axes + reach / 2)
-    return _cores_within(a, b, offset, reach)
+        return _balls_within(offset, a.semi_axes + radius_sum / 2, b.semi_axes + radius_sum / 2)
+    return _cores_within(a, b, offset, radius_sum)
 
 
-def _cores_within(a: PlacedBodies, b: PlacedBodies, offset: Array, reach: Array) -> Array:
+def _cores_within(a: PlacedBodies, b: PlacedBodies, offset: Array, radius_sum: Array) -> Array:
     """Check whether cores, those of ``b`` offset by ``offset`` ``(2, ...)``, are within reach of each other."""
-    total = a.rounding + b.rounding + reach
+    total = a.rounding + b.rounding + radius_sum
     corners = b.corners + offset[:, None]
     apart = jnp.maximum(
         _separation(a.axes, a.extents, corners), _separation(b.axes, b.extents, a.corners - offset[:, None])
@@ -143,7 +143,7 @@ def _separation(axes: Array, extents: Array, corners: Array) -> Array:
     return widest
 
 
-def _corner_near_edge(corners: Array, others: Array, reach: Array) -> Array:
+def _corner_near_edge(corners: Array, others: Array, radius_sum: Array) -> Array:
     """Check whether one of the first corners is within reach of an edge between the others."""
     near = jnp.zeros((), bool)
     for j in range(others.shape[1]):
@@ -153,7 +153,7 @@ def _corner_near_edge(corners: Array, others: Array, reach: Array) -> Array:
             jnp.clip((offset * along[:, None]).sum(axis=0), 0, square[None]) / jnp.where(square > 0, square, 1)[None]
         )
         gap = offset - share[None] * along[:, None]
-        near = near | ((gap * gap).sum(axis=0) <= (reach * reach)[None]).any(axis=0)
+        near = near | ((gap * gap).sum(axis=0) <= (radius_sum * radius_sum)[None]).any(axis=0)
     return near
 
 
@@ -189,7 +189,7 @@ def _static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array
         rounding = bodies.rounding[None]
         low, high = rounding - bodies.corners.min(axis=1), rounding + bodies.corners.max(axis=1)
     lower, upper = (bound[:, None, None] for bound in jnp.asarray(arrays.bounds))
-    hit = ((bodies.place - (low + extra) <= lower) | (bodies.place + (high + extra) >= upper)).any(axis=0)
+    hit = ((bodies.position - (low + extra) <= lower) | (bodies.position + (high + extra) >= upper)).any(axis=0)
     boxes, triangles = jnp.asarray(arrays.boxes), jnp.asarray(arrays.triangles).reshape(-1, 3, 2)
     if len(boxes):
         hit = jax.lax.fori_loop(0, len(boxes), lambda i, hit: hit | _meets_box(bodies, boxes[i], extra), hit)
@@ -197,19 +197,19 @@ def _static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array
         return hit
 
     def meet(i: Array, hit: Array) -> Array:
-        return hit | _cores_within(bodies, _polygon(triangles[i].T, jnp.float32(0)), -bodies.place, extra)
+        return hit | _cores_within(bodies, _polygon(triangles[i].T, jnp.float32(0)), -bodies.position, extra)
 
     return jax.lax.fori_loop(0, len(triangles), meet, hit)
 
 
 def _meets_box(bodies: PlacedBodies, box: Array, extra: Array) -> Array:
     """``(R, S)`` whether bodies are within ``extra`` of a rounded box."""
-    dimension = len(bodies.place)
+    dimension = len(bodies.position)
     lower, upper, rounding = box[:dimension], box[dimension:-1], box[-1]
     if dimension == 2:
         corners = jnp.stack([lower, jnp.stack([upper[0], lower[1]]), upper, jnp.stack([lower[0], upper[1]])], axis=1)
-        return _cores_within(bodies, _polygon(corners, rounding), -bodies.place, extra)
-    gap = jnp.clip(bodies.place, lower[:, None, None], upper[:, None, None]) - bodies.place
+        return _cores_within(bodies, _polygon(corners, rounding), -bodies.position, extra)
+    gap = jnp.clip(bodies.position, lower[:, None, None], upper[:, None, None]) - bodies.position
     axes = bodies.semi_axes + extra
     sharp = ((gap / axes) ** 2).sum(axis=0) <= 1
     ball = jnp.where(rounding > 0, rounding, 1)

@@ -32,7 +32,7 @@ class Worlds(NamedTuple):
     """A block of worlds on the way."""
 
     state: Array  #: ``(K, n, S)``
-    docked: Array  #: ``(K, S)`` bool
+    arrived: Array  #: ``(K, S)`` bool
     control: Array  #: ``(K, m, S)`` executed last
 
 
@@ -71,7 +71,7 @@ def numbers_of(model: Model, robots: np.ndarray[Any, Any], arrays: ProblemArrays
 
 
 def advance_robots(
-    model: Model, numbers: Numbers, x: Components, control: Components, docked: Array
+    model: Model, numbers: Numbers, x: Components, control: Components, arrived: Array
 ) -> tuple[Components, Components, Array]:
     """One step of robots of one model, docking included: states, executed controls, and who has docked."""
     functions, limits = model.functions, numbers.limits
@@ -83,8 +83,8 @@ def advance_robots(
     if numbers.facing and model.heading_index is not None:
         heading = y[model.heading_index]
         arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), *numbers.facing)
-    standing = transition.stands(docked, numbers.docks > 0)
-    docks, zero = transition.stands(arrives, numbers.docks > 0), jnp.zeros_like(gap2)
+    standing = transition.absorbed(arrived, numbers.docks > 0)
+    docks, zero = transition.absorbed(arrives, numbers.docks > 0), jnp.zeros_like(gap2)
     after = tuple(
         jnp.where(standing, old, jnp.where(docks, rest, new))
         for old, rest, new in zip(x, functions.rest(y, zero), y, strict=True)
@@ -100,18 +100,18 @@ def by_model(models: tuple[str, ...]) -> Iterator[tuple[Model, np.ndarray[Any, A
 
 def advance_worlds(models: tuple[str, ...], arrays: ProblemArrays, worlds: Worlds, control: Array) -> Worlds:
     """One step of every robot in every world, docking included, under ``control`` ``(K, m, S)``, not yet clipped."""
-    state, executed, docked = worlds.state, jnp.zeros_like(control), worlds.docked
+    state, executed, arrived = worlds.state, jnp.zeros_like(control), worlds.arrived
     for model, robots in by_model(models):
         x = tuple(worlds.state[robots, i] for i in range(model.state_size))
         u = tuple(control[robots, i] for i in range(model.control_size))
         numbers = numbers_of(model, robots, arrays)
-        after, done, stands = advance_robots(model, numbers, x, u, worlds.docked[robots])
+        after, done, absorbed = advance_robots(model, numbers, x, u, worlds.arrived[robots])
         for i, component in enumerate(after):
             state = state.at[robots, i].set(component)
         for i, component in enumerate(done):
             executed = executed.at[robots, i].set(component)
-        docked = docked.at[robots].set(stands)
-    return Worlds(state, docked, executed)
+        arrived = arrived.at[robots].set(absorbed)
+    return Worlds(state, arrived, executed)
 
 
 def roll_out(models: tuple[str, ...], arrays: ProblemArrays, begin: Worlds, controls: Array) -> Worlds:
@@ -131,22 +131,22 @@ def _roll_out_in_steps(models: tuple[str, ...], arrays: ProblemArrays, begin: Wo
 def _roll_out_by_kernel(models: tuple[str, ...], arrays: ProblemArrays, begin: Worlds, controls: Array) -> Worlds:
     def move(model: Model, robots: np.ndarray[Any, Any], begin: Worlds, controls: Array) -> Worlds:
         numbers = numbers_of(model, robots, arrays)
-        return Worlds(*move_robots(partial(advance_robots, model), numbers, begin.state, begin.docked, controls))
+        return Worlds(*move_robots(partial(advance_robots, model), numbers, begin.state, begin.arrived, controls))
 
     groups = list(by_model(models))
     if len(groups) == 1:
         return move(*groups[0], begin, controls)
-    horizon, (num_robots, num_samples) = len(controls), begin.docked.shape
+    horizon, (num_robots, num_samples) = len(controls), begin.arrived.shape
     state = jnp.zeros((horizon, *begin.state.shape), jnp.float32)
-    docked = jnp.zeros((horizon, num_robots, num_samples), bool)
-    after = Worlds(state, docked, jnp.zeros_like(controls))
+    arrived = jnp.zeros((horizon, num_robots, num_samples), bool)
+    after = Worlds(state, arrived, jnp.zeros_like(controls))
     for model, robots in groups:
         n, m = model.state_size, model.control_size
-        before = Worlds(begin.state[robots, :n], begin.docked[robots], begin.control)
+        before = Worlds(begin.state[robots, :n], begin.arrived[robots], begin.control)
         moved = move(model, robots, before, controls[:, robots, :m])
         after = Worlds(
             after.state.at[:, robots, :n].set(moved.state),
-            after.docked.at[:, robots].set(moved.docked),
+            after.arrived.at[:, robots].set(moved.arrived),
             after.control.at[:, robots, :m].set(moved.control),
         )
     return after

@@ -34,21 +34,21 @@ def observe_team(
 
     ``arrays.bounds`` is ``None`` where it has none; ``time_left`` is the share of the time left, 1 to 0.
     """
-    place = [world.state[:, axis] for axis in range(layout.dimension)]
+    position = [world.state[:, axis] for axis in range(layout.dimension)]
     velocity, heading = _motion(models, arrays, world)
     columns: list[Array | FloatArray] = [
         *velocity,
         *heading,
         jnp.sqrt(_square(velocity)),
-        *(arrays.goal[:, axis] - own for axis, own in enumerate(place)),
+        *(arrays.goal[:, axis] - own for axis, own in enumerate(position)),
         jnp.full(len(models), time_left, jnp.float32),
-        world.docked.astype(jnp.float32),
+        world.arrived.astype(jnp.float32),
         arrays.radius,
         arrays.limits[:, 0],
         arrays.limits[:, 1],
-        *_neighbors(arrays, place, velocity, layout),
-        *_obstacles(arrays, place, layout.num_obstacles),
-        *cast_rays(arrays, world.state, place, heading, layout),
+        *_neighbors(arrays, position, velocity, layout),
+        *_obstacles(arrays, position, layout.num_obstacles),
+        *cast_rays(arrays, world.state, position, heading, layout),
     ]
     low, high = layout.low, layout.high
     return jnp.stack([jnp.clip(column, low[i], high[i]) for i, column in enumerate(columns)], axis=1)
@@ -65,7 +65,7 @@ def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds) -> tu
         limits = tuple(arrays.limits[:, i] for i in range(len(model.limit_names)))
         x = tuple(world.state[:, i] for i in range(model.state_size))
         u = tuple(world.control[:, i] for i in range(model.control_size))
-        standing = transition.stands(world.docked, arrays.docks)
+        standing = transition.absorbed(world.arrived, arrays.docks)
         for axis, component in enumerate(model.functions.velocity(x, u, limits, OPS)):
             velocity[axis] = jnp.where(own & ~standing, component, velocity[axis])
         if model.heading_index is not None:
@@ -104,38 +104,38 @@ class _Nearest(NamedTuple):
     def columns(self) -> Columns:
         """Presence and columns of each, zeros for those that are not there."""
         presence = [jnp.isfinite(key).astype(jnp.float32) for key in self.keys]
-        return [column for there, row in zip(presence, self.rows) for column in (there, *row)]
+        return [column for present, row in zip(presence, self.rows) for column in (present, *row)]
 
 
-def _neighbors(arrays: ProblemArrays, place: Columns, velocity: Columns, layout: ObservationLayout) -> Columns:
+def _neighbors(arrays: ProblemArrays, position: Columns, velocity: Columns, layout: ObservationLayout) -> Columns:
     """``2 d + 2`` for each."""
     robots = np.arange(len(arrays.radius), dtype=np.int32)
 
     def look(other: tuple[Ints, Columns, Array | FloatArray]) -> tuple[Array, Columns]:
         number, motion, radius = other
-        relative = [theirs - own for theirs, own in zip(motion, (*place, *velocity))]
-        gap2 = _square(relative[: len(place)])
+        relative = [theirs - own for theirs, own in zip(motion, (*position, *velocity))]
+        gap2 = _square(relative[: len(position)])
         hidden = (robots == number) | (gap2 > np.float32(layout.communication_range**2))
         if layout.line_of_sight:
-            hidden |= are_blocked(arrays, place, relative[:2])
+            hidden |= are_blocked(arrays, position, relative[:2])
         key = jnp.where(hidden, jnp.inf, gap2)
         return key, [*relative, jnp.broadcast_to(radius, key.shape)]
 
-    nearest = _Nearest.nothing(len(robots), layout.num_neighbors, 2 * len(place) + 1)
-    return nearest.with_all(look, (robots, [*place, *velocity], arrays.radius)).columns()
+    nearest = _Nearest.nothing(len(robots), layout.num_neighbors, 2 * len(position) + 1)
+    return nearest.with_all(look, (robots, [*position, *velocity], arrays.radius)).columns()
 
 
-def _obstacles(arrays: ProblemArrays, place: Columns, count: int) -> Columns:
+def _obstacles(arrays: ProblemArrays, position: Columns, count: int) -> Columns:
     """``d + 2`` for each."""
 
     def seen(distance: Array, vector: Columns) -> tuple[Array, Columns]:
         return distance, [*vector, distance - arrays.radius]
 
-    nearest = _Nearest.nothing(len(arrays.radius), count, len(place) + 1)
+    nearest = _Nearest.nothing(len(arrays.radius), count, len(position) + 1)
     for to_one, things in ((_to_box, arrays.boxes), (_to_triangle, arrays.triangles)):
         if len(things):
-            nearest = nearest.with_all(lambda one, to_one=to_one: seen(*to_one(one, place)), things)  # type: ignore[misc]
-    for distance, vector in [] if arrays.bounds is None else _to_walls(arrays.bounds, place):
+            nearest = nearest.with_all(lambda one, to_one=to_one: seen(*to_one(one, position)), things)  # type: ignore[misc]
+    for distance, vector in [] if arrays.bounds is None else _to_walls(arrays.bounds, position):
         nearest = nearest.with_another(*seen(distance, vector))
     return nearest.columns()
 
@@ -144,23 +144,23 @@ def _square(vector: Columns) -> Array:
     return sum((component * component for component in vector), jnp.float32(0))
 
 
-def _to_box(box: Array, place: Columns) -> tuple[Array, Columns]:
+def _to_box(box: Array, position: Columns) -> tuple[Array, Columns]:
     """Distance of a rounded box, and the vector to its nearest point."""
-    d = len(place)
-    offset = [jnp.clip(own, box[axis], box[d + axis]) - own for axis, own in enumerate(place)]
+    d = len(position)
+    offset = [jnp.clip(own, box[axis], box[d + axis]) - own for axis, own in enumerate(position)]
     distance, radius = jnp.sqrt(_square(offset)), box[2 * d]
     # Inside a box, whose radius is zero, the vector is too.
     share = jnp.where(radius > 0, (distance - radius) / jnp.maximum(distance, 1e-6), 1)
     return distance - radius, [component * share for component in offset]
 
 
-def _to_triangle(corners: Array, place: Columns) -> tuple[Array, Columns]:
+def _to_triangle(corners: Array, position: Columns) -> tuple[Array, Columns]:
     """The same of a triangle."""
     inside: Array | bool = True
     nearest: Columns = []
     for edge in range(3):
         corner, end = corners[2 * edge : 2 * edge + 2], corners[2 * ((edge + 1) % 3) :][:2]
-        along, offset = end - corner, [own - corner[axis] for axis, own in enumerate(place[:2])]
+        along, offset = end - corner, [own - corner[axis] for axis, own in enumerate(position[:2])]
         inside &= along[0] * offset[1] - along[1] * offset[0] >= 0
         share = (offset[0] * along[0] + offset[1] * along[1]) / (along * along).sum()
         gap = [jnp.clip(share, 0, 1) * along[axis] - offset[axis] for axis in range(2)]
@@ -170,11 +170,11 @@ def _to_triangle(corners: Array, place: Columns) -> tuple[Array, Columns]:
     return jnp.sqrt(_square(vector)), vector
 
 
-def _to_walls(bounds: Array | FloatArray, place: Columns) -> list[tuple[Array, Columns]]:
+def _to_walls(bounds: Array | FloatArray, position: Columns) -> list[tuple[Array, Columns]]:
     """The same of the bounds: each axis' lower and upper one."""
     walls = []
-    for axis, own in enumerate(place):
+    for axis, own in enumerate(position):
         for side, sign in enumerate((-1, 1)):
             beyond = bounds[side, axis] - own
-            walls.append((sign * beyond, [beyond if i == axis else jnp.zeros_like(own) for i in range(len(place))]))
+            walls.append((sign * beyond, [beyond if i == axis else jnp.zeros_like(own) for i in range(len(position))]))
     return walls

@@ -25,7 +25,7 @@ class OtherBodies(NamedTuple):
 
 
 def cast_rays(
-    arrays: ProblemArrays, state: Array, place: list[Array], heading: list[Array], layout: ObservationLayout
+    arrays: ProblemArrays, state: Array, position: list[Array], heading: list[Array], layout: ObservationLayout
 ) -> list[Array]:
     """``R`` columns ``(K,)``: how far each ray of every robot reaches [m].
 
@@ -34,13 +34,13 @@ def cast_rays(
     """
     if not layout.num_rays:
         return []
-    fan, (x, y), (cosine, sine) = layout.ray_directions, place, heading
+    fan, (x, y), (cosine, sine) = layout.ray_directions, position, heading
     robots, f = jnp.arange(len(x)), arrays.footprints
-    bodies, owner, cores = place, robots, None
+    bodies, owner, cores = position, robots, None
     radius: Array | FloatArray = arrays.radius
     if f is not None:
         cores = jax.tree.map(lambda part: part[..., 0], place_robots(f, state[..., None], 2))
-        bodies, radius, owner = [*cores.place], cores.rounding, jnp.asarray(f.robot)
+        bodies, radius, owner = [*cores.position], cores.rounding, jnp.asarray(f.robot)
     cosine = jnp.where((cosine == 0) & (sine == 0), 1, cosine)
 
     def of_robot(robot: Array, x: Array, y: Array, cosine: Array, sine: Array) -> Array:
@@ -64,7 +64,7 @@ def _nearest(arrays: ProblemArrays, others: OtherBodies, x: Array, y: Array, ray
     return jnp.concatenate(found).min()
 
 
-def are_blocked(arrays: ProblemArrays, place: list[Array], gap: list[Array]) -> Array:
+def are_blocked(arrays: ProblemArrays, position: list[Array], gap: list[Array]) -> Array:
     """``(K,)`` bool: an obstacle lies between positions and what is this vector away from them, columns ``(K,)``."""
     distance = jnp.sqrt(gap[0] * gap[0] + gap[1] * gap[1])
     length = jnp.where(distance > 0, distance, 1)
@@ -72,7 +72,7 @@ def are_blocked(arrays: ProblemArrays, place: list[Array], gap: list[Array]) -> 
     def to_obstacle(x: Array, y: Array, ray_x: Array, ray_y: Array) -> Array:
         return jnp.concatenate([jnp.full(1, jnp.inf), *_to_obstacles(arrays, x, y, ray_x, ray_y)]).min()
 
-    return jax.vmap(to_obstacle)(place[0], place[1], gap[0] / length, gap[1] / length) < distance
+    return jax.vmap(to_obstacle)(position[0], position[1], gap[0] / length, gap[1] / length) < distance
 
 
 def _to_others(f: FootprintArrays | None, others: OtherBodies, ray_x: Array, ray_y: Array) -> Array:

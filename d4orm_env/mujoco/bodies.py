@@ -93,8 +93,8 @@ class TeamBodies:
         touched = np.zeros(self.problem.num_robots, np.bool_)
         for number in range(1, self._substeps + 1):
             left = self.problem.dt - number * self._step
-            for place, body in zip(self.data.mocap_pos, intruders):
-                place[:2] = body[:2] - left * body[2:4]
+            for position, body in zip(self.data.mocap_pos, intruders):
+                position[:2] = body[:2] - left * body[2:4]
             self._serve(controls)
             self._turn_wheels(commands, number * self._step)
             mujoco.mj_step(self.scene.model, self.data)

@@ -17,7 +17,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import FloatArray, shown
+from d4orm_env.core.arrays import FloatArray, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.base_env import Frame, TeamSimulation, Viewer
 from d4orm_env.envs.body_simulation import BodySimulation
@@ -65,10 +65,10 @@ class Camera:
         self._model, self._goal_radius = model, problem.goal_radius
         self._scene = mujoco.MjvScene(model, maxgeom=10_000)
         self._view = mujoco.MjvCamera()
-        places = np.concatenate([problem.start[:, :2], problem.goal])
+        positions = np.concatenate([problem.start[:, :2], problem.goal])
         if problem.world.lower is not None:
-            places = np.concatenate([places, problem.world.bounds])
-        low, high = places.min(axis=0), places.max(axis=0)
+            positions = np.concatenate([positions, problem.world.bounds])
+        low, high = positions.min(axis=0), positions.max(axis=0)
         reach = float(np.linalg.norm(high - low)) / 2 + 2 * float(problem.team.radius.max())
         self._view.lookat[:] = [*((low + high) / 2), 0]
         self._view.distance = reach / math.tan(math.radians(_VIEW_ANGLE / 2))
@@ -188,9 +188,9 @@ class parallel_env(navigation_v0.parallel_env):
         **options: object,
     ) -> None:
         if not isinstance(physics, Physics | None):
-            raise ValueError(f"physics is {shown(physics)}; give d4orm_env.mujoco.Physics(...), or leave it out")
+            raise ValueError(f"physics is {short_repr(physics)}; give d4orm_env.mujoco.Physics(...), or leave it out")
         if renderer not in RENDERERS:
-            raise ValueError(f"renderer is {shown(renderer)}; choose one of {', '.join(RENDERERS)}")
+            raise ValueError(f"renderer is {short_repr(renderer)}; choose one of {', '.join(RENDERERS)}")
         self._physics, self._renderer = physics or Physics(), renderer
         super().__init__(scenario, num_robots, **options)
 

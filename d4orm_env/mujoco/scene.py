@@ -170,11 +170,11 @@ def _cylinder(
     low: float,
     high: float,
     physics: Physics,
-    place: tuple[float, float] = (0.0, 0.0),
+    position: tuple[float, float] = (0.0, 0.0),
     **attributes: object,
 ) -> None:
     """A solid upright cylinder between two heights [m]."""
-    size, middle = [radius, (high - low) / 2, 0], [*place, (high + low) / 2]
+    size, middle = [radius, (high - low) / 2, 0], [*position, (high + low) / 2]
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=middle, **_solid(physics), **attributes)
 
 
@@ -186,7 +186,7 @@ def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Ph
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[100, 100, 1], contype=0, conaffinity=_ROLLING, rgba=[0.8, 0.8, 0.8, 1]
     )  # fmt: skip
     for x, y, radius in world.circles.tolist():
-        _cylinder(ground, radius, 0.0, top, physics, place=(x, y), rgba=grey)
+        _cylinder(ground, radius, 0.0, top, physics, position=(x, y), rgba=grey)
     boxes = world.boxes.tolist()
     if world.lower is not None and world.upper is not None:
         boxes += _walls(world.lower.tolist(), world.upper.tolist())
@@ -248,11 +248,11 @@ def _add_drive(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physi
         conaffinity=0,
     )
     size = CASTER_RADIUS * radius
-    for place, gap in ((-CASTER_PLACE, 0.0), (CASTER_PLACE, FRONT_GAP)):
+    for position, gap in ((-CASTER_PLACE, 0.0), (CASTER_PLACE, FRONT_GAP)):
         # Without friction: it turns and rolls as it likes. Its priority has the floor's own friction not count.
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[size, 0, 0], pos=[place * radius, 0, size + gap * radius], mass=0,
-            contype=_ROLLING, conaffinity=0, condim=1, priority=1,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[size, 0, 0], pos=[position * radius, 0, size + gap * radius],
+            mass=0, contype=_ROLLING, conaffinity=0, condim=1, priority=1,
         )  # fmt: skip
     for side in (1, -1):
         wheel = body.add_body(pos=[0, side * HALF_TRACK * radius, WHEEL_RADIUS * radius])

@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-from d4orm_env.paths.spaces import Place, Space, about_to_obstacles, clearance_at, to_bounds
+from d4orm_env.paths.spaces import Position, Space, about_to_obstacles, clearance_at, to_bounds
 
 MAX_POINTS = 2**24
 """Most points of a grid, blocked ones included."""
@@ -33,7 +33,7 @@ class Lattice(NamedTuple):
     moves: IntArray  #: ``(M, 3)`` int64 to the neighbours of a point
     nodes: Ints  #: ``(G,)`` int32 the node of each point; -1 where it is not free
     points: Ints  #: ``(N,)`` int32 the point of each node
-    places: Floats  #: ``(N, 3)`` where each node is [m]
+    positions: Floats  #: ``(N, 3)`` where each node is [m]
 
 
 @inlined
@@ -43,7 +43,7 @@ def indices_of(size: IntArray, n: Whole) -> tuple[int, int, int]:
 
 
 @inlined
-def corner_below(low: Floats, step: float, size: IntArray, q: Place) -> tuple[int, int, int]:
+def corner_below(low: Floats, step: float, size: IntArray, q: Position) -> tuple[int, int, int]:
     """Steps along each axis to the point below a place, or to the outermost one."""
     i = min(max(np.int64((q[0] - low[0]) / step), 0), size[0] - 1)
     j = min(max(np.int64((q[1] - low[1]) / step), 0), size[1] - 1)
@@ -61,16 +61,16 @@ def neighbour(lattice: Lattice, move: int, i: int, j: int, k: int) -> np.int64:
 
 
 @compiled
-def settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tuple[Place, bool]:
+def settled(space: Space, lattice: Lattice, safety_distance: float, position: Position) -> tuple[Position, bool]:
     """The place, or if a body of this reach does not fit there one less than half a step away where it does.
 
     And whether it does.
     """
-    half, probe, slack = lattice.step / 2, lattice.step / 64, reach * _SLACK
-    x, y, z = place
+    half, probe, slack = lattice.step / 2, lattice.step / 64, safety_distance * _SLACK
+    x, y, z = position
     clearance = clearance_at(space, x, y, z)
     for _ in range(_PUSHES):
-        if clearance > reach or clearance < reach - lattice.step:
+        if clearance > safety_distance or clearance < safety_distance - lattice.step:
             break
         gx = clearance_at(space, x + probe, y, z) - clearance_at(space, x - probe, y, z)
         gy = clearance_at(space, x, y + probe, z) - clearance_at(space, x, y - probe, z)
@@ -78,17 +78,17 @@ def settled(space: Space, lattice: Lattice, reach: float, place: Place) -> tuple
         norm = np.sqrt(gx * gx + gy * gy + gz * gz)
         if norm == 0.0:
             break
-        push = (reach + slack - clearance) / norm
+        push = (safety_distance + slack - clearance) / norm
         slack /= 3
-        x = min(max(x + push * gx, place[0] - half), place[0] + half)
-        y = min(max(y + push * gy, place[1] - half), place[1] + half)
-        z = min(max(z + push * gz, place[2] - half), place[2] + half)
+        x = min(max(x + push * gx, position[0] - half), position[0] + half)
+        y = min(max(y + push * gy, position[1] - half), position[1] + half)
+        z = min(max(z + push * gz, position[2] - half), position[2] + half)
         clearance = clearance_at(space, x, y, z)
-    return (x, y, z), clearance > reach
+    return (x, y, z), clearance > safety_distance
 
 
 @cached_kernel(variant="settle", **OPTIONS)
-def settle_nodes(space: Space, lattice: Lattice, reach: float) -> int:
+def settle_nodes(space: Space, lattice: Lattice, safety_distance: float) -> int:
     """Find the points of a lattice where a body of this reach fits, if that is less than half a step away.
 
     Returns:
@@ -97,19 +97,19 @@ def settle_nodes(space: Space, lattice: Lattice, reach: float) -> int:
     low, step, count = lattice.low, lattice.step, 0
     for n in range(lattice.nodes.shape[0]):
         i, j, k = indices_of(lattice.size, n)
-        place = (low[0] + i * step, low[1] + j * step, low[2] + k * step)
+        position = (low[0] + i * step, low[1] + j * step, low[2] + k * step)
         fits = (
-            about_to_obstacles(space, place[0], place[1], place[2])
-            > reach
-            < to_bounds(space, place[0], place[1], place[2])
+            about_to_obstacles(space, position[0], position[1], position[2])
+            > safety_distance
+            < to_bounds(space, position[0], position[1], position[2])
         )
         if not fits:
-            place, fits = settled(space, lattice, reach, place)
+            position, fits = settled(space, lattice, safety_distance, position)
         lattice.nodes[n] = count if fits else -1
         if fits:
             if count < lattice.points.shape[0]:
                 lattice.points[count] = n
-                lattice.places[count, 0], lattice.places[count, 1], lattice.places[count, 2] = place
+                lattice.positions[count, 0], lattice.positions[count, 1], lattice.positions[count, 2] = position
             count += 1
     return count
 
@@ -117,7 +117,7 @@ def settle_nodes(space: Space, lattice: Lattice, reach: float) -> int:
 def lay_lattice(
     problem: Problem,
     space: Space | None,
-    reach: float,
+    safety_distance: float,
     step: float,
     most: int,
     most_points: int = MAX_POINTS,
@@ -128,32 +128,32 @@ def lay_lattice(
     Args:
         problem: The starts, goals and bounds.
         space: Its obstacles; ``None`` where there are none.
-        reach: Radius that must fit at a node [m].
+        safety_distance: Radius that must fit at a node [m].
         step: Distance of neighbouring nodes [m], at least: that of the lattice is said by its ``step``.
         most: Most nodes.
         most_points: Most points, blocked ones included.
         pad: Distance beyond starts, goals and obstacles that paths may lead, at least twice the reach [m].
     """
-    low, high = _extent(problem, space, max(pad, 2 * reach))
+    low, high = _extent(problem, space, max(pad, 2 * safety_distance))
     most_points = most if space is None else most_points
     while True:
         while np.floor((high - low) / step + 1).prod() > most_points:
             step *= STRETCH
         lattice = _empty_lattice(low, high, step, most)
-        count = _fill(lattice, problem.world, space, reach)
+        count = _fill(lattice, problem.world, space, safety_distance)
         if count <= most:
-            return lattice._replace(points=lattice.points[:count].copy(), places=lattice.places[:count].copy())
+            return lattice._replace(points=lattice.points[:count].copy(), positions=lattice.positions[:count].copy())
         step *= STRETCH * root(count / most, problem.dimension)
 
 
 def _extent(problem: Problem, space: Space | None, pad: float) -> tuple[Floats, Floats]:
     """Lowest and highest corner of where paths may lead [m]."""
     d, bounds = problem.dimension, problem.world.bounds.astype(np.float64)
-    places = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
+    positions = np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)
     if space is not None:
         obstacles = space.extent[:, :d]
-        places = np.concatenate([places, np.where(np.isinf(obstacles), problem.goal[0], obstacles)])
-    return np.maximum(places.min(axis=0) - pad, bounds[0]), np.minimum(places.max(axis=0) + pad, bounds[1])
+        positions = np.concatenate([positions, np.where(np.isinf(obstacles), problem.goal[0], obstacles)])
+    return np.maximum(positions.min(axis=0) - pad, bounds[0]), np.minimum(positions.max(axis=0) + pad, bounds[1])
 
 
 def _empty_lattice(low: Floats, high: Floats, step: float, most: int) -> Lattice:
@@ -168,20 +168,23 @@ def _empty_lattice(low: Floats, high: Floats, step: float, most: int) -> Lattice
         moves=np.array([(*move, *flat) for move in product((-1, 0, 1), repeat=d) if any(move)]),
         nodes=np.empty(size.prod(), np.int32),
         points=np.empty(count, np.int32),
-        places=np.empty((count, 3)),
+        positions=np.empty((count, 3)),
     )
 
 
-def _fill(lattice: Lattice, world: World, space: Space | None, reach: float) -> int:
+def _fill(lattice: Lattice, world: World, space: Space | None, safety_distance: float) -> int:
     """Find the nodes of a lattice, and write as many as there is room for; how many there are."""
     if space is not None:
-        return settle_nodes(space, lattice, reach)
+        return settle_nodes(space, lattice, safety_distance)
     bounds, d = world.bounds.astype(np.float64), world.dimension
-    lattice.places[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * lattice.step
-    free = ((lattice.places[:, :d] >= bounds[0] + reach) & (lattice.places[:, :d] <= bounds[1] - reach)).all(axis=1)
+    lattice.positions[:] = lattice.low + np.indices(tuple(lattice.size)).reshape(3, -1).T * lattice.step
+    free = (
+        (lattice.positions[:, :d] >= bounds[0] + safety_distance)
+        & (lattice.positions[:, :d] <= bounds[1] - safety_distance)
+    ).all(axis=1)
     inside = np.flatnonzero(free)
     count = len(inside)
     lattice.nodes[:] = -1
     lattice.nodes[inside] = np.arange(count)
-    lattice.points[:count], lattice.places[:count] = inside, lattice.places[inside]
+    lattice.points[:count], lattice.positions[:count] = inside, lattice.positions[inside]
     return count

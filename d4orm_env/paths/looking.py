@@ -11,14 +11,14 @@ from d4orm_env.core.arrays import Floats, IntArray, Ints
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.lattice import Lattice, corner_below
-from d4orm_env.paths.spaces import Place, Space, clearance_at, distance, place_of, sees
+from d4orm_env.paths.spaces import Position, Space, clearance_at, distance, position_of, sees
 from d4orm_env.paths.wavefront import NOBODY, Front
 
 
 class Fields(NamedTuple):
     """The wavefronts of a team, one behind the other, and the lattices that they are on."""
 
-    reach: Floats  #: ``(K,)`` the distance that each robot keeps [m]
+    safety_distance: Floats  #: ``(K,)`` the distance that each robot keeps [m]
     room: Floats  #: ``(K,)`` clearance at its goal [m]
     lattice: IntArray  #: ``(K,)`` int64 number of its lattice
     low: Floats  #: ``(L, 3)`` the first nodes of the lattices [m]
@@ -26,8 +26,8 @@ class Fields(NamedTuple):
     size: IntArray  #: ``(L, 3)`` int64 points along each axis
     first_node: IntArray  #: ``(L + 1,)`` int64 where the part of ``nodes`` of each lattice begins, and the end
     nodes: Ints  #: int32 the node of each point; -1 where it is not free
-    first_place: IntArray  #: ``(L + 1,)`` int64 where the part of ``places`` of each lattice begins, and the end
-    places: Floats  #: ``(., 3)`` where the nodes are [m]
+    first_place: IntArray  #: ``(L + 1,)`` int64 where the part of ``positions`` of each lattice begins, and the end
+    positions: Floats  #: ``(., 3)`` where the nodes are [m]
     first_anchor: IntArray  #: ``(K + 1,)`` int64 where the part of ``anchor`` of each robot begins, and the end
     anchor: Ints  #: int32, see :class:`Front`
     #: ``(K + 1,)`` int64 where those of ``points``, ``values`` and ``parents`` begin, and the end
@@ -37,10 +37,10 @@ class Fields(NamedTuple):
     parents: Ints  #: int32, counted from the first one of the robot
 
 
-def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts: Sequence[Front]) -> Fields:
-    """The wavefronts of robots that keep ``reach`` ``(K,)``, on the lattices of these numbers ``(K,)``."""
+def gather(safety_distance: Floats, lattices: Sequence[Lattice], number: IntArray, fronts: Sequence[Front]) -> Fields:
+    """The wavefronts of robots that keep ``safety_distance`` ``(K,)``, on the lattices of these numbers ``(K,)``."""
     return Fields(
-        reach=reach,
+        safety_distance=safety_distance,
         room=np.array([front.room for front in fronts]),
         lattice=number,
         low=np.stack([lattice.low for lattice in lattices]),
@@ -48,8 +48,8 @@ def gather(reach: Floats, lattices: Sequence[Lattice], number: IntArray, fronts:
         size=np.stack([lattice.size for lattice in lattices]),
         first_node=_beginnings([lattice.nodes for lattice in lattices]),
         nodes=_joined([lattice.nodes for lattice in lattices]),
-        first_place=_beginnings([lattice.places for lattice in lattices]),
-        places=_joined([lattice.places for lattice in lattices]),
+        first_place=_beginnings([lattice.positions for lattice in lattices]),
+        positions=_joined([lattice.positions for lattice in lattices]),
         first_anchor=_beginnings([front.anchor for front in fronts]),
         anchor=_joined([front.anchor for front in fronts]),
         first_point=_beginnings([front.points for front in fronts]),
@@ -70,17 +70,17 @@ def _joined(arrays: list[np.ndarray]) -> Any:
 
 
 @compiled
-def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Place, float, np.int32]:
+def _look_from(space: Space, fields: Fields, robot: int, q: Position) -> tuple[Position, float, np.int32]:
     """Return the next position for a robot at ``q``, the length of the whole path, and the anchor."""
-    reach, lattice, first = fields.reach[robot], fields.lattice[robot], fields.first_point[robot]
+    safety_distance, lattice, first = fields.safety_distance[robot], fields.lattice[robot], fields.first_point[robot]
     step, size, first_place = fields.step[lattice], fields.size[lattice], fields.first_place[lattice]
     first_node, first_anchor = fields.first_node[lattice], fields.first_anchor[robot]
-    goal, own_goal, own = place_of(fields.points, first), fields.room[robot], clearance_at(space, q[0], q[1], q[2])
-    if sees(space, reach, goal, own_goal, q, own):
+    goal, own_goal, own = position_of(fields.points, first), fields.room[robot], clearance_at(space, q[0], q[1], q[2])
+    if sees(space, safety_distance, goal, own_goal, q, own):
         return goal, distance(goal, q), np.int32(0)
     i, j, k = corner_below(fields.low[lattice], step, size, q)
     # From deep inside an obstacle there may be none.
-    rings = 2 + np.int64(2 * min(max(0.0, reach - own), 2 * reach) / step)
+    rings = 2 + np.int64(2 * min(max(0.0, safety_distance - own), 2 * safety_distance) / step)
     ring, target, length, anchor = 0, q, np.inf, NOBODY
     while ring < rings and anchor < 0:
         last = NOBODY
@@ -93,33 +93,33 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Place) -> tuple[Plac
                     a = fields.anchor[first_anchor + n]
                     if a < 0:
                         continue
-                    at, value = place_of(fields.points, first + a), fields.values[first + a]
+                    at, value = position_of(fields.points, first + a), fields.values[first + a]
                     straight = value + distance(at, q)
                     if straight < length and a != last:
                         last = a
-                        if sees(space, reach, at, own_goal if a == 0 else reach, q, own):
+                        if sees(space, safety_distance, at, own_goal if a == 0 else safety_distance, q, own):
                             target, length, anchor = at, straight, a
                             continue
-                    place = place_of(fields.places, first_place + n)
-                    bent = value + distance(at, place) + distance(place, q)
-                    if bent < length and sees(space, reach, place, reach, q, own):
-                        target, length, anchor = place, bent, a
+                    position = position_of(fields.positions, first_place + n)
+                    bent = value + distance(at, position) + distance(position, q)
+                    if bent < length and sees(space, safety_distance, position, safety_distance, q, own):
+                        target, length, anchor = position, bent, a
         ring += 1
     return target, length, anchor
 
 
 @cached_kernel(variant="look", **OPTIONS)
 def look(
-    space: Space, fields: Fields, first: int, places: Floats, target: Floats, length: Floats, anchor: Ints
+    space: Space, fields: Fields, first: int, positions: Floats, target: Floats, length: Floats, anchor: Ints
 ) -> None:
-    """Fill the paths of robots from number ``first`` on from places ``(R, Q, 3)``.
+    """Fill the paths of robots from number ``first`` on from positions ``(R, Q, 3)``.
 
-    ``target`` ``(R, Q, 3)`` is where to go first, the place itself where there is no path; ``length`` ``(R, Q)`` that
-    of the whole path, infinite where there is none; ``anchor`` ``(R, Q)`` the anchor that is the target or comes next,
-    else -1.
+    ``target`` ``(R, Q, 3)`` is where to go first, the position itself where there is no path; ``length`` ``(R, Q)``
+    that of the whole path, infinite where there is none; ``anchor`` ``(R, Q)`` the anchor that is the target or comes
+    next, else -1.
     """
-    for r in range(places.shape[0]):
-        for b in range(places.shape[1]):
-            q = (places[r, b, 0], places[r, b, 1], places[r, b, 2])
+    for r in range(positions.shape[0]):
+        for b in range(positions.shape[1]):
+            q = (positions[r, b, 0], positions[r, b, 1], positions[r, b, 2])
             to, length[r, b], anchor[r, b] = _look_from(space, fields, first + r, q)
             target[r, b, 0], target[r, b, 1], target[r, b, 2] = to

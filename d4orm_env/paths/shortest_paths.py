@@ -57,11 +57,11 @@ class ShortestPaths:
         """``(..., K)`` float64 length of the paths from points ``(..., K, d)`` to the goals [m]."""
         return self._look(points)[1]
 
-    def distance_from(self, robot: int, places: Floats) -> Floats:
-        """``(Q,)`` float64 length of the paths of one robot from places ``(Q, d)`` to its goal [m]."""
+    def distance_from(self, robot: int, positions: Floats) -> Floats:
+        """``(Q,)`` float64 length of the paths of one robot from positions ``(Q, d)`` to its goal [m]."""
         if self._world is None:
-            return np.linalg.norm(places - self.problem.goal[robot], axis=1)
-        return _find(self._world, robot, in_space(places)[None])[1][0]
+            return np.linalg.norm(positions - self.problem.goal[robot], axis=1)
+        return _find(self._world, robot, in_space(positions)[None])[1][0]
 
     def direction(self, points: ArrayLike) -> Floats:
         """``(..., K, d)`` float64 unit vectors along the paths; zero at a goal and where there is no path."""
@@ -69,9 +69,9 @@ class ShortestPaths:
 
     def ahead(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """:meth:`direction` and :meth:`distance` at once."""
-        places = np.asarray(points, np.float64)
-        target, length = self._look(places)
-        return _towards(places, target), length
+        positions = np.asarray(points, np.float64)
+        target, length = self._look(positions)
+        return _towards(positions, target), length
 
     def path(self, robot: int) -> Floats:
         """``(w, d)`` float64 corners of the path of a robot, from its start to its goal; empty if there is none."""
@@ -95,34 +95,34 @@ class ShortestPaths:
         robots = np.flatnonzero(np.isinf(self.length))
         if len(robots):
             names = ", ".join(f"robot_{robot}" for robot in robots)
-            reach = sorted(
+            distances = sorted(
                 {f"{radius + self.problem.margin:.4g}" for radius in np.asarray(self.problem.team.radius)[robots]}
             )
             raise ValueError(
                 f"{names} {'has' if len(robots) == 1 else 'have'} no path from start to goal that is "
-                f"{' or '.join(reach)} m clear of obstacles; move the start or the goal, open the world there, or use "
-                f"a smaller radius or margin"
+                f"{' or '.join(distances)} m clear of obstacles; move the start or the goal, open the world there, or "
+                "use a smaller radius or margin"
             )
 
     def _look(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Return the next position to head for, and the whole distance."""
-        places: Floats = np.asarray(points, np.float64)
+        positions: Floats = np.asarray(points, np.float64)
         goal = self.problem.goal.astype(np.float64)
         if self._world is None:
-            offset = goal - places
+            offset = goal - positions
             straight: Floats = np.sqrt((offset * offset).sum(axis=-1))
-            return np.broadcast_to(goal, places.shape), straight
-        num_robots, d = places.shape[-2:]
-        spatial = in_space(places.reshape(-1, d)).reshape(-1, num_robots, 3).swapaxes(0, 1)
+            return np.broadcast_to(goal, positions.shape), straight
+        num_robots, d = positions.shape[-2:]
+        spatial = in_space(positions.reshape(-1, d)).reshape(-1, num_robots, 3).swapaxes(0, 1)
         target, length, _ = _find(self._world, 0, np.ascontiguousarray(spatial))
-        return target.swapaxes(0, 1)[..., :d].reshape(places.shape), length.T.reshape(places.shape[:-1])
+        return target.swapaxes(0, 1)[..., :d].reshape(positions.shape), length.T.reshape(positions.shape[:-1])
 
 
-def _find(world: tuple[Space, Fields], robot: int, places: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
+def _find(world: tuple[Space, Fields], robot: int, positions: Floats) -> tuple[Floats, Floats, NDArray[np.int32]]:
     """Return next positions for robots from this number on at ``(R, Q, 3)``, the whole distances, and their anchors."""
-    shape = places.shape[:2]
-    target, length, anchor = np.empty(places.shape), np.empty(shape), np.empty(shape, np.int32)
-    looking.look(*world, robot, places, target, length, anchor)
+    shape = positions.shape[:2]
+    target, length, anchor = np.empty(positions.shape), np.empty(shape), np.empty(shape, np.int32)
+    looking.look(*world, robot, positions, target, length, anchor)
     return target, length, anchor
 
 
@@ -136,38 +136,43 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
     if not problem.world.num_obstacles:
         return ShortestPaths(problem, np.linalg.norm(problem.goal - start, axis=1), None)
     space, starts = spaces.make_space(problem), in_space(start)[:, None]
-    reaches = np.asarray(problem.team.radius, np.float64) + problem.margin
+    safety_distances = np.asarray(problem.team.radius, np.float64) + problem.margin
     lattices: dict[tuple[float, int], Lattice] = {}
     chosen: list[tuple[float, int]] = []
     fronts: list[Front] = []
-    for reach, goal, place in zip(reaches.tolist(), in_space(problem.goal.astype(np.float64)), starts):
+    for safety_distance, goal, position in zip(
+        safety_distances.tolist(), in_space(problem.goal.astype(np.float64)), starts
+    ):
         for refinement in range(1 + REFINEMENTS):
-            if (reach, refinement) not in lattices:
-                lattices[reach, refinement] = _first_or_finer(
-                    problem, space, reach, lattices.get((reach, refinement - 1))
+            if (safety_distance, refinement) not in lattices:
+                lattices[safety_distance, refinement] = _first_or_finer(
+                    problem, space, safety_distance, lattices.get((safety_distance, refinement - 1))
                 )
-            lattice = lattices[reach, refinement]
-            front = wavefront.spread(space, lattice, reach, goal)
-            own = looking.gather(np.array([reach]), [lattice], np.array([0]), [front])
-            if np.isfinite(_find((space, own), 0, place[None])[1]).all():
+            lattice = lattices[safety_distance, refinement]
+            front = wavefront.spread(space, lattice, safety_distance, goal)
+            own = looking.gather(np.array([safety_distance]), [lattice], np.array([0]), [front])
+            if np.isfinite(_find((space, own), 0, position[None])[1]).all():
                 break
-        chosen.append((reach, refinement))
+        chosen.append((safety_distance, refinement))
         fronts.append(front)
     number = {key: n for n, key in enumerate(lattices)}
-    world = space, looking.gather(reaches, list(lattices.values()), np.array([number[key] for key in chosen]), fronts)
+    world = (
+        space,
+        looking.gather(safety_distances, list(lattices.values()), np.array([number[key] for key in chosen]), fronts),
+    )
     return ShortestPaths(problem, read_only(_find(world, 0, starts)[1][:, 0]), world)
 
 
-def _towards(places: Floats, targets: Floats) -> Floats:
+def _towards(positions: Floats, targets: Floats) -> Floats:
     """Unit vectors ``(..., d)`` from places to targets; zero where these are the same."""
-    offset = targets - places
+    offset = targets - positions
     norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
     return offset / np.where(norm > 0, norm, 1.0)
 
 
-def ahead_in_each(paths: Sequence[ShortestPaths], places: FloatArray) -> tuple[Floats, Floats]:
-    """:meth:`ShortestPaths.ahead` in ``B`` worlds, each with paths of its own, from places ``(B, K, d)``."""
-    given = places.astype(np.float64)
+def ahead_in_each(paths: Sequence[ShortestPaths], positions: FloatArray) -> tuple[Floats, Floats]:
+    """:meth:`ShortestPaths.ahead` in ``B`` worlds, each with paths of its own, from positions ``(B, K, d)``."""
+    given = positions.astype(np.float64)
     target, length = np.empty(given.shape), np.empty(given.shape[:-1])
     # Each robot is one row of one place.
     spatial = in_space(given.reshape(-1, given.shape[-1])).reshape(*given.shape[:-1], 1, 3)
@@ -198,14 +203,14 @@ def along_paths(direction: ArrayLike, length: ArrayLike) -> tuple[Floats, BoolAr
     return direction * np.where(known, length, 0.0)[:, None], known
 
 
-def _first_or_finer(problem: Problem, space: Space, reach: float, before: Lattice | None) -> Lattice:
+def _first_or_finer(problem: Problem, space: Space, safety_distance: float, before: Lattice | None) -> Lattice:
     """The lattice that paths are looked for on at first, or one that is twice as fine as the one before."""
     most = min(MAX_NODES, MAX_NODES_IN_ALL // problem.num_robots)
     if before is None:
-        return grids.lay_lattice(problem, space, reach, STEP * reach, most, MAX_NODES)
-    return grids.lay_lattice(problem, space, reach, before.step / 2, most)
+        return grids.lay_lattice(problem, space, safety_distance, STEP * safety_distance, most, MAX_NODES)
+    return grids.lay_lattice(problem, space, safety_distance, before.step / 2, most)
 
 
-def in_space(places: Floats) -> Floats:
+def in_space(positions: Floats) -> Floats:
     """Places ``(Q, d)`` in three dimensions."""
-    return np.hstack([places, np.zeros((len(places), 3 - places.shape[1]))])
+    return np.hstack([positions, np.zeros((len(positions), 3 - positions.shape[1]))])

@@ -21,7 +21,7 @@ from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 TOLERANCE = 5e-6
 """Rounding of clearances, as a share of the reach."""
 
-Place: TypeAlias = tuple[float, float, float]
+Position: TypeAlias = tuple[float, float, float]
 
 
 class Space(NamedTuple):
@@ -157,59 +157,61 @@ def clearance_at(space: Space, x: float, y: float, z: float) -> float:
 
 
 @inlined
-def distance(a: Place, b: Place) -> float:
+def distance(a: Position, b: Position) -> float:
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 @compiled
-def sees(space: Space, reach: float, a: Place, own_a: float, b: Place, own_b: float) -> bool:
+def sees(space: Space, safety_distance: float, a: Position, own_a: float, b: Position, own_b: float) -> bool:
     """Check whether a line is free.
 
-    ``own_a`` and ``own_b`` are the clearances at the ends: a place that lies nearer to something than ``reach`` is left
-    on lines that come no nearer than it is.
+    ``own_a`` and ``own_b`` are the clearances at the ends: a position that lies nearer to something than
+    ``safety_distance`` is left on lines that come no nearer than it is.
     """
     length = distance(a, b)
     if length == 0.0:
         return True
     ux, uy, uz = (b[0] - a[0]) / length, (b[1] - a[1]) / length, (b[2] - a[2]) / length
-    need_a, need_b = min(reach, own_a), min(reach, own_b)
-    zone_a, zone_b = 2 * (reach - need_a), length - 2 * (reach - need_b)
+    need_a, need_b = min(safety_distance, own_a), min(safety_distance, own_b)
+    zone_a, zone_b = 2 * (safety_distance - need_a), length - 2 * (safety_distance - need_b)
     s = 0.0
     while s < length:
         x, y, z = a[0] + s * ux, a[1] + s * uy, a[2] + s * uz
-        need = reach
+        need = safety_distance
         if s < zone_a:
             need = need_a
         if s > zone_b:
             need = min(need, need_b)
-        shortest = 0.25 * max(need, 0.1 * reach)
+        shortest = 0.25 * max(need, 0.1 * safety_distance)
         room = about_to_obstacles(space, x, y, z) - need
         if room < shortest:
             room = _to_obstacles(space, x, y, z) - need
-            if room < -TOLERANCE * reach:
+            if room < -TOLERANCE * safety_distance:
                 return False
         s += max(room, shortest)
     return True
 
 
 @inlined
-def place_of(rows: Floats, n: Whole) -> Place:
+def position_of(rows: Floats, n: Whole) -> Position:
     return (rows[n, 0], rows[n, 1], rows[n, 2])
 
 
 @compiled
-def is_free_line(space: Space, reach: float, tail: Floats, head: Floats) -> bool:
+def is_free_line(space: Space, safety_distance: float, tail: Floats, head: Floats) -> bool:
     """Check whether a body of this radius moves freely straight from one position to another.
 
     An end that lies nearer than that to something is left and reached on a line that comes no nearer.
     """
     p, q = (tail[0], tail[1], tail[2]), (head[0], head[1], head[2])
-    return sees(space, reach, p, clearance_at(space, p[0], p[1], p[2]), q, clearance_at(space, q[0], q[1], q[2]))
+    return sees(
+        space, safety_distance, p, clearance_at(space, p[0], p[1], p[2]), q, clearance_at(space, q[0], q[1], q[2])
+    )
 
 
 @cached_kernel(variant="lines", **OPTIONS)
-def free_lines(space: Space, reach: float, tails: Floats, heads: Floats, free: BoolArray) -> None:
+def free_lines(space: Space, safety_distance: float, tails: Floats, heads: Floats, free: BoolArray) -> None:
     """:func:`is_free_line` of many, from ``tails`` ``(Q, 3)`` to ``heads`` ``(Q, 3)``; ``free`` ``(Q,)`` is output."""
     for b in range(tails.shape[0]):
-        free[b] = is_free_line(space, reach, tails[b], heads[b])
+        free[b] = is_free_line(space, safety_distance, tails[b], heads[b])

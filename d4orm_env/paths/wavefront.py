@@ -18,7 +18,7 @@ from d4orm_env.core.arrays import BoolArray, Floats, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_env.paths.lattice import Lattice, corner_below, indices_of, neighbour, settled
-from d4orm_env.paths.spaces import Place, Space, clearance_at, distance, place_of, sees
+from d4orm_env.paths.spaces import Position, Space, clearance_at, distance, position_of, sees
 
 _HALVINGS = 6
 """Number of halvings of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
@@ -37,17 +37,19 @@ class Front(NamedTuple):
 
 
 @inlined
-def _between(a: Place, b: Place, share: float) -> Place:
+def _between(a: Position, b: Position, share: float) -> Position:
     return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2]))
 
 
 @compiled
-def _turned(space: Space, reach: float, a: Place, own: float, p: Place, q: Place) -> tuple[Place, Place]:
+def _turned(
+    space: Space, safety_distance: float, a: Position, own: float, p: Position, q: Position
+) -> tuple[Position, Position]:
     """Two places to go round on the way from ``a`` to ``q``, which it does not see and ``p`` beside it does."""
     low, high = 0.0, 1.0
     for _ in range(_HALVINGS):
         share = (low + high) / 2
-        if sees(space, reach, a, own, _between(q, p, share), reach):
+        if sees(space, safety_distance, a, own, _between(q, p, share), safety_distance):
             high = share
         else:
             low = share
@@ -59,7 +61,7 @@ def _turned(space: Space, reach: float, a: Place, own: float, p: Place, q: Place
         for _ in range(_HALVINGS):
             cut = (low + high) / 2
             b, c = _between(x, a, cut / near), _between(x, q, cut / far)
-            if sees(space, reach, b, reach, c, reach):
+            if sees(space, safety_distance, b, safety_distance, c, safety_distance):
                 low, one, other = cut, b, c
             else:
                 high = cut
@@ -78,16 +80,16 @@ class _Nodes(NamedTuple):
 
 
 @inlined
-def _kept(anchor: Whole, own_goal: float, reach: float) -> float:
+def _kept(anchor: Whole, own_goal: float, safety_distance: float) -> float:
     """Return the clearance kept around an anchor: all but the goal are clear."""
-    return own_goal if anchor == 0 else reach
+    return own_goal if anchor == 0 else safety_distance
 
 
 @compiled
 def _seen_anchor(
     space: Space,
     lattice: Lattice,
-    reach: float,
+    safety_distance: float,
     own_goal: float,
     nodes: _Nodes,
     points: Floats,
@@ -95,7 +97,7 @@ def _seen_anchor(
     n: Whole,
 ) -> tuple[np.int32, float]:
     """The best anchor of the neighbours of a node that it sees, and the path by it; -1 for none."""
-    (i, j, k), q, tried = indices_of(lattice.size, lattice.points[n]), place_of(lattice.places, n), nodes.tried
+    (i, j, k), q, tried = indices_of(lattice.size, lattice.points[n]), position_of(lattice.positions, n), nodes.tried
     best, chosen, count = np.inf, NOBODY, 0
     for move in range(lattice.moves.shape[0]):
         p = neighbour(lattice, move, i, j, k)
@@ -109,17 +111,17 @@ def _seen_anchor(
             continue
         tried[count] = a
         count += 1
-        at = place_of(points, a)
+        at = position_of(points, a)
         length = values[a] + distance(at, q)
-        if length < best and sees(space, reach, at, _kept(a, own_goal, reach), q, reach):
+        if length < best and sees(space, safety_distance, at, _kept(a, own_goal, safety_distance), q, safety_distance):
             best, chosen = length, a
     return chosen, best
 
 
 @compiled
 def _detour(
-    space: Space, lattice: Lattice, reach: float, nodes: _Nodes, n: Whole, q: Place
-) -> tuple[np.int64, float, Place]:
+    space: Space, lattice: Lattice, safety_distance: float, nodes: _Nodes, n: Whole, q: Position
+) -> tuple[np.int64, float, Position]:
     """The best neighbour to go on from to a node at ``q``, -1 for none, the path by it, and where it bends.
 
     In a narrow gap neighbours may see each other by way of a place between them only; elsewhere it is ``q``.
@@ -131,13 +133,17 @@ def _detour(
             p = neighbour(lattice, move, i, j, k)
             if p < 0 or not nodes.done[p]:
                 continue
-            place, c, fits = place_of(lattice.places, p), q, True
+            position, c, fits = position_of(lattice.positions, p), q, True
             if not straight:
-                c, fits = settled(space, lattice, reach, _between(place, q, 0.5))
-            length = nodes.value[p] + distance(place, c) + distance(c, q)
-            if not fits or length >= best or not sees(space, reach, place, reach, c, reach):
+                c, fits = settled(space, lattice, safety_distance, _between(position, q, 0.5))
+            length = nodes.value[p] + distance(position, c) + distance(c, q)
+            if (
+                not fits
+                or length >= best
+                or not sees(space, safety_distance, position, safety_distance, c, safety_distance)
+            ):
                 continue
-            if straight or sees(space, reach, c, reach, q, reach):
+            if straight or sees(space, safety_distance, c, safety_distance, q, safety_distance):
                 best, through, bend = length, p, c
         if through >= 0:
             break
@@ -145,9 +151,9 @@ def _detour(
 
 
 @compiled
-def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, place: Place, parent: int) -> None:
-    points[number, 0], points[number, 1], points[number, 2] = place
-    values[number] = values[parent] + distance(place, place_of(points, parent))
+def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, position: Position, parent: int) -> None:
+    points[number, 0], points[number, 1], points[number, 2] = position
+    values[number] = values[parent] + distance(position, position_of(points, parent))
     parents[number] = parent
 
 
@@ -167,7 +173,7 @@ Heap: TypeAlias = list[tuple[float, np.int64]]
 
 
 @register_jitable(nogil=True, **OPTIONS)
-def _begin_at(lattice: Lattice, at: Place, around: int, nodes: _Nodes) -> Heap:
+def _begin_at(lattice: Lattice, at: Position, around: int, nodes: _Nodes) -> Heap:
     """Give the nodes so many steps around the goal straight paths."""
     size, heap = lattice.size, [(0.0, np.int64(0)) for _ in range(0)]
     low_i, low_j, low_k = corner_below(lattice.low, lattice.step, size, at)
@@ -176,7 +182,7 @@ def _begin_at(lattice: Lattice, at: Place, around: int, nodes: _Nodes) -> Heap:
             for k in range(max(0, low_k - around), min(size[2], low_k + around + 1)):
                 n = np.int64(lattice.nodes[(i * size[1] + j) * size[2] + k])
                 if n >= 0:
-                    nodes.value[n], nodes.anchor[n] = distance(at, place_of(lattice.places, n)), 0
+                    nodes.value[n], nodes.anchor[n] = distance(at, position_of(lattice.positions, n)), 0
                     heapq.heappush(heap, (nodes.value[n], n))
     return heap
 
@@ -185,27 +191,27 @@ def _begin_at(lattice: Lattice, at: Place, around: int, nodes: _Nodes) -> Heap:
 def _pass_on(
     space: Space,
     lattice: Lattice,
-    reach: float,
+    safety_distance: float,
     nodes: _Nodes,
     n: Whole,
     a: Whole,
-    at: Place,
+    at: Position,
     own: float,
     value: float,
     heap: Heap,
 ) -> None:
-    """Give the neighbours of node ``n`` paths by its anchor ``a`` at a place of clearance ``own``, if shorter."""
+    """Give the neighbours of node ``n`` paths by its anchor ``a`` at a position of clearance ``own``, if shorter."""
     i, j, k = indices_of(lattice.size, lattice.points[n])
     for move in range(lattice.moves.shape[0]):
         p = neighbour(lattice, move, i, j, k)
         if p < 0 or nodes.done[p]:
             continue
-        place = place_of(lattice.places, p)
-        length = value + distance(at, place)
+        position = position_of(lattice.positions, p)
+        length = value + distance(at, position)
         # What is hidden from one that has no path yet may still be reached by going round.
         if length >= nodes.value[p] or (nodes.hidden[p] == a and nodes.value[p] < np.inf):
             continue
-        if nodes.tested[p] and not sees(space, reach, at, own, place, reach):
+        if nodes.tested[p] and not sees(space, safety_distance, at, own, position, safety_distance):
             nodes.hidden[p] = a
             continue
         nodes.value[p], nodes.anchor[p] = length, a
@@ -214,30 +220,31 @@ def _pass_on(
 
 @cached_kernel(variant="wave", **OPTIONS)
 def _spread(
-    space: Space, lattice: Lattice, reach: float, goal: Floats, nodes: _Nodes
+    space: Space, lattice: Lattice, safety_distance: float, goal: Floats, nodes: _Nodes
 ) -> tuple[Floats, Floats, Ints, float]:
     """See :func:`spread`; anchors, their values and their parents, and the clearance at the goal."""
     value, anchor, hidden = nodes.value, nodes.anchor, nodes.hidden
     points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
     points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
     values[0], parents[0], used = 0.0, NOBODY, 1
-    at = place_of(points, 0)
+    at = position_of(points, 0)
     own_goal = clearance_at(space, at[0], at[1], at[2])
-    heap = _begin_at(lattice, at, 2 + int(2 * max(0.0, reach - own_goal) / lattice.step), nodes)
+    heap = _begin_at(lattice, at, 2 + int(2 * max(0.0, safety_distance - own_goal) / lattice.step), nodes)
     while len(heap) > 0:
         length, n = heapq.heappop(heap)
         if nodes.done[n] or length != value[n]:
             continue
-        q, a = place_of(lattice.places, n), anchor[n]
-        if not nodes.tested[n] and not sees(space, reach, place_of(points, a), _kept(a, own_goal, reach), q, reach):
+        q, a = position_of(lattice.positions, n), anchor[n]
+        at, kept = position_of(points, a), _kept(a, own_goal, safety_distance)
+        if not nodes.tested[n] and not sees(space, safety_distance, at, kept, q, safety_distance):
             hidden[n] = a
-            a, value[n] = _seen_anchor(space, lattice, reach, own_goal, nodes, points, values, n)
-            p, via, bend = _detour(space, lattice, reach, nodes, n, q)
+            a, value[n] = _seen_anchor(space, lattice, safety_distance, own_goal, nodes, points, values, n)
+            p, via, bend = _detour(space, lattice, safety_distance, nodes, n, q)
             if via < value[n]:
-                b, c, parent = place_of(lattice.places, p), bend, anchor[p]
+                b, c, parent = position_of(lattice.positions, p), bend, anchor[p]
                 if c == q:
-                    at = place_of(points, parent)
-                    b, c = _turned(space, reach, at, _kept(parent, own_goal, reach), b, q)
+                    at = position_of(points, parent)
+                    b, c = _turned(space, safety_distance, at, _kept(parent, own_goal, safety_distance), b, q)
                 if used + 2 > len(values):
                     points, values, parents = _twice_as_many(points, values, parents)
                 _add_anchor(points, values, parents, used, b, parent)
@@ -251,13 +258,14 @@ def _spread(
                 heapq.heappush(heap, (value[n], n))
                 continue
         nodes.done[n] = True
-        _pass_on(space, lattice, reach, nodes, n, a, place_of(points, a), _kept(a, own_goal, reach), values[a], heap)
+        at, kept = position_of(points, a), _kept(a, own_goal, safety_distance)
+        _pass_on(space, lattice, safety_distance, nodes, n, a, at, kept, values[a], heap)
     return points[:used].copy(), values[:used].copy(), parents[:used].copy(), own_goal
 
 
-def spread(space: Space, lattice: Lattice, reach: float, goal: Floats) -> Front:
-    """The wavefront of a body of this reach from its goal ``(3,)``."""
-    count = len(lattice.places)
+def spread(space: Space, lattice: Lattice, safety_distance: float, goal: Floats) -> Front:
+    """The wavefront of a body that keeps this distance, from its goal ``(3,)``."""
+    count = len(lattice.positions)
     nodes = _Nodes(
         value=np.full(count, np.inf),
         anchor=np.full(count, NOBODY),
@@ -266,5 +274,5 @@ def spread(space: Space, lattice: Lattice, reach: float, goal: Floats) -> Front:
         done=np.zeros(count, np.bool_),
         tried=np.empty(len(lattice.moves), np.int32),
     )
-    found = _spread(space, lattice, reach, goal, nodes)
+    found = _spread(space, lattice, safety_distance, goal, nodes)
     return Front(np.where(nodes.done, nodes.anchor, NOBODY), *found)

@@ -37,7 +37,7 @@ def save_animation(
     fps: float | None = None,
     speed: float = 1.0,
     max_frames: int = 400,
-    marks: DisturbanceEvents | None = None,
+    events: DisturbanceEvents | None = None,
 ) -> Path:
     """Write a trajectory as a moving picture, up to half a second after the last robot has arrived, or to its end.
 
@@ -48,7 +48,7 @@ def save_animation(
         fps: Frames per second; by default one frame per time step, at most 20.
         speed: Speed of playing, in multiples of real time.
         max_frames: A longer animation gets fewer frames per second, at the same speed.
-        marks: Its disturbances, as for :func:`~d4orm_env.render.plot_trajectory`.
+        events: Its disturbances, as for :func:`~d4orm_env.render.plot_trajectory`.
 
     Returns:
         The path.
@@ -66,7 +66,7 @@ def save_animation(
         steps, rate = frame_steps(problem, trajectory, _frame_rate(problem, fps, speed, most), speed, max_frames)
         write = _write_gif if kind == ".gif" else _write_mp4
         with closing(FrameRenderer(problem, frame_size(problem, trajectory), trajectory.positions)) as renderer:
-            write(temporary, _Frames(renderer, trajectory, steps, marks), rate)
+            write(temporary, _Frames(renderer, trajectory, steps, events), rate)
     return path
 
 
@@ -108,9 +108,9 @@ class _Frames:
         renderer: FrameRenderer,
         trajectory: Trajectory,
         steps: NDArray[np.int64],
-        marks: DisturbanceEvents | None = None,
+        events: DisturbanceEvents | None = None,
     ) -> None:
-        self.renderer, self.trajectory, self.steps, self.marks = renderer, trajectory, steps, marks
+        self.renderer, self.trajectory, self.steps, self.events = renderer, trajectory, steps, events
         self.contacts = contact_points(trajectory)
 
     def __len__(self) -> int:
@@ -128,7 +128,7 @@ class _Frames:
             trajectory.collided[step],
             trail=trajectory.positions[: step + 1],
             contacts=self.contacts[step],
-            marks=None if self.marks is None else self.marks.until(step),
+            events=None if self.events is None else self.events.until(step),
             caption=f"{problem.name}    {step * problem.dt:.1f} s    arrived {arrived.sum()} of {len(arrived)}",
         )
 

@@ -32,21 +32,21 @@ class MarkLayer:
         self.stalls = panel.segments(empty, colors=INK, linewidths=1.8, zorder=6.7)
         self.artists = [self.paths, self.bodies, self.pushes, self.stalls]
 
-    def show_last(self, marks: DisturbanceEvents, positions: Array) -> None:
-        """Show the last moment of ``marks``, with ``(T + 1, K, d)`` positions of the robots."""
+    def show_last(self, events: DisturbanceEvents, positions: Array) -> None:
+        """Show the last moment of ``events``, with ``(T + 1, K, d)`` positions of the robots."""
         shown = max(1, round(_SHOWN_SECONDS / self.problem.dt))
-        self._draw_bodies(marks)
-        self._draw_pushes(marks.pushed, positions, max(0, len(positions) - shown))
-        self._draw_stalls(positions[-1:], marks.stalled[-1:])
+        self._draw_bodies(events)
+        self._draw_pushes(events.pushed, positions, max(0, len(positions) - shown))
+        self._draw_stalls(positions[-1:], events.stalled[-1:])
 
-    def show_all(self, marks: DisturbanceEvents, positions: Array) -> None:
+    def show_all(self, events: DisturbanceEvents, positions: Array) -> None:
         """Show the whole execution; arguments as for :meth:`show_last`."""
-        self._draw_bodies(marks)
-        self._draw_pushes(marks.pushed, positions, 0)
-        self._draw_stalls(positions, marks.stall_starts)
+        self._draw_bodies(events)
+        self._draw_pushes(events.pushed, positions, 0)
+        self._draw_stalls(positions, events.stall_starts)
 
-    def _draw_bodies(self, marks: DisturbanceEvents) -> None:
-        d, bodies = self.problem.dimension, np.asarray(marks.bodies, np.float64)
+    def _draw_bodies(self, events: DisturbanceEvents) -> None:
+        d, bodies = self.problem.dimension, np.asarray(events.bodies, np.float64)
         now = bodies[-1, bodies[-1, :, -1] > 0]
         self.bodies.set_verts(self.panel.outlines(now[:, :d], now[:, -1]))
         # A body that has left comes again somewhere else, or is absent.
@@ -82,12 +82,12 @@ class MarkLayer:
         self.stalls.set_segments(np.concatenate(crosses))
 
 
-def mark_legend(marks: DisturbanceEvents) -> list[Line2D]:
+def mark_legend(events: DisturbanceEvents) -> list[Line2D]:
     """Entries of a legend for what there is."""
     entries = [
-        (marks.pushed.any(), Line2D([], [], color=PUSH, linewidth=1.8, label="push")),
-        (marks.stalled.any(), Line2D([], [], linestyle="none", marker="x", color=INK, ms=8, mew=1.8, label="stalls")),
-        (marks.bodies.shape[1] > 0, Line2D([], [], linestyle="none", marker="o", mfc=BODY, mec=INK, ms=8,
+        (events.pushed.any(), Line2D([], [], color=PUSH, linewidth=1.8, label="push")),
+        (events.stalled.any(), Line2D([], [], linestyle="none", marker="x", color=INK, ms=8, mew=1.8, label="stalls")),
+        (events.bodies.shape[1] > 0, Line2D([], [], linestyle="none", marker="o", mfc=BODY, mec=INK, ms=8,
                                            label="moving obstacle")),
     ]  # fmt: skip
     return [line for shown, line in entries if shown]

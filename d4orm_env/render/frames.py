@@ -68,13 +68,13 @@ class FrameRenderer:
 
     def _panels(self, figure: Figure, limits: Array) -> list[Axes2D]:
         if self.problem.dimension == 2:
-            places = [("plane", (0.12, 0.1, 0.85, 0.83))]
+            positions = [("plane", (0.12, 0.1, 0.85, 0.83))]
         elif self.size[0] >= 1.6 * self.size[1]:
-            places = [("space", (0.015, 0.04, 0.44, 0.84)), ("above", (0.57, 0.1, 0.42, 0.83))]
+            positions = [("space", (0.015, 0.04, 0.44, 0.84)), ("above", (0.57, 0.1, 0.42, 0.83))]
         else:
-            places = [("space", (0.01, 0.04, 0.86, 0.86))]
+            positions = [("space", (0.01, 0.04, 0.86, 0.86))]
         panels = []
-        for view, rectangle in places:
+        for view, rectangle in positions:
             panel = Axes2D(make_axes(figure, 111, view), self.problem, limits)
             panel.axes.set_position(rectangle)
             panels.append(panel)
@@ -90,7 +90,7 @@ class FrameRenderer:
         *,
         contacts: ArrayLike = (),
         caption: str | None = None,
-        marks: DisturbanceEvents | None = None,
+        events: DisturbanceEvents | None = None,
     ) -> NDArray[np.uint8]:
         """Draw one state.
 
@@ -102,7 +102,7 @@ class FrameRenderer:
             trail: ``(T, K, d)`` positions up to now, oldest first.
             contacts: ``(N, d)`` further points to mark with a star, such as earlier contacts.
             caption: Text above the picture; by default how many robots have arrived.
-            marks: Disturbances of the execution up to now; its moments are the last ones of ``trail``.
+            events: Disturbances of the execution up to now; its moments are the last ones of ``trail``.
 
         Returns:
             ``(height, width, 3)`` image, the caller's own.
@@ -112,17 +112,17 @@ class FrameRenderer:
             RuntimeError: After :meth:`close`.
         """
         team, d = self._checked(np.asarray(states)), self.problem.dimension
-        docked = np.asarray(arrived, bool)
-        places = self.problem.goal if goals is None else np.asarray(goals)
+        arrived = np.asarray(arrived, bool)
+        positions = self.problem.goal if goals is None else np.asarray(goals)
         path = np.empty((0, len(team), d)) if trail is None else np.asarray(trail)
         stars = np.concatenate([np.reshape(contacts, (-1, d)), team[np.asarray(collided, bool), :d]])
-        self._keep_in_view(np.concatenate([team[:, :d], places]))
+        self._keep_in_view(np.concatenate([team[:, :d], positions]))
         for layer in self._layers:
-            layer.update(team, docked, places, path, stars)
-        if marks is not None:
+            layer.update(team, arrived, positions, path, stars)
+        if events is not None:
             for mark_layer in self._mark_layers:
-                mark_layer.show_last(marks, path[-len(marks.pushed) :])
-        self._caption.set_text(f"arrived {docked.sum()} of {len(docked)}" if caption is None else caption)
+                mark_layer.show_last(events, path[-len(events.pushed) :])
+        self._caption.set_text(f"arrived {arrived.sum()} of {len(arrived)}" if caption is None else caption)
         return self._paint()
 
     def _checked(self, states: Array) -> Array:
@@ -133,9 +133,9 @@ class FrameRenderer:
             raise ValueError(f"states must be finite and of shape (K, n) = {expected}; these have {states.shape}")
         return states
 
-    def _keep_in_view(self, places: Array) -> None:
+    def _keep_in_view(self, positions: Array) -> None:
         reach = np.max(self.problem.team.radius)
-        lower, upper = places.min(axis=0) - reach, places.max(axis=0) + reach
+        lower, upper = positions.min(axis=0) - reach, positions.max(axis=0) + reach
         low, high = self._limits
         if (lower < low).any() or (upper > high).any():
             room = 0.15 * (high - low)
@@ -200,9 +200,9 @@ class WindowRenderer:
     def _forget_window(self, event: object) -> None:
         self._manager = None
 
-    def draw(self, *state: ArrayLike, **marks: Any) -> NDArray[np.uint8]:
+    def draw(self, *state: ArrayLike, **events: Any) -> NDArray[np.uint8]:
         """Draw one state as :meth:`FrameRenderer.draw` does, show it, and wait until it is time for the next."""
-        frame = self._frames.draw(*state, **marks)
+        frame = self._frames.draw(*state, **events)
         if self._manager is not None:
             canvas = self._manager.canvas
             self._image.set_data(frame)

@@ -72,8 +72,8 @@ def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     bounds where they are near. Neither side of the plane is shown at less than 0.4 of the other.
     """
     d, world, reach = problem.dimension, problem.world, float(np.max(problem.team.radius))
-    places = np.concatenate([problem.start[:, :d], problem.goal, np.reshape(points, (-1, d))]).astype(np.float64)
-    nearest, farthest = places.min(axis=0) - reach, places.max(axis=0) + reach
+    positions = np.concatenate([problem.start[:, :d], problem.goal, np.reshape(points, (-1, d))]).astype(np.float64)
+    nearest, farthest = positions.min(axis=0) - reach, positions.max(axis=0) + reach
     corners = np.where(np.isfinite(every := np.stack(world.shapes.corners())), every, nearest)
     lower, upper = corners[0].min(axis=0, initial=np.inf), corners[1].max(axis=0, initial=-np.inf)
     lower, upper = np.minimum(lower, nearest), np.maximum(upper, farthest)
@@ -88,9 +88,9 @@ def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     return limits
 
 
-def make_axes(figure: Figure, place: int, view: str) -> Axes:
+def make_axes(figure: Figure, position: int, view: str) -> Axes:
     """Axes of a figure for a view: ``"space"``, or flat for ``"plane"`` and ``"above"``."""
-    return figure.add_subplot(place, projection="3d" if view == "space" else None)
+    return figure.add_subplot(position, projection="3d" if view == "space" else None)
 
 
 class Axes2D:
@@ -256,13 +256,13 @@ class TeamLayer:
     def body_outlines(self, states: Array) -> Array:
         """``(F, vertices, .)`` outlines of the bodies in states ``(K, n)``; in space ellipsoids face the reader."""
         team, panel = self.problem.team, self.panel
-        places = states[:, : team.dimension]
+        positions = states[:, : team.dimension]
         if not team.shapes:
-            return panel.outlines(places, self.radius)
+            return panel.outlines(positions, self.radius)
         if team.dimension == 3:
-            balls = panel.outlines(np.zeros_like(places), 1.0)
+            balls = panel.outlines(np.zeros_like(positions), 1.0)
             sizes = panel.flatten(team.all_footprint_arrays.semi_axes)
-            return panel.flatten(places)[:, None] + balls * sizes[:, None]
+            return panel.flatten(positions)[:, None] + balls * sizes[:, None]
         poses = team.body_poses(states)
         x, y = np.moveaxis(np.stack([body.footprint.outline() for body in team.bodies]), 2, 0)
         cosine, sine = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])

@@ -72,7 +72,7 @@ def last_moment(problem: Problem, trajectory: Trajectory, aftermath: float) -> i
 
 @own_style()
 def plot_trajectory(
-    problem: Problem, trajectory: Trajectory, *, title: str | None = None, marks: DisturbanceEvents | None = None
+    problem: Problem, trajectory: Trajectory, *, title: str | None = None, events: DisturbanceEvents | None = None
 ) -> Figure:
     """Draw a whole trajectory, to scale: what the world is, where every robot went, and what went wrong.
 
@@ -85,7 +85,7 @@ def plot_trajectory(
         problem: The problem that the trajectory belongs to.
         trajectory: Motion to draw.
         title: Title of the figure; by default the problem's name and the outcome, ``""`` for none.
-        marks: Its disturbances, ``episode.marks``: arrows are pushes, as long as the distance in a second at their
+        events: Its disturbances, ``episode.events``: arrows are pushes, as long as the distance in a second at their
             speed, crosses are where a robot stops obeying, and grey discs with dotted paths are intruders.
 
     Returns:
@@ -105,15 +105,15 @@ def plot_trajectory(
         panel = Axes2D(make_axes(figure, place, view), problem, limits)
         layer = TeamLayer(panel, problem)
         _draw_history(layer, trajectory)
-        if marks is not None:
-            MarkLayer(panel, problem).show_all(marks, np.asarray(trajectory.positions))
+        if events is not None:
+            MarkLayer(panel, problem).show_all(events, np.asarray(trajectory.positions))
         if not panel.spatial:
             _number_robots(layer, trajectory, points_per_metre=72 * 4.6 / float(np.max(size[:2])))
     title = _outcome(problem, trajectory) if title is None else title
     if title:
         figure.suptitle(title, fontsize=11)
     spacing = {"columnspacing": 1.4, "handletextpad": 0.1, "fontsize": 8.5, "frameon": False}
-    handles = _legend(problem, trajectory) + ([] if marks is None else mark_legend(marks))
+    handles = _legend(problem, trajectory) + ([] if events is None else mark_legend(events))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, **spacing)
     return figure
 
@@ -226,7 +226,7 @@ def save_picture(
     path: str | Path,
     *,
     title: str | None = None,
-    marks: DisturbanceEvents | None = None,
+    events: DisturbanceEvents | None = None,
 ) -> Path:
     """Write :func:`plot_trajectory` to a PNG, SVG or PDF file, by its suffix. The same input gives the same bytes.
 
@@ -241,7 +241,7 @@ def save_picture(
     kind = path.suffix.lower()[1:]
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with replaced_when_done(path, PICTURE_SUFFIXES) as temporary:
-        figure = plot_trajectory(problem, trajectory, title=title, marks=marks)
+        figure = plot_trajectory(problem, trajectory, title=title, events=events)
         with own_style({"svg.hashsalt": "d4orm", "pdf.fonttype": 42}):
             figure.savefig(temporary, format=kind, dpi=160, metadata=undated.get(kind))
     return path

@@ -64,16 +64,16 @@ def motion(
         ValueError: If the trajectory, the goals or the bodies do not fit the problem, or are not finite.
     """
     checked_trajectory(problem, trajectory)
-    places = problem.goal[None] if goals is None else _checked_goals(problem, goals, len(trajectory.states))
+    positions = problem.goal[None] if goals is None else _checked_goals(problem, goals, len(trajectory.states))
     end = last_moment(problem, trajectory, _AFTERMATH) + 1
     flags = trajectory.arrived * 1 + trajectory.collided * 2 + trajectory.margin_violated * 4
     content = {
         "title": title,
         "figures": figures,
-        "limits": _in_space(view_limits(problem, np.concatenate([trajectory.positions, places])).tolist()),
+        "limits": _in_space(view_limits(problem, np.concatenate([trajectory.positions, positions])).tolist()),
         **_setting(problem),
         "states": rounded(trajectory.states[:end]),
-        "goals": rounded(places[:end]),
+        "goals": rounded(positions[:end]),
         "world_clearance": _clearance(problem, trajectory.positions[:end]),
         "flags": _text(flags[:end].astype(np.uint8)),
     }
@@ -86,11 +86,11 @@ def motion(
 
 def _checked_goals(problem: Problem, goals: ArrayLike, moments: int) -> FloatArray:
     """``(T+1, K, d)`` goals, or ``(1, K, d)`` where they are always the same."""
-    places: FloatArray = np.asarray(goals, np.float32)
+    positions: FloatArray = np.asarray(goals, np.float32)
     shape = (moments, *problem.goal.shape)
-    if places.shape != shape or not np.isfinite(places).all():
-        raise ValueError(f"goals have shape {places.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
-    return places[:1] if (places == places[0]).all() else places
+    if positions.shape != shape or not np.isfinite(positions).all():
+        raise ValueError(f"goals have shape {positions.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
+    return positions[:1] if (positions == positions[0]).all() else positions
 
 
 @dataclass(frozen=True, eq=False)

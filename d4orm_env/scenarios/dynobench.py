@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import Floats, shown
+from d4orm_env.core.arrays import Floats, short_repr
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import read_yaml
 from d4orm_env.core.problem import Problem
@@ -125,7 +125,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     for robot, (entry, model) in enumerate(zip(robots, team.robot_models, strict=True)):
         for what, states in (("start", start), ("goal", goal)):
             if len(entry[what]) != model.state_size:
-                given, kind = shown(entry[what]), entry["type"]
+                given, kind = short_repr(entry[what]), entry["type"]
                 raise ValueError(f"{what} of robot_{robot} is {given}; a {kind} has {model.state_size} components")
             states[robot, : model.state_size] = _state(model, entry[what])
     turning = np.array([model.heading_index is not None for model in team.robot_models])
@@ -145,14 +145,14 @@ def _check_types(types: list[Any], models: Mapping[str, dict[str, Any]]) -> None
     unknown = [name for name in dict.fromkeys(types) if name not in models]
     if unknown:
         raise ValueError(
-            f"robot types {', '.join(map(shown, unknown))} are unknown; known are {', '.join(models)}, or give their "
-            f"parameters as models={{type: {{'dynamics': ...}}}}"
+            f"robot types {', '.join(map(short_repr, unknown))} are unknown; known are {', '.join(models)}, or give "
+            f"their parameters as models={{type: {{'dynamics': ...}}}}"
         )
     for name in dict.fromkeys(types):
         own = models[name]
         if own.get("dynamics") not in DYNAMICS:
             raise ValueError(
-                f"robot type {name}: dynamics {shown(own.get('dynamics'))} has no model here; "
+                f"robot type {name}: dynamics {short_repr(own.get('dynamics'))} has no model here; "
                 f"there are {', '.join(DYNAMICS)}"
             )
         for least in ("min_vel", "min_angular_vel"):
@@ -221,7 +221,7 @@ def _world(environment: Mapping[str, Any], team: Team) -> World:
             balls.append([*centre, obstacle["size"] if np.isscalar(obstacle["size"]) else obstacle["size"][0]])
             continue
         if obstacle["type"] != "box":
-            raise ValueError(f"obstacle type {shown(obstacle['type'])} is unknown; known are box, sphere")
+            raise ValueError(f"obstacle type {short_repr(obstacle['type'])} is unknown; known are box, sphere")
         half = np.array(obstacle["size"], float)[:d] / 2
         boxes.append([*(centre - half), *(centre + half)])
     kind = {"circles" if d == 2 else "spheres": balls}

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, shown
+from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, short_repr
 from d4orm_env.core.files import read_limited, read_yaml
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_checks import RESOLUTION
@@ -72,13 +72,13 @@ class GridMap:
         column, row = cells.T
         return np.array(self.low) + self.cell * np.column_stack([column + 0.5, len(self.blocked) - row - 0.5])
 
-    def lattice_step(self, reach: float) -> float:
+    def lattice_step(self, safety_distance: float) -> float:
         """Step of a lattice that finds every path one cell wide which robots of that reach have [m]."""
         half = self.cell / 2
-        if half <= reach:
-            return half * max(1, int(reach / 2 / half))
+        if half <= safety_distance:
+            return half * max(1, int(safety_distance / 2 / half))
         # Between two lattice points this far from a wall a robot is still clear of it; see free_space.
-        room = 2 * math.sqrt(half * half - reach * reach) * (1 - ROUNDING)
+        room = 2 * math.sqrt(half * half - safety_distance * safety_distance) * (1 - ROUNDING)
         parts = int(half / room) + 1
         return half / min(parts, MOST_PARTS)
 
@@ -133,9 +133,9 @@ def grid_of_fields(fields: dict[str, Any], folder: Path) -> GridMap:
         raise ValueError(f"has no field {missing[0]!r}; a map_server file needs image, resolution and origin")
     image, negate = fields["image"], fields.get("negate", 0)
     if not isinstance(image, str) or not image:
-        raise ValueError(f"image is {shown(image)}; it must be the path of a .png or .pgm file")
+        raise ValueError(f"image is {short_repr(image)}; it must be the path of a .png or .pgm file")
     if not isinstance(negate, bool | int) or negate not in (0, 1):
-        raise ValueError(f"negate is {shown(negate)}; it must be 0 or 1")
+        raise ValueError(f"negate is {short_repr(negate)}; it must be 0 or 1")
     mode = _mode(fields.get("mode", "trinary"))
     if mode == "raw" and negate:
         raise ValueError("negate is 1 and mode is raw, which map_server and nav2 read differently; save it with 0")
@@ -212,7 +212,7 @@ def _mode(value: object) -> Mode:
     for mode in get_args(Mode):
         if isinstance(value, str) and value.lower() == mode:
             return mode
-    raise ValueError(f"mode is {shown(value)}; it must be one of {', '.join(get_args(Mode))}")
+    raise ValueError(f"mode is {short_repr(value)}; it must be one of {', '.join(get_args(Mode))}")
 
 
 def _share(value: object, name: str) -> float:
@@ -229,7 +229,7 @@ def _numbers(origin: object) -> list[float]:
     if str(numbers[-1]).lower().lstrip("+-.") == "nan":
         numbers = [*numbers[:2], 0.0]
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in numbers):
-        raise ValueError(f"origin is {shown(origin)}; it must be three numbers, x, y and yaw")
+        raise ValueError(f"origin is {short_repr(origin)}; it must be three numbers, x, y and yaw")
     return [float(value) for value in numbers]
 
 

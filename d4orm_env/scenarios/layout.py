@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import as_float32, frozen_array, shown
+from d4orm_env.core.arrays import as_float32, frozen_array, short_repr
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_checks import MAX_HORIZON, check_places
+from d4orm_env.core.problem_checks import MAX_HORIZON, check_positions
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.placement import PlacementArea, Points, with_random_obstacles
@@ -41,11 +41,11 @@ def build(settings: Settings, layout: Layout) -> Problem:
     team, horizon = settings.team, settings.horizon
     if settings.height is not None:
         layout = _lifted(layout, settings.height)
-    places = np.vstack([layout.starts, layout.goals])
+    positions = np.vstack([layout.starts, layout.goals])
     world = with_bounds(settings, layout.world, layout.area)
     require_inside(settings, world, layout.starts, layout.goals)
     if layout.area is not None:
-        world = with_random_obstacles(settings, world, places, layout.area)
+        world = with_random_obstacles(settings, world, positions, layout.area)
     require_margin(settings, world, layout.starts, layout.goals)
     return Problem(
         team=team,
@@ -67,12 +67,12 @@ def build(settings: Settings, layout: Layout) -> Problem:
 
 def _lifted(layout: Layout, height: float) -> Layout:
     """The layout with its lowest start or goal at that height [m]; obstacles of scenarios reach through all heights."""
-    places = np.vstack([layout.starts, layout.goals])
-    if places.shape[1] != 3:
+    positions = np.vstack([layout.starts, layout.goals])
+    if positions.shape[1] != 3:
         raise ValueError(
             f"height is {height:g} and the robots move in the plane; use model='holonomic3d', or leave it out"
         )
-    lift = np.array([0.0, 0.0, height - places[:, 2].min()])
+    lift = np.array([0.0, 0.0, height - positions[:, 2].min()])
     area, world = layout.area, layout.world
     if area is not None:
         area = area._replace(centre=area.centre + lift)
@@ -123,8 +123,8 @@ def require_margin(settings: Settings, world: World, starts: Points, goals: Poin
 
     The problem would have no solution that keeps the margin.
     """
-    for what, places in (("start", starts), ("goal", goals)):
-        fault = check_places(settings.team, world, what, as_float32(places), settings.margin)
+    for what, positions in (("start", starts), ("goal", goals)):
+        fault = check_positions(settings.team, world, what, as_float32(positions), settings.margin)
         if fault:
             raise ValueError(
                 f"scenario {settings.scenario!r}: {fault}; make the scenario larger, or the radius or margin smaller"
@@ -141,8 +141,8 @@ def with_bounds(settings: Settings, world: World, area: PlacementArea | None) ->
         return world
     if area is None or world.lower is not None:
         raise ValueError(
-            f"scenario {settings.scenario!r} has bounds of its own and takes none, not {shown(settings.bounds)}; leave "
-            "bounds out"
+            f"scenario {settings.scenario!r} has bounds of its own and takes none, not {short_repr(settings.bounds)}; "
+            "leave bounds out"
         )
     if isinstance(settings.bounds, list | tuple | np.ndarray):
         lower, upper = frozen_array(settings.bounds, "bounds", (2, world.dimension), largest=LARGEST)
@@ -158,13 +158,14 @@ def require_inside(settings: Settings, world: World, starts: Points, goals: Poin
         return
     lower, upper = world.bounds.astype(np.float64)
     needed = np.asarray(settings.team.radius, np.float64) + settings.margin
-    for what, places in (("start", starts), ("goal", goals)):
-        gaps: NDArray[np.float64] = np.minimum(places - lower, upper - places).min(axis=1)
+    for what, positions in (("start", starts), ("goal", goals)):
+        gaps: NDArray[np.float64] = np.minimum(positions - lower, upper - positions).min(axis=1)
         robot = int(np.argmin(gaps - needed))
         if gaps[robot] <= needed[robot]:
-            place = ", ".join(f"{coordinate:g}" for coordinate in places[robot])
+            position = ", ".join(f"{coordinate:g}" for coordinate in positions[robot])
             where = f"{gaps[robot]:.3g} m inside" if gaps[robot] >= 0 else f"{-gaps[robot]:.3g} m outside"
             raise ValueError(
-                f"scenario {settings.scenario!r}: the {what} of robot_{robot} at ({place}) is {where} the bounds "
-                f"{shown(settings.bounds)}, and its radius and the margin take {needed[robot]:.3g} m; use wider bounds"
+                f"scenario {settings.scenario!r}: the {what} of robot_{robot} at ({position}) is {where} the bounds "
+                f"{short_repr(settings.bounds)}, and its radius and the margin take {needed[robot]:.3g} m; use wider "
+                "bounds"
             )

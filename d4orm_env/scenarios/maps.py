@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.files import is_yaml_path, read_limited
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
@@ -20,7 +20,7 @@ from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, grid_of_
 from d4orm_env.scenarios.layout import Layout, build
 from d4orm_env.scenarios.placement import FreeSpace, Points, free_space
 from d4orm_env.scenarios.settings import Settings, bounded, require_plane
-from d4orm_env.scenarios.well_formed import populate, reach_of, with_obstacles
+from d4orm_env.scenarios.well_formed import populate, safety_distance_of, with_obstacles
 
 PASSABLE, BLOCKED = b".GSE", b"@OTW"
 """Ground, swamp or service points, emitters; out of bounds, trees and water."""
@@ -160,7 +160,7 @@ def read_map(path: PathLike, cell: float = 0.6, resolution: float | None = None)
     """Read a map as :func:`load_map`; the same object for the same content."""
     cell = bounded(cell, "cell")
     if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"the path of a map must be text or a path, not {shown(path)}")
+        raise ValueError(f"the path of a map must be text or a path, not {short_repr(path)}")
     file = Path(path)
     with _named(file):
         if file.suffix.lower() in IMAGES:
@@ -198,19 +198,19 @@ def map(
             f"scenario {settings.scenario!r} needs map=, the path of a .map file or a map_server .yaml file"
         )
     require_plane(settings)
-    grid, reach = read_map(map, cell, resolution), reach_of(settings)
-    step = grid.lattice_step(reach)
-    space = free_space(grid.world, reach, step)
+    grid, safety_distance = read_map(map, cell, resolution), safety_distance_of(settings)
+    step = grid.lattice_step(safety_distance)
+    space = free_space(grid.world, safety_distance, step)
     if scenario_file is None:
         remedy = "a larger map, larger cells or smaller robots"
         return populate(settings, grid.world, step, space.longest_path, remedy)
-    starts, goals, travel = _listed_places(settings, grid, space, Path(scenario_file))
+    starts, goals, travel = _listed_positions(settings, grid, space, Path(scenario_file))
     world = with_obstacles(settings, grid.world, np.vstack([starts, goals]))
     with _named(Path(scenario_file)):  # whose rows may start or end in one place
         return build(settings, Layout(starts, goals, world, travel))
 
 
-def _listed_places(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:
+def _listed_positions(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:
     """Starts and goals of a Moving AI scenario, and the longest path [m]."""
     with _named(path):
         tasks = parse_scenario(read_limited(path, "a map", MAX_BYTES), grid.blocked.shape, settings.num_robots)

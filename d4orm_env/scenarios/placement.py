@@ -76,10 +76,10 @@ def size_for(count: int, spacing: float, dimension: int) -> float:
     return root(count * ball / DENSITY[dimension], dimension) if count > 1 else 0.0
 
 
-def with_random_obstacles(settings: Settings, world: World, places: Points, area: PlacementArea) -> World:
+def with_random_obstacles(settings: Settings, world: World, positions: Points, area: PlacementArea) -> World:
     """The world and ``settings.num_obstacles`` random circles, or spheres in space.
 
-    They keep more than the margin to the ``places`` ``(2 K, d)``, starts, then goals, of which there are none where
+    They keep more than the margin to the ``positions`` ``(2 K, d)``, starts, then goals, of which there are none where
     these are drawn later, and leave the largest robot a passage with its margin on both sides, between each other and
     to everything else: no obstacle closes a path.
     """
@@ -88,11 +88,11 @@ def with_random_obstacles(settings: Settings, world: World, places: Points, area
     random = settings.generator(OBSTACLES)
     size = float(np.float32(settings.obstacle_radius))
     passage = 2 * (float(np.max(settings.team.radius)) + settings.margin)
-    reach = np.tile(np.float64(settings.team.radius), 2) + size + settings.margin
+    safety_distance = np.tile(np.float64(settings.team.radius), 2) + size + settings.margin
     balls: Points = np.empty((0, world.dimension))
 
     def is_free(centres: Points) -> NDArray[np.bool_]:
-        apart = _gaps(centres, places, reach) > 0
+        apart = _gaps(centres, positions, safety_distance) > 0
         passable = (world.clearance(centres) > size + passage) & (_gaps(centres, balls, 2 * size + passage) > 0)
         return np.asarray(apart & passable)
 
@@ -127,8 +127,8 @@ def _with_another(
         free = _gaps(candidates, points, spacing) > 0
         return free if avoid is None else free & (_gaps(candidates, *avoid) > 0)
 
-    place = _first(random, area, is_free)
-    return points if place is None else np.vstack([points, place])
+    position = _first(random, area, is_free)
+    return points if position is None else np.vstack([points, position])
 
 
 def _first(
@@ -146,11 +146,11 @@ def _first(
     return None
 
 
-def _gaps(candidates: Points, points: Points, reach: Points | float) -> Points:
+def _gaps(candidates: Points, points: Points, safety_distance: Points | float) -> Points:
     """``(C,)`` how far each candidate is from all points, less their reach; infinite where there are none [m]."""
     if not len(points):
         return np.full(len(candidates), np.inf)
-    return (np.linalg.norm(candidates[:, None] - points, axis=-1) - reach).min(axis=1)
+    return (np.linalg.norm(candidates[:, None] - points, axis=-1) - safety_distance).min(axis=1)
 
 
 MAX_POINTS = 2**24
@@ -174,9 +174,9 @@ class FreeSpace:
         """``(..., d)`` places of the lattice points of these indices, as float32 holds them [m]."""
         return (self.low + self.step * indices).astype(np.float32).astype(np.float64)
 
-    def contains(self, place: Points) -> bool:
+    def contains(self, position: Points) -> bool:
         """Check whether the lattice point nearest to a position belongs to the region."""
-        index = np.round((place - self.low) / self.step).astype(int)
+        index = np.round((position - self.low) / self.step).astype(int)
         within = ((index >= 0) & (index < self.inside.shape)).all()
         return bool(within and self.inside[tuple(index)])
 
@@ -211,8 +211,8 @@ def _last_reached(
 
 
 @lru_cache(maxsize=4)
-def free_space(world: World, reach: float, step: float) -> FreeSpace:
-    """The free space of a world with bounds for robots whose centres keep ``reach`` to everything [m].
+def free_space(world: World, safety_distance: float, step: float) -> FreeSpace:
+    """The free space of a world with bounds for robots whose centres keep ``safety_distance`` to everything [m].
 
     The lattice begins at the lower bounds, in steps of ``step`` [m].
     """
@@ -225,7 +225,7 @@ def free_space(world: World, reach: float, step: float) -> FreeSpace:
         )
     space = FreeSpace(low, step, np.zeros(shape, np.bool_))
     # A robot keeps its reach between two neighbours that are further from everything than this.
-    needed = math.sqrt(reach * reach + step * step / 4)
+    needed = math.sqrt(safety_distance * safety_distance + step * step / 4)
     free = np.empty(shape, np.bool_)
     rows = max(1, _POINTS_AT_ONCE // int(np.prod(shape[1:])))
     for begin in range(0, shape[0], rows):

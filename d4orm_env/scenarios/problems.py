@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import numpy as np
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.files import is_yaml_path
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
@@ -48,7 +48,7 @@ def register_scenario(name: str, generator: Callable[..., Problem] | Scenario) -
         ValueError: If the name is taken or no name, or the generator cannot be called like that.
     """
     if isinstance(name, str) and is_yaml_path(name):
-        raise ValueError(f"scenario name {shown(name)} is that of a file; give one that does not end in .yaml")
+        raise ValueError(f"scenario name {short_repr(name)} is that of a file; give one that does not end in .yaml")
     SCENARIOS.add(name, generator)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import shown, whole_number
+from d4orm_env.core.arrays import short_repr, whole_number
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.robot_types import find_robot
@@ -66,7 +66,7 @@ class Scenario:
             self._signature.bind_partial(0, DEFAULT_ROBOTS)
         except (TypeError, ValueError):
             raise ValueError(
-                f"scenario {self.name!r} is {shown(self.generator)}; it must be a callable "
+                f"scenario {self.name!r} is {short_repr(self.generator)}; it must be a callable "
                 "(seed, num_robots, **settings) that returns a Problem"
             ) from None
 
@@ -133,7 +133,9 @@ class Scenario:
             raise UnknownKeywordError(f"scenario {self.name!r}: {error}; give it by name") from None
         problem = self.generator(seed, *size, **settings)
         if not isinstance(problem, Problem):
-            raise ValueError(f"scenario {self.name!r} returned {shown(problem)}; it must return a d4orm_env.Problem")
+            raise ValueError(
+                f"scenario {self.name!r} returned {short_repr(problem)}; it must return a d4orm_env.Problem"
+            )
         if num_robots is not None and problem.num_robots != num_robots:
             raise ValueError(
                 f"scenario {self.name!r} returned a problem of {problem.num_robots} robots where num_robots is "

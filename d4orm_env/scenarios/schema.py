@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import Arrival
@@ -31,9 +31,9 @@ SQUARED_MAX = 1e18
 Number = Annotated[float, Field(ge=-FLOAT32_MAX, le=FLOAT32_MAX)]
 Squared = Annotated[float, Field(ge=-SQUARED_MAX, le=SQUARED_MAX)]
 Speed = Annotated[float, Field(allow_inf_nan=True)]
-Place = Annotated[list[Squared], Field(min_length=2, max_length=3)]
-PlanarPlace = Annotated[list[Number], Field(min_length=2, max_length=2)]
-SpatialPlace = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Position = Annotated[list[Squared], Field(min_length=2, max_length=3)]
+PlanarPosition = Annotated[list[Number], Field(min_length=2, max_length=2)]
+SpatialPosition = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class Entry(BaseModel):
@@ -46,9 +46,9 @@ class RobotEntry(Entry):
     """One robot. Lengths of ``start``, ``goal`` and ``velocity`` follow the model's dimension."""
 
     model: str
-    start: Place
-    goal: Place
-    velocity: Place | None = None
+    start: Position
+    goal: Position
+    velocity: Position | None = None
     heading: Number | None = None
     speed: Squared | None = None
     state: list[Number] | None = None
@@ -98,7 +98,7 @@ class RobotEntry(Entry):
 class RoundEntry(Entry):
     """A circle or vertical cylinder: centre x, y and radius [m]."""
 
-    center: PlanarPlace
+    center: PlanarPosition
     radius: Number
 
     @property
@@ -109,14 +109,14 @@ class RoundEntry(Entry):
 class SphereEntry(RoundEntry):
     """A sphere: centre x, y, z and radius [m]."""
 
-    center: SpatialPlace
+    center: SpatialPosition
 
 
 class BoxEntry(Entry):
     """An axis-aligned box, or the bounds of the world: two opposite corners [m]."""
 
-    lower: Place
-    upper: Place
+    lower: Position
+    upper: Position
 
     @model_validator(mode="after")
     def _corners_match(self) -> BoxEntry:
@@ -134,7 +134,7 @@ class BoxEntry(Entry):
 class PolygonEntry(Entry):
     """A simple polygon: its corners x, y in order, either way round [m]."""
 
-    corners: list[PlanarPlace] = Field(min_length=3)
+    corners: list[PlanarPosition] = Field(min_length=3)
 
 
 class WorldEntry(Entry):
@@ -146,7 +146,7 @@ class WorldEntry(Entry):
     cylinders: list[RoundEntry] = []
     boxes: list[BoxEntry] = []
     polygons: list[PolygonEntry] = []
-    origin: Place | None = None
+    origin: Position | None = None
 
     def build(self, dimension: int) -> World:
         kinds = ("circles", "spheres", "cylinders", "boxes")
@@ -280,5 +280,5 @@ def _explain(error: ValidationError) -> str:
     elif first["type"] == "value_error":
         message = str(first["ctx"]["error"])
     else:
-        message = f"{first['msg'][0].lower()}{first['msg'][1:]}, not {shown(first['input'])}"
+        message = f"{first['msg'][0].lower()}{first['msg'][1:]}, not {short_repr(first['input'])}"
     return f"{where}: {message}" if where else message

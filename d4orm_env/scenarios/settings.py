@@ -10,7 +10,7 @@ from typing import Any, SupportsFloat
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import positive_number, shown, whole_number
+from d4orm_env.core.arrays import positive_number, short_repr, whole_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem_checks import MAX_HORIZON, Arrival, check_arrival
 from d4orm_env.core.team import Team
@@ -157,7 +157,7 @@ def parsed(content: object) -> Footprint:
     """The footprint that a file means, such as ``{"shape": "box", "length": 0.5, "width": 0.25}``."""
     if not isinstance(content, dict) or not isinstance(content.get("shape"), str):
         example = "{shape: box, length: 0.5, width: 0.25}"
-        raise ValueError(f"footprint must be a mapping such as {example}, not {shown(content)}")
+        raise ValueError(f"footprint must be a mapping such as {example}, not {short_repr(content)}")
     kind = KINDS.get(content["shape"])
     if kind is None:
         raise unknown("footprint", content["shape"], KINDS)

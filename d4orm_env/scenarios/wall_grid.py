@@ -14,7 +14,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.placement import Mask
 from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
-from d4orm_env.scenarios.well_formed import lattice_step, populate, reach_of
+from d4orm_env.scenarios.well_formed import lattice_step, populate, safety_distance_of
 
 sparse: Any = LazyModule("scipy.sparse")
 csgraph: Any = LazyModule("scipy.sparse.csgraph")
@@ -159,7 +159,7 @@ def maze(
     width = bounded(corridor_width, "corridor_width")
     if cells is None:
         # Where two robots cannot pass each other, every place takes a dead end.
-        is_wide = width > 1.1 * (2 * reach_of(settings) + settings.spacing + settings.goal_radius)
+        is_wide = width > 1.1 * (2 * safety_distance_of(settings) + settings.spacing + settings.goal_radius)
         cells = default_squares((2.5 if is_wide else 12) * settings.num_robots, 6)
     columns, rows = grid_size(cells, "cells")
     share = positive_number(loops, "loops", zero_allowed=True, most=1.0)

@@ -13,7 +13,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.placement import Points, round_up
 from d4orm_env.scenarios.settings import MAX_COUNT, WALLS, Settings, bounded, grid_size, require_plane
-from d4orm_env.scenarios.well_formed import lattice_step, populate, reach_of
+from d4orm_env.scenarios.well_formed import lattice_step, populate, safety_distance_of
 
 DOOR_DEPTH = 0.2
 """Thickness of the wall that the door is in [m]."""
@@ -67,7 +67,7 @@ def _two_rooms(
     require_plane(settings)
     name, width = passage
     # A bay is deep enough that a robot in it lets another pass.
-    separation = settings.spacing + 2 * reach_of(settings)
+    separation = settings.spacing + 2 * safety_distance_of(settings)
     depth = max(width, separation - width + 0.1) if bays else 0.0
     least = width + 2 * depth
     if room_size is None:
@@ -75,7 +75,7 @@ def _two_rooms(
     room = bounded(room_size, "room_size")
     if room <= least:
         raise ValueError(f"room_size is {room:g}; a {name} of {width:g} with its bays needs {round_up(least)}")
-    bay = max(2 * width, 2 * reach_of(settings) + width)
+    bay = max(2 * width, 2 * safety_distance_of(settings) + width)
     if bays * bay * 1.2 > length:
         raise ValueError(
             f"{bays} bays do not fit along a length of {length:g}; use length={round_up(bays * bay * 1.2)}"
@@ -87,7 +87,7 @@ def _two_rooms(
     boxes = np.vstack([above, below[:, [0, 3, 2, 1]] * [1, -1, 1, -1]])
     corner = np.array([length / 2 + room, room / 2])
     world = World(2, boxes=boxes, lower=-corner, upper=corner)
-    clear = length / 2 + reach_of(settings)
+    clear = length / 2 + safety_distance_of(settings)
     # One half drives through after the other, in a row.
     travel = 2 * (length + 2 * room) + settings.num_robots * settings.spacing
     return populate(settings, world, step, travel, "a larger room_size", exchange=(-clear, clear))

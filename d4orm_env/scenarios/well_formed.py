@@ -56,7 +56,7 @@ class _Placing:
 
     def __init__(self, inside: Mask, separation: float, most: int) -> None:
         self._label, self._dilation = ndimage.label, ndimage.binary_dilation
-        self.places, self.count = np.empty((most, inside.ndim), np.int64), 0
+        self.positions, self.count = np.empty((most, inside.ndim), np.int64), 0
         # Whoever goes round a place finds a path within the wide window about it, or is held to find none.
         self._narrow = 2 * int(separation) + 1
         self._wide = max(self._narrow, WINDOW[inside.ndim])
@@ -66,46 +66,46 @@ class _Placing:
         self._wide_disc = (offsets * offsets).sum(axis=0) <= separation * separation
         self._disc = self._wide_disc[self._about(np.zeros(inside.ndim, np.int64), self._narrow)]
 
-    def add(self, place: NDArray[np.int64]) -> bool:
+    def add(self, position: NDArray[np.int64]) -> bool:
         """Take a place if that leaves every robot a path."""
-        if self._taken[tuple(place + self._wide)] or not self._goes_round(place):
+        if self._taken[tuple(position + self._wide)] or not self._goes_round(position):
             return False
-        taken = self._taken[self._about(place, self._narrow)]
+        taken = self._taken[self._about(position, self._narrow)]
         taken += self._disc
-        self.places[self.count] = place
-        others = self.places[: self.count + 1]
-        if all(self._in_touch(other) for other in others[np.abs(others - place).max(axis=1) <= self._narrow]):
+        self.positions[self.count] = position
+        others = self.positions[: self.count + 1]
+        if all(self._in_touch(other) for other in others[np.abs(others - position).max(axis=1) <= self._narrow]):
             self.count += 1
             return True
         taken -= self._disc
         return False
 
-    def _about(self, place: NDArray[np.int64], window: int) -> tuple[slice, ...]:
-        return tuple(slice(index + self._wide - window, index + self._wide + window + 1) for index in place)
+    def _about(self, position: NDArray[np.int64], window: int) -> tuple[slice, ...]:
+        return tuple(slice(index + self._wide - window, index + self._wide + window + 1) for index in position)
 
-    def _goes_round(self, place: NDArray[np.int64]) -> bool:
+    def _goes_round(self, position: NDArray[np.int64]) -> bool:
         """Check whether all that a new disc touches of the untaken region is connected around it."""
-        about = self._about(place, self._wide)
+        about = self._about(position, self._wide)
         untaken = self._free[about] & (self._taken[about] == 0)
         regions, _ = self._label(untaken & ~self._wide_disc)
         touched = regions[self._dilation(untaken & self._wide_disc)]
         return len(np.unique(touched[touched > 0])) == 1
 
-    def _in_touch(self, place: NDArray[np.int64]) -> bool:
+    def _in_touch(self, position: NDArray[np.int64]) -> bool:
         """Check whether a robot gets from a place to the untaken region through no disc but its own."""
-        about = self._about(place, self._narrow)
+        about = self._about(position, self._narrow)
         free, taken = self._free[about], self._taken[about]
         untaken = free & (taken == 0)
         regions, _ = self._label(untaken | (free & (taken == 1) & self._disc))
-        return bool((regions[untaken] == regions[(self._narrow,) * place.size]).any())
+        return bool((regions[untaken] == regions[(self._narrow,) * position.size]).any())
 
 
-def draw_places(
+def draw_positions(
     random: np.random.Generator, space: FreeSpace, groups: Sequence[tuple[Mask | None, int]], separation: float
 ) -> Points:
     """Random places ``(P, d)``, far enough apart that a robot gets from each to each while robots are on all others.
 
-    Each of the ``groups`` has the part of the region that its places are drawn from, or ``None`` for all of it, and
+    Each of the ``groups`` has the part of the region that its positions are drawn from, or ``None`` for all of it, and
     their number. Robots that pass by keep the ``separation`` to a place [m]. There are fewer than asked for if there is
     no room.
     """
@@ -120,7 +120,7 @@ def draw_places(
             placing.add(np.array(index))
         if placing.count < wanted:
             break
-    return space.points(placing.places[: placing.count])
+    return space.points(placing.positions[: placing.count])
 
 
 def reserve_of(settings: Settings) -> float:
@@ -128,7 +128,7 @@ def reserve_of(settings: Settings) -> float:
     return RESERVE * settings.team.largest_radius
 
 
-def reach_of(settings: Settings) -> float:
+def safety_distance_of(settings: Settings) -> float:
     """Distance that the centre of the largest robot keeps to obstacles [m]."""
     return float(np.max(settings.team.radius)) + settings.margin + reserve_of(settings)
 
@@ -142,13 +142,14 @@ def lattice_step(settings: Settings, sides: ArrayLike, passage: tuple[str, float
     step = max(settings.spacing / 4, root(float(lengths.prod()) / ENOUGH_POINTS, len(lengths)))
     if passage is None:
         return step
-    (name, width), reach = passage, reach_of(settings)
-    if width < 2.2 * reach:
+    (name, width), safety_distance = passage, safety_distance_of(settings)
+    if width < 2.2 * safety_distance:
         raise ValueError(
             f"scenario {settings.scenario!r}: robots of radius {np.max(settings.team.radius):g} m with margin "
-            f"{settings.margin:g} m do not fit through a {name} of {width:g} m; use {name}={round_up(2.2 * reach)}"
+            f"{settings.margin:g} m do not fit through a {name} of {width:g} m; "
+            f"use {name}={round_up(2.2 * safety_distance)}"
         )
-    return min(step, 0.99 * (width / 2 - reach))
+    return min(step, 0.99 * (width / 2 - safety_distance))
 
 
 def populate(
@@ -171,15 +172,15 @@ def populate(
             other way round; everywhere by default.
     """
     world = with_obstacles(settings, world)
-    starts, goals = draw_team(settings, free_space(world, reach_of(settings), step), remedy, exchange)
+    starts, goals = draw_team(settings, free_space(world, safety_distance_of(settings), step), remedy, exchange)
     return build(settings, Layout(starts, goals, world, travel))
 
 
-def with_obstacles(settings: Settings, world: World, places: Points | None = None) -> World:
+def with_obstacles(settings: Settings, world: World, positions: Points | None = None) -> World:
     """A world with bounds and the random obstacles asked for, clear of starts and goals if they are known."""
     low, high = world.bounds.astype(np.float64)
-    places = np.empty((0, world.dimension)) if places is None else places
-    return with_random_obstacles(settings, world, places, PlacementArea((high - low) / 2, centre=(low + high) / 2))
+    positions = np.empty((0, world.dimension)) if positions is None else positions
+    return with_random_obstacles(settings, world, positions, PlacementArea((high - low) / 2, centre=(low + high) / 2))
 
 
 def draw_team(
@@ -201,10 +202,10 @@ def draw_team(
         number = np.r_[:half, count + half : 2 * count, count : count + half, half:count]
     most = 0
     for _ in range(ROUNDS):
-        places = draw_places(random, space, groups, separation)
-        most = max(most, len(places))
-        if len(places) == 2 * count:
-            return places[number[:count]], places[number[count:]]
+        positions = draw_positions(random, space, groups, separation)
+        most = max(most, len(positions))
+        if len(positions) == 2 * count:
+            return positions[number[:count]], positions[number[count:]]
     raise ValueError(
         f"scenario {settings.scenario!r}: only {most} of {2 * count} starts and goals of robots of radius "
         f"{np.max(settings.team.radius):g} m with margin {settings.margin:g} m fit in such that all robots get by; "

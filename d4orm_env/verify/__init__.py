@@ -145,8 +145,8 @@ class _Course:
         """``(T, S+1, B)`` headings, a docked robot's as it docked [rad]."""
         (reading, body), ends = self._readings(docking), self._motion.end_headings
         headings = self._motion.headings(steps, self._sub_steps)
-        stands = np.arange(len(ends))[steps, None] >= docking.steps[reading]
-        return np.where(stands[:, None], ends[stop[reading] - 1, body], headings[:, :, body])
+        absorbed = np.arange(len(ends))[steps, None] >= docking.steps[reading]
+        return np.where(absorbed[:, None], ends[stop[reading] - 1, body], headings[:, :, body])
 
     def _hitched(self, docking: Docking, turn: Floats) -> Floats:
         """``(T, S+1, B, d)`` reference points of the bodies relative to those of their robots [m]."""
@@ -173,15 +173,15 @@ class _Course:
         horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
         stop = np.minimum(docking.steps, horizon)
         horizon = min(horizon, int(docking.steps.max()) + 1, self._moving + 1)
-        docked = self.ends[stop, robot]
+        arrived = self.ends[stop, robot]
         for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
-            displacement, place = self._displacement(steps), self.ends[:-1][steps]
+            displacement, position = self._displacement(steps), self.ends[:-1][steps]
             if len(robot) > displacement.shape[2]:  # copying is not free, and one reading each is the rule
-                displacement, place = displacement[:, :, robot], place[:, robot]
-            stands = np.arange(horizon)[steps, None] >= docking.steps
-            displacement[np.broadcast_to(stands[:, None], displacement.shape[:3])] = 0.0
-            place = np.where(stands[..., None], docked, place)
-            path, reach, turn = place[:, None] + displacement, norm(displacement).max(axis=1), np.zeros((0, 0, 0))
+                displacement, position = displacement[:, :, robot], position[:, robot]
+            absorbed = np.arange(horizon)[steps, None] >= docking.steps
+            displacement[np.broadcast_to(absorbed[:, None], displacement.shape[:3])] = 0.0
+            position = np.where(absorbed[..., None], arrived, position)
+            path, reach, turn = position[:, None] + displacement, norm(displacement).max(axis=1), np.zeros((0, 0, 0))
             if self._shapes is not None:
                 turn, (reading, body) = self._turns(steps, docking, stop), self._readings(docking)
                 if len(body) > len(robot):

@@ -178,9 +178,9 @@ class Pairs(Watch):
         lower, upper = lower - widening, upper + widening
         # Boxes that overlap along one axis: each with those that begin before it ends.
         order = np.argsort(lower[:, axis], kind="stable")
-        places = np.arange(len(order))
-        count = np.searchsorted(lower[order, axis], upper[order, axis], side="right") - places - 1
-        first = np.repeat(places, count)
+        positions = np.arange(len(order))
+        count = np.searchsorted(lower[order, axis], upper[order, axis], side="right") - positions - 1
+        first = np.repeat(positions, count)
         second = first + 1 + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         a, b = order[first], order[second]
         near = np.all((lower[a] <= upper[b]) & (lower[b] <= upper[a]), axis=1)
@@ -194,8 +194,8 @@ class Pairs(Watch):
         return norm(stretch.path[0, 0, a] - stretch.path[0, 0, b]) - self._radius[a] - self._radius[b]
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
-        place = stretch.path[:, 0]
-        distance = norm(place[steps, self.rows[pairs]] - place[steps, self.columns[pairs]])
+        position = stretch.path[:, 0]
+        distance = norm(position[steps, self.rows[pairs]] - position[steps, self.columns[pairs]])
         return distance - self._size[pairs]
 
     def bodies(self, pairs: Indices) -> Sequence[Indices]:
@@ -234,7 +234,7 @@ class Static(Watch):
         return column
 
     @abstractmethod
-    def distance(self, places: Floats, columns: Indices) -> Floats:
+    def distance(self, positions: Floats, columns: Indices) -> Floats:
         """Signed distance from places to the surface of the things in ``columns`` [m]."""
 
     @abstractmethod

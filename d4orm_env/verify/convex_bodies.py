@@ -47,8 +47,8 @@ class ConvexBodies:
             self.corners[index], self.rounding[index], self.semi_axes[index], self.outer[index], self.stretch[index]
         )
 
-    def placed(self, index: Indices, place: Floats, turn: Floats) -> Floats:
-        """``(N, n, 2)`` corners of bodies at places ``(N, 2)`` turned by ``(N,)``."""
+    def placed(self, index: Indices, position: Floats, turn: Floats) -> Floats:
+        """``(N, n, 2)`` corners of bodies at positions ``(N, 2)`` turned by ``(N,)``."""
         sine, cosine = (part[:, None] for part in portable.sin_cos(turn))
         x, y = self.corners[index, :, 0], self.corners[index, :, 1]
-        return place[:, None] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+        return position[:, None] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)

@@ -31,16 +31,16 @@ class Round(Static):
         super().__init__("obstacle contact", robot, radius, [f"{shape}[{index}]" for index in range(len(obstacles))])
         self._centres, self._sizes = obstacles[:, :-1], obstacles[:, -1]
 
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        return norm(self._offset(places, columns)) - self._sizes[columns]
+    def distance(self, positions: Floats, columns: Indices) -> Floats:
+        return norm(self._offset(positions, columns)) - self._sizes[columns]
 
     def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         distance, fraction = closest_approach(self._offset(start, columns), self._offset(end, columns))
         return distance - self._sizes[columns], fraction
 
-    def _offset(self, places: Floats, columns: Indices) -> Floats:
+    def _offset(self, positions: Floats, columns: Indices) -> Floats:
         # A cylinder is a circle seen from above.
-        return places[..., : self._centres.shape[1]] - self._centres[columns]
+        return positions[..., : self._centres.shape[1]] - self._centres[columns]
 
 
 class Boxes(Static):
@@ -50,8 +50,8 @@ class Boxes(Static):
         super().__init__("obstacle contact", robot, radius, [f"boxes[{index}]" for index in range(len(boxes))])
         self._boxes = boxes
 
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        return box_distance(places, self._boxes[columns])
+    def distance(self, positions: Floats, columns: Indices) -> Floats:
+        return box_distance(positions, self._boxes[columns])
 
     def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         return box_approach(start, end, self._boxes[columns])
@@ -64,8 +64,8 @@ class PolygonObstacle(Static):
         super().__init__("obstacle contact", robot, radius, [name])
         self._corners = corners
 
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        return polygon_distance(places, self._corners)
+    def distance(self, positions: Floats, columns: Indices) -> Floats:
+        return polygon_distance(positions, self._corners)
 
     def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         return polygon_approach(start, end, self._corners)
@@ -79,12 +79,12 @@ class Bounds(Static):
         names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
         super().__init__("bounds contact", robot, radius, names)
         self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
-        self._place = np.concatenate([lower, -upper])
+        self._position = np.concatenate([lower, -upper])
 
-    def distance(self, places: Floats, columns: Indices) -> Floats:
-        axis = np.broadcast_to(self._axis[columns], places.shape[:-1])
-        value = np.take_along_axis(places, axis[..., None], axis=-1)[..., 0]
-        return self._sign[columns] * value - self._place[columns]
+    def distance(self, positions: Floats, columns: Indices) -> Floats:
+        axis = np.broadcast_to(self._axis[columns], positions.shape[:-1])
+        value = np.take_along_axis(positions, axis[..., None], axis=-1)[..., 0]
+        return self._sign[columns] * value - self._position[columns]
 
     def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:
         before, after = self.distance(start, columns), self.distance(end, columns)

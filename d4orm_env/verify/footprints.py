@@ -33,16 +33,16 @@ class Turning(Watch):
     shapes: ConvexBodies
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
-        """``(N,)`` gap of these pairs, their bodies at places ``(N, d)`` and headings ``(N,)``."""
+        """``(N,)`` gap of these pairs, their bodies at positions ``(N, d)`` and headings ``(N,)``."""
         raise NotImplementedError
 
-    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
-        """``(N,)`` gap of the discs or balls round these pairs, no more than theirs, each body at places ``(N, d)``."""
+    def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
+        """``(N,)`` gap of the discs or balls round these pairs, no more than theirs, bodies at positions ``(N, d)``."""
         raise NotImplementedError
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
-        places = [stretch.path[steps, 0, bodies] for bodies in self.bodies(pairs)]
-        gap = self.outer_gap(pairs, *places)
+        positions = [stretch.path[steps, 0, bodies] for bodies in self.bodies(pairs)]
+        gap = self.outer_gap(pairs, *positions)
 
         def ask(some: Indices) -> None:
             first = np.zeros(len(some), np.intp)
@@ -60,10 +60,10 @@ class Turning(Watch):
         after = np.minimum(sub_steps + 1, stretch.path.shape[1] - 1)
         poses = []
         for bodies in self.bodies(pairs):
-            place = stretch.path[steps, sub_steps, bodies]
-            place = place + share[:, None] * (stretch.path[steps, after, bodies] - place)
+            position = stretch.path[steps, sub_steps, bodies]
+            position = position + share[:, None] * (stretch.path[steps, after, bodies] - position)
             turn = stretch.turn[steps, sub_steps, bodies]
-            poses.append((place, turn + share * (stretch.turn[steps, after, bodies] - turn)))
+            poses.append((position, turn + share * (stretch.turn[steps, after, bodies] - turn)))
         return self.between(pairs, poses)
 
     def _travel(self, stretch: Stretch, steps: Indices, pairs: Indices) -> Floats:
@@ -111,8 +111,8 @@ class TurningPairs(Turning, Pairs):
         super().__init__(robot, shapes.outer)
         self.shapes = shapes
 
-    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
-        return norm(places[0] - places[1]) - WIDER * self._size[pairs]
+    def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
+        return norm(positions[0] - positions[1]) - WIDER * self._size[pairs]
 
     def near_gap(self, stretch: Stretch, a: Indices, b: Indices) -> Floats:
         poses = [(stretch.path[0, 0, bodies], stretch.turn[0, 0, bodies]) for bodies in (a, b)]
@@ -122,11 +122,11 @@ class TurningPairs(Turning, Pairs):
         return self._between_bodies(self.rows[pairs], self.columns[pairs], poses)
 
     def _between_bodies(self, a: Indices, b: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
-        (place, turn), (its_place, its_turn) = poses
+        (position, turn), (its_position, its_turn) = poses
         shapes = self.shapes
-        if place.shape[1] == 3:
-            return ball_gap(its_place - place, shapes.semi_axes[a], shapes.semi_axes[b])
-        cores = shapes.placed(a, np.zeros_like(place), turn), shapes.placed(b, its_place - place, its_turn)
+        if position.shape[1] == 3:
+            return ball_gap(its_position - position, shapes.semi_axes[a], shapes.semi_axes[b])
+        cores = shapes.placed(a, np.zeros_like(position), turn), shapes.placed(b, its_position - position, its_turn)
         return core_gap(*cores) - shapes.rounding[a] - shapes.rounding[b]
 
 
@@ -137,7 +137,7 @@ class TurningStatic(Turning, Static):
         super().__init__(kind, robot, shapes.outer, names)
         self.shapes = shapes
 
-    def distance(self, places: Floats, columns: Indices) -> Floats:
+    def distance(self, positions: Floats, columns: Indices) -> Floats:
         raise NotImplementedError("the gap of a footprint is not that of its place")
 
     pass_by = distance  # type: ignore[assignment]
@@ -152,20 +152,20 @@ class Obstacles(TurningStatic):
         self._round = np.asarray(world.circles if world.dimension == 2 else world.spheres, np.float64)
         self._cylinders, self._boxes = np.asarray(world.cylinders, np.float64), np.asarray(world.boxes, np.float64)
 
-    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
-        gaps, (place,) = np.empty(len(pairs)), places
+    def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
+        gaps, (position,) = np.empty(len(pairs)), positions
         for kind, here, thing in self._kinds(pairs):
-            gaps[here] = self._distance(kind, thing, place[here])
+            gaps[here] = self._distance(kind, thing, position[here])
         return gaps - WIDER * self.shapes.outer[self.rows[pairs]]
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
-        ((place, turn),), gaps = poses, np.empty(len(pairs))
+        ((position, turn),), gaps = poses, np.empty(len(pairs))
         ways: dict[str, _Gap] = {"polygons": self._to_polygon, "cylinders": self._to_cylinder}
         planar = self._world.dimension == 2
         ways |= {"circles": self._to_circle, "boxes": self._to_rectangle if planar else self._to_box}
         ways["spheres"] = self._to_ball
         for kind, here, thing in self._kinds(pairs):
-            gaps[here] = ways[kind](thing, self.rows[pairs[here]], place[here], turn[here])
+            gaps[here] = ways[kind](thing, self.rows[pairs[here]], position[here], turn[here])
         return gaps
 
     def _kinds(self, pairs: Indices) -> Iterator[tuple[str, Indices, Indices]]:
@@ -178,38 +178,38 @@ class Obstacles(TurningStatic):
                 yield kind, here, column[here] - first
             first = end
 
-    def _distance(self, kind: str, thing: Indices, place: Floats) -> Floats:
+    def _distance(self, kind: str, thing: Indices, position: Floats) -> Floats:
         """``(N,)`` signed distance from places to obstacles."""
         if kind == "boxes":
-            return box_distance(place, self._boxes[thing])
+            return box_distance(position, self._boxes[thing])
         if kind == "polygons":
             distance = np.empty(len(thing))
             for polygon in np.unique(thing):
                 here = np.flatnonzero(thing == polygon)
                 corners = np.asarray(self._world.polygons[polygon], np.float64)
-                distance[here] = polygon_distance(place[here], corners)
+                distance[here] = polygon_distance(position[here], corners)
             return distance
         things = self._cylinders if kind == "cylinders" else self._round
         centre = things[thing, :-1]
-        return norm(place[:, : centre.shape[1]] - centre) - things[thing, -1]
+        return norm(position[:, : centre.shape[1]] - centre) - things[thing, -1]
 
-    def _to_circle(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
-        core = self.shapes.placed(body, np.zeros_like(place), turn)
-        centre = (self._round[thing, :2] - place)[:, None]
+    def _to_circle(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
+        core = self.shapes.placed(body, np.zeros_like(position), turn)
+        centre = (self._round[thing, :2] - position)[:, None]
         return core_gap(core, centre) - self.shapes.rounding[body] - self._round[thing, 2]
 
-    def _to_rectangle(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
-        left, low, right, high = (self._boxes[thing] - np.tile(place, 2)).T
+    def _to_rectangle(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
+        left, low, right, high = (self._boxes[thing] - np.tile(position, 2)).T
         corners = np.stack([left, low, right, low, right, high, left, high], axis=-1).reshape(-1, 4, 2)
-        core = self.shapes.placed(body, np.zeros_like(place), turn)
+        core = self.shapes.placed(body, np.zeros_like(position), turn)
         return core_gap(core, corners) - self.shapes.rounding[body]
 
-    def _to_polygon(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
+    def _to_polygon(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
         gaps = np.empty(len(thing))
         for polygon in np.unique(thing):
             here = np.flatnonzero(thing == polygon)
             corners = np.asarray(self._world.polygons[polygon], np.float64)
-            core, least = self.shapes.placed(body[here], place[here], turn[here]), np.full(len(here), np.inf)
+            core, least = self.shapes.placed(body[here], position[here], turn[here]), np.full(len(here), np.inf)
             for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
                 edge = np.broadcast_to(np.stack([begin, end]), (len(here), 2, 2))
                 least = np.minimum(least, core_gap(core, edge))
@@ -218,18 +218,18 @@ class Obstacles(TurningStatic):
             gaps[here] = np.where(inside, -least, least) - self.shapes.rounding[body[here]]
         return gaps
 
-    def _to_ball(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
+    def _to_ball(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
         del turn
-        return ball_gap(self._round[thing, :3] - place, self.shapes.semi_axes[body], _ball(self._round[thing, 3]))
+        return ball_gap(self._round[thing, :3] - position, self.shapes.semi_axes[body], _ball(self._round[thing, 3]))
 
-    def _to_cylinder(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
+    def _to_cylinder(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
         del turn
-        offset = np.pad(self._cylinders[thing, :2] - place[:, :2], ((0, 0), (0, 1)))
+        offset = np.pad(self._cylinders[thing, :2] - position[:, :2], ((0, 0), (0, 1)))
         return ball_gap(offset, self.shapes.semi_axes[body], _ball(self._cylinders[thing, 2]))
 
-    def _to_box(self, thing: Indices, body: Indices, place: Floats, turn: Floats) -> Floats:
+    def _to_box(self, thing: Indices, body: Indices, position: Floats, turn: Floats) -> Floats:
         del turn
-        offset = np.clip(place, self._boxes[thing, :3], self._boxes[thing, 3:]) - place
+        offset = np.clip(position, self._boxes[thing, :3], self._boxes[thing, 3:]) - position
         axes = self.shapes.semi_axes[body]
         factor = np.maximum(norm(offset / axes), 1e-6)
         return np.maximum(norm(offset) * (1 - 1 / factor), -axes.min(axis=1))
@@ -242,25 +242,27 @@ class Sides(TurningStatic):
         axes = "xyz"[: len(lower)]
         names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
         super().__init__("bounds contact", robot, shapes, names)
-        self._place, self._dimension = np.concatenate([lower, -upper]), len(lower)
+        self._position, self._dimension = np.concatenate([lower, -upper]), len(lower)
 
-    def _inside(self, pairs: Indices, place: Floats) -> Floats:
-        """``(N,)`` how far places ``(N, d)`` are inside of their sides."""
+    def _inside(self, pairs: Indices, position: Floats) -> Floats:
+        """``(N,)`` how far positions ``(N, d)`` are inside of their sides."""
         side, axis = np.divmod(self.columns[pairs], self._dimension)
-        return np.where(side == 0, 1.0, -1.0) * place[np.arange(len(axis)), axis] - self._place[self.columns[pairs]]
+        return (
+            np.where(side == 0, 1.0, -1.0) * position[np.arange(len(axis)), axis] - self._position[self.columns[pairs]]
+        )
 
-    def outer_gap(self, pairs: Indices, *places: Floats) -> Floats:
-        return self._inside(pairs, *places) - WIDER * self.shapes.outer[self.rows[pairs]]
+    def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
+        return self._inside(pairs, *positions) - WIDER * self.shapes.outer[self.rows[pairs]]
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
-        ((place, turn),) = poses
+        ((position, turn),) = poses
         column, body = self.columns[pairs], self.rows[pairs]
         side, axis = np.divmod(column, self._dimension)
         sign = np.where(side == 0, 1.0, -1.0)
-        at = self._inside(pairs, place)
+        at = self._inside(pairs, position)
         if self._dimension == 3:
             return at - self.shapes.semi_axes[body, axis]
-        corners = self.shapes.placed(body, np.zeros_like(place), turn)
+        corners = self.shapes.placed(body, np.zeros_like(position), turn)
         along = np.take_along_axis(corners, axis[:, None, None], axis=2)[..., 0]
         return at + (sign[:, None] * along).min(axis=1) - self.shapes.rounding[body]
 

@@ -62,11 +62,11 @@ class Candidate:
 
 def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
     """Roll controls ``(H, K, m)`` out and evaluate them: failures at some steps, a solution at all."""
-    reach = PLAN_REACH * problem.team.control_limits
-    bounded = np.clip(controls, -reach, reach)
+    safety_distance = PLAN_REACH * problem.team.control_limits
+    bounded = np.clip(controls, -safety_distance, safety_distance)
     trajectory = engine.rollout(problem, bounded)
-    docked = trajectory.arrived[:-1, :, None] & problem.docks
-    planned = np.where(docked, np.float32(0), bounded)
+    arrived = trajectory.arrived[:-1, :, None] & problem.docks
+    planned = np.where(arrived, np.float32(0), bounded)
     failed = failed_robots(trajectory, check_interval)
     report = None if failed_robots(trajectory).any() else verify(problem, trajectory.controls)
     return Candidate(planned, trajectory.controls, trajectory, failed, report)
@@ -100,8 +100,8 @@ def _not_there(problem: Problem, trajectory: Trajectory, robot: int, unreachable
         missed = 2 * np.pi * abs(turns - np.round(turns))
         yield f"ends {gap:.2g} m from its goal" + (f", {missed:.2g} rad off" if missed > 0 else "")
     if unreachable:
-        reach = problem.team.radius[robot] + problem.margin
-        yield f"has no path from start to goal that is {reach:.4g} m clear of obstacles"
+        safety_distance = problem.team.radius[robot] + problem.margin
+        yield f"has no path from start to goal that is {safety_distance:.4g} m clear of obstacles"
 
 
 def _too_near(problem: Problem, trajectory: Trajectory, robot: int, near: Graph) -> Iterator[str]:
@@ -111,6 +111,6 @@ def _too_near(problem: Problem, trajectory: Trajectory, robot: int, near: Graph)
         return
     if near[robot]:
         yield f"comes within the margin of {', '.join(f'robot_{other}' for other in sorted(near[robot]))}"
-    reach = problem.team.radius[robot] + problem.margin
-    if problem.world.clearance(trajectory.positions[1:, robot]).min() <= reach:
+    safety_distance = problem.team.radius[robot] + problem.margin
+    if problem.world.clearance(trajectory.positions[1:, robot]).min() <= safety_distance:
         yield "comes within the margin of an obstacle or the bounds"

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, shown
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, short_repr
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -104,7 +104,7 @@ class Controller:
         **settings: Any,
     ) -> None:
         if mode not in get_args(Mode):
-            raise ValueError(f"mode is {shown(mode)}; choose one of {', '.join(get_args(Mode))}")
+            raise ValueError(f"mode is {short_repr(mode)}; choose one of {', '.join(get_args(Mode))}")
         self.mode = mode
         default = 0.5 if tracker else 0.2 if mode == "nominal" else 0.0
         self.reserve = default if reserve is None else positive_number(reserve, "reserve", zero_allowed=True, most=0.9)

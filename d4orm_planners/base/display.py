@@ -73,8 +73,8 @@ class DisplayMixin:
             denoising: Denoising of the plan, shown before the motion; see :mod:`d4orm_planners.sampling.denoising`.
         """
         title = self.title if title is None else title
-        goals, marks = getattr(self, "goals", None), getattr(self, "marks", None)
-        bodies = None if marks is None else marks.bodies
+        goals, events = getattr(self, "goals", None), getattr(self, "events", None)
+        bodies = None if events is None else events.bodies
         figures = joined(self.key_figures)
         return replay.motion(
             self.problem, self.trajectory, title, figures, goals=goals, denoising=denoising, bodies=bodies

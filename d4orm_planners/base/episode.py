@@ -12,11 +12,11 @@ import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import BoolArray, FloatArray, shown, whole_number
+from d4orm_env.core.arrays import BoolArray, FloatArray, short_repr, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count, outcome_rows
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, accelerations, mean_squared_jerk, mean_stretch
-from d4orm_env.disturbances.disturbance import marks_of
+from d4orm_env.disturbances.disturbance import events_of
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
@@ -43,7 +43,7 @@ class Episode(DisplayMixin):
         observations: Observations of all agents at the reset and after every step.
         infos: Infos likewise.
         goals: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode.
-        marks: Its disturbances, for pictures; ``None`` without disturbances.
+        events: Its disturbances, for pictures; ``None`` without disturbances.
     """
 
     problem: Problem
@@ -52,7 +52,7 @@ class Episode(DisplayMixin):
     observations: tuple[dict[str, FloatArray], ...]
     infos: tuple[AgentInfos, ...]
     goals: FloatArray
-    marks: DisturbanceEvents | None = None
+    events: DisturbanceEvents | None = None
 
     @property
     def title(self) -> str:
@@ -102,7 +102,7 @@ def physics_module(physics: str) -> Any:
         ImportError: If it needs a library that is not installed.
     """
     if physics not in PHYSICS:
-        raise ValueError(f"physics is {shown(physics)}; choose one of {', '.join(PHYSICS)}")
+        raise ValueError(f"physics is {short_repr(physics)}; choose one of {', '.join(PHYSICS)}")
     return navigation_v0 if physics == "model" else import_module(f"d4orm_env.{physics}")
 
 
@@ -123,7 +123,9 @@ def open_env(problem: Problem, physics: str = "model", policy: Policy | None = N
     if isinstance(policy, Policy):  # a user's own may have no more than reset and act
         options = {**policy.observation_options(problem), **options}
     if "ray_range" in options and not options.get("observed_rays"):
-        raise ValueError(f"ray_range is {shown(options['ray_range'])}, and robots have no rays; give observed_rays too")
+        raise ValueError(
+            f"ray_range is {short_repr(options['ray_range'])}, and robots have no rays; give observed_rays too"
+        )
     return physics_module(physics).parallel_env(problem=problem, **options)
 
 
@@ -147,7 +149,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
     """
     whole_number(seed, "seed", 0)
     if not hasattr(env, "reset"):
-        raise ValueError(f"env is {shown(env)}; give the environment first, then the policy")
+        raise ValueError(f"env is {short_repr(env)}; give the environment first, then the policy")
     if isinstance(env, gymnasium.Env):
         env = _parallel(env)
     if physics is not None:
@@ -171,9 +173,9 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
     trajectory = _trajectory(problem, joints, outcomes)
     jerk = mean_squared_jerk(accelerations(problem, trajectory), trajectory.arrived, problem.dt)
     metrics = {**env.unwrapped.metrics(), "mean_squared_jerk": jerk}
-    marks = None if all(part is None for part in effects[0]) else marks_of(effects, problem)
+    events = None if all(part is None for part in effects[0]) else events_of(effects, problem)
     goals = np.stack([joint.goals for joint in joints])
-    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals, marks)
+    return Episode(problem, trajectory, metrics, tuple(all_observations), tuple(all_infos), goals, events)
 
 
 def _parallel(env: gymnasium.Env[Any, Any]) -> ParallelEnv:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TypeGuard
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.registry import Registry
 from d4orm_planners.base.planner import Planner
 
@@ -16,13 +16,13 @@ def is_planner_class(thing: object) -> TypeGuard[type[Planner]]:
 
 def _admit_planner(name: str, thing: object) -> type[Planner]:
     if not is_planner_class(thing):
-        raise ValueError(f"planner {name!r} is {shown(thing)}; give a subclass of d4orm_planners.Planner")
+        raise ValueError(f"planner {name!r} is {short_repr(thing)}; give a subclass of d4orm_planners.Planner")
     return thing
 
 
 def _admit_policy(name: str, thing: object) -> object:
     if not (callable(thing) or hasattr(thing, "act")):
-        raise ValueError(f"policy {name!r} is {shown(thing)}; give a Policy, or a function that is or makes one")
+        raise ValueError(f"policy {name!r} is {short_repr(thing)}; give a Policy, or a function that is or makes one")
     return thing
 
 

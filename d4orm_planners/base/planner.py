@@ -9,7 +9,7 @@ from typing import Any, ClassVar, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, duration, shown, whole_number
+from d4orm_env.core.arrays import FloatArray, duration, short_repr, whole_number
 from d4orm_env.core.infeasibility import prepare_proofs, prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.candidate import Candidate
@@ -139,7 +139,7 @@ class Planner(ABC):
             ValueError: If an argument makes no sense, or there is a watcher and another engine; the message names it.
         """
         if not isinstance(problem, Problem):
-            raise ValueError(f"problem is {shown(problem)}; give a Problem, such as make_problem() returns")
+            raise ValueError(f"problem is {short_repr(problem)}; give a Problem, such as make_problem() returns")
         limit = None if time_limit is None else duration(time_limit, "time_limit")
         most = (
             self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)

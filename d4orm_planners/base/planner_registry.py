@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias, TypeVar
 
-from d4orm_env.core.arrays import duration, shown
+from d4orm_env.core.arrays import duration, short_repr
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
 from d4orm_env.core.registry import load_reference, source_digest, written
 from d4orm_planners.base.fingerprint import attributes
@@ -223,7 +223,7 @@ def _configured(
     """
     if preset is not None and not (isinstance(preset, str) and preset in presets):
         remedy = f"choose one of {', '.join(presets)}" if presets else "it has none, so leave it out"
-        raise ValueError(f"preset {shown(preset)} of {owner} is unknown; {remedy}{did_you_mean(preset, presets)}")
+        raise ValueError(f"preset {short_repr(preset)} of {owner} is unknown; {remedy}{did_you_mean(preset, presets)}")
     settings = NOTHING if preset is None else presets[preset]
     known = config_class.setting_names({**settings, **config})
     applying = {name: value for name, value in settings.items() if name in known}
@@ -251,7 +251,7 @@ def _check_keywords(kind: Callable[..., object], config: Mapping[str, object], o
         signature = inspect.signature(kind)
     except (TypeError, ValueError):
         raise ValueError(
-            f"{owner} is {shown(kind)}, which does not say what it takes; give a Policy of yours"
+            f"{owner} is {short_repr(kind)}, which does not say what it takes; give a Policy of yours"
         ) from None
     parameters = signature.parameters
     if not parameters:
@@ -267,7 +267,7 @@ def _check_keywords(kind: Callable[..., object], config: Mapping[str, object], o
 
 def _refuse_settings(config: Mapping[str, object], owner: str) -> None:
     if config:
-        raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(map(shown, config))}")
+        raise UnknownKeywordError(f"{owner} takes no settings, but was given {', '.join(map(short_repr, config))}")
 
 
 def _time_limit(config: dict[str, object]) -> float | None:

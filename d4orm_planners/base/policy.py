@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, as_float32, shown
+from d4orm_env.core.arrays import FloatArray, as_float32, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.inputs import usable
@@ -279,7 +279,7 @@ def as_policy(thing: Any, owner: str) -> Policy:
     count = required_parameters(thing) if callable(thing) and not isinstance(thing, type) else 0
     if count not in (1, 2):
         raise ValueError(
-            f"{owner} is {shown(thing)}, which does not act; it must have reset and act, or be a function of "
+            f"{owner} is {short_repr(thing)}, which does not act; it must have reset and act, or be a function of "
             "(observations, state) or of one robot's observation, distinguished by their required positional parameters"
         )
     return TeamFunction(thing) if count == 2 else RobotFunction(thing)

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Self, SupportsFloat, get_type_hints
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
-from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, shown
+from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, short_repr
 from d4orm_env.core.errors import no_setting, unknown
 from d4orm_env.engine.choice import ENGINES
 
@@ -168,9 +168,9 @@ def _explain(error: ValidationError) -> str:
     if kind == "value_error":
         return f"{name} {first['ctx']['error']}"
     if kind not in _EXPECTED:
-        return f"{name}: {first['msg']}, not {shown(value)}"
+        return f"{name}: {first['msg']}, not {short_repr(value)}"
     expected = _EXPECTED[kind].format(**first.get("ctx", {}))
     if kind.endswith("_type"):
-        return f"{name} must be {expected}, not {shown(value)}"
-    found = f"{value:g}" if isinstance(value, float) else shown(value)
+        return f"{name} must be {expected}, not {short_repr(value)}"
+    found = f"{value:g}" if isinstance(value, float) else short_repr(value)
     return f"{name} is {found}; it must be {_PLAIN.get(expected, expected)}"

@@ -125,15 +125,15 @@ class WorkingPlan:
 
     def _costs_beside(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Costs:
         """``(1 + V,)`` costs of what a robot does and of its paths ``(V, H+1, d)``; all zero if these are just that."""
-        places = np.concatenate([self.positions[None, :, robot], paths])
+        positions = np.concatenate([self.positions[None, :, robot], paths])
         arrives = np.append(self.arrived[robot], arrived)
         # Most turn to their goals when they head there anyhow: what is done before costs as much again.
-        alike = (places[:, None] == places[:2]).all(axis=(2, 3)) & (arrives[:, None] == arrives[:2])
-        same = np.where(alike.any(axis=1), alike.argmax(axis=1), np.arange(len(places)))
+        alike = (positions[:, None] == positions[:2]).all(axis=(2, 3)) & (arrives[:, None] == arrives[:2])
+        same = np.where(alike.any(axis=1), alike.argmax(axis=1), np.arange(len(positions)))
         different, which = np.unique(same, return_inverse=True)
         if len(different) == 1:
-            return np.zeros(len(places))
-        costs: Costs = self._costs([robot], places[None, different], arrives[None, different])[0][0, which]
+            return np.zeros(len(positions))
+        costs: Costs = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
         return costs
 
     def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:

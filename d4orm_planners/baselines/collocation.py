@@ -135,11 +135,11 @@ class TeamProgram:
         bodies = self.problem.num_robots + len(self.obstacles)
         return ((robot, body) for robot in range(self.problem.num_robots) for body in range(robot + 1, bodies))
 
-    def _gap(self, robot: int, body: int, places: Expression) -> Expression:
+    def _gap(self, robot: int, body: int, positions: Expression) -> Expression:
         """Distance from a robot's centre to another's, or to an obstacle's surface [m], at every column of places."""
         if body >= self.problem.num_robots:
-            return self.obstacles[body - self.problem.num_robots](places[robot])
-        return self._norm(places[robot] - places[body])
+            return self.obstacles[body - self.problem.num_robots](positions[robot])
+        return self._norm(positions[robot] - positions[body])
 
     def _units(self) -> tuple[list[Floats], list[Floats]]:
         """Return the units of every component of each robot's state and control: only lengths have one."""
@@ -258,11 +258,11 @@ class TeamProgram:
             # Once all have docked nothing changes any more.
             moving = steps[steps <= docks[pair].max()]
             if len(moving):
-                places = {
+                positions = {
                     one: self.paths[one][: self.problem.dimension, np.minimum(moving, docks[one]).tolist()]
                     for one in pair
                 }
-                yield self._gap(robot, body, places) / self.unit, self._reach(robot, body) / self.unit, np.inf
+                yield self._gap(robot, body, positions) / self.unit, self._reach(robot, body) / self.unit, np.inf
 
     def _variable_bounds(self) -> tuple[Floats, Floats]:
         """Bounds of the world on positions, and limits of every single component."""

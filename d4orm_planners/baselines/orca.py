@@ -124,13 +124,13 @@ class Orca(StatePolicy):
         # The library has absolute constants, which are meant for robots of about the default size.
         unit = np.float32(problem.team.largest_radius / DEFAULT_RADIUS)
         radius, max_speed = np.asarray(problem.team.radius) / unit, np.asarray(problem.team.max_speed) / unit
-        places = joint.states[:, :2] / unit
-        stands = joint.arrived & problem.docks
-        moving = team[~stands[team]]
+        positions = joint.states[:, :2] / unit
+        absorbed = joint.arrived & problem.docks
+        moving = team[~absorbed[team]]
         velocities = present_velocities(problem, joint.states, joint.controls) / unit
         for robot in moving:
             simulator.add_agent(
-                places[robot].tolist(),
+                positions[robot].tolist(),
                 config.neighbor_distance * problem.stride / float(unit),
                 config.max_neighbors,
                 config.time_horizon,
@@ -139,8 +139,8 @@ class Orca(StatePolicy):
                 float(max_speed[robot]),
                 velocities[robot].tolist(),
             )
-        docked = [_disc(places[k, 0], places[k, 1], radius[k]) for k in team[stands[team]]]
-        for corners in [*(wall / unit for wall in self._walls), *docked]:
+        arrived = [_disc(positions[k, 0], positions[k, 1], radius[k]) for k in team[absorbed[team]]]
+        for corners in [*(wall / unit for wall in self._walls), *arrived]:
             simulator.add_obstacle(corners.tolist())
         simulator.process_obstacles()
         for agent, robot in enumerate(moving):

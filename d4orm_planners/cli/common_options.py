@@ -170,9 +170,9 @@ class PictureOptions:
         check_target(self.picture, (".png", ".svg", ".pdf"))
         check_target(self.animation, (".gif", ".mp4"))
 
-    def draw(self, problem: Problem, trajectory: Trajectory, marks: DisturbanceEvents | None = None) -> None:
+    def draw(self, problem: Problem, trajectory: Trajectory, events: DisturbanceEvents | None = None) -> None:
         """Write the pictures that were asked for."""
         if self.picture is not None:
-            render.save_picture(problem, trajectory, self.picture, marks=marks)
+            render.save_picture(problem, trajectory, self.picture, events=events)
         if self.animation is not None:
-            render.save_animation(problem, trajectory, self.animation, marks=marks)
+            render.save_animation(problem, trajectory, self.animation, events=events)

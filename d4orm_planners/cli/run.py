@@ -115,7 +115,7 @@ def run(options: RunOptions) -> None:
     disturbances = options.disturbances()
     problem, policy = options.chosen()
     episode = options.execute(problem, policy, disturbances)
-    options.draw(problem, episode.trajectory, episode.marks)
+    options.draw(problem, episode.trajectory, episode.events)
     if options.out is not None:
         episode.to_html(options.out)
     if not options.quiet:

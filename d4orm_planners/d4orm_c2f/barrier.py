@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 def safe_velocities(
-    problem: Problem, joint: JointState, wanted: FloatArray, free: BoolArray, gap: float, caution: float = 0.0
+    problem: Problem, joint: JointState, wanted: FloatArray, free: BoolArray, gap: float, speed_slack: float = 0.0
 ) -> FloatArray:
     """Velocities near those wanted, at which all can still brake before a collision.
 
@@ -51,13 +51,13 @@ def safe_velocities(
         wanted: ``(K, d)`` [m/s].
         free: ``(K,)`` robots that can be told other velocities; the others are at rest.
         gap: Distance to leave between surfaces [m].
-        caution: Robots may come to be so much faster towards anything than they are told [m/s]. If any, they are also
-            taken to go on for a time step before they brake.
+        speed_slack: Robots may come to be so much faster towards anything than they are told [m/s]. If any, they are
+            also taken to go on for a time step before they brake.
 
     Returns:
         ``(K, d)`` [m/s]; zero for robots for which there are none.
     """
-    barriers = _barriers(problem, joint, free, gap, caution)
+    barriers = _barriers(problem, joint, free, gap, speed_slack)
     velocities = np.where(free[:, None], wanted, 0).astype(np.float64)
     if not (barriers.missing(velocities) > 0).any():
         return velocities.astype(np.float32)
@@ -90,10 +90,10 @@ class Barriers(NamedTuple):
         return missing
 
 
-def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, caution: float) -> Barriers:
+def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, speed_slack: float) -> Barriers:
     """Return the barriers for the velocities of robots that are ``free``."""
     d = problem.dimension
-    places, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
+    positions, radius = joint.states[:, :d].astype(np.float64), np.asarray(problem.team.radius, np.float64)
     acceleration, speed = (problem.team.limits[:, limit].astype(np.float64) for limit in (ACCELERATION, SPEED))
     at_once = np.array([model.first_order for model in problem.team.robot_models])
     braking = np.where(free, np.where(at_once, speed / problem.dt, acceleration), 0)
@@ -103,13 +103,13 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
         if room > 0:
             lost = brakes * reaction
             # Nobody has to back off as long as there is room: whoever stands keeps to everything.
-            least = min(caution + lost - np.sqrt(2 * brakes * room + lost**2), 0.0)
+            least = min(speed_slack + lost - np.sqrt(2 * brakes * room + lost**2), 0.0)
         else:
             least = -PARTING * room
         rows.append((one, other, normal, least + speed))
 
-    reaction, near = problem.dt if caution else 0.0, _near(problem)
-    offsets = places[:, None] - places
+    reaction, near = problem.dt if speed_slack else 0.0, _near(problem)
+    offsets = positions[:, None] - positions
     separation = np.linalg.norm(offsets, axis=2)
     for i, j in np.argwhere(np.triu((separation > 0) & (separation < near) & (free[:, None] | free))).tolist():
         normal, room = offsets[i, j] / separation[i, j], float(separation[i, j]) - radius[i] - radius[j] - gap
@@ -117,13 +117,13 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     able = np.flatnonzero(free).tolist()
     for body in joint.bodies[joint.bodies[:, -1] > 0] if len(joint.bodies) else ():
         for i in able:
-            offset = places[i] - body[:d]
+            offset = positions[i] - body[:d]
             away = float(np.linalg.norm(offset))
             if 0 < away < near:
                 normal = offset / away
                 leaving = float((normal * body[d : 2 * d]).sum())
                 add(i, -1, normal, away - radius[i] - float(body[-1]) - gap, braking[i], leaving)
-    for i, normal, room in _walls(problem, places[able], able, near):
+    for i, normal, room in _walls(problem, positions[able], able, near):
         add(i, -1, normal, room - radius[i] - gap, braking[i])
     one, other, normals, least = zip(*rows) if rows else ((), (), (), ())
     return Barriers(
@@ -171,17 +171,17 @@ def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any
     return False
 
 
-def _walls(problem: Problem, places: Array, robots: list[int], near: float) -> Iterator[tuple[int, Array, float]]:
-    """Yield what is near robots at ``places`` ``(R, d)``: which robot, the direction away from it, and the distance."""
+def _walls(problem: Problem, positions: Array, robots: list[int], near: float) -> Iterator[tuple[int, Array, float]]:
+    """Yield what is near robots at ``positions`` ``(R, d)``: which robot, the direction away from it, the distance."""
     d, (lower, upper), shapes = problem.dimension, problem.world.bounds.astype(np.float64), problem.world.shapes
     axes = np.eye(d)
-    inward, sides = np.concatenate([axes, -axes]), np.concatenate([places - lower, upper - places], axis=1)
+    inward, sides = np.concatenate([axes, -axes]), np.concatenate([positions - lower, upper - positions], axis=1)
     for row, side in np.argwhere(sides < near).tolist():
         yield robots[row], inward[side], float(sides[row, side])
-    rows, items = shapes.within(places, near)
-    away = shapes.signed_distance(places[rows], items)
+    rows, items = shapes.within(positions, near)
+    away = shapes.signed_distance(positions[rows], items)
     kept = away < near
-    rows, items, away, at = rows[kept], items[kept], away[kept], places[rows[kept]]
+    rows, items, away, at = rows[kept], items[kept], away[kept], positions[rows[kept]]
     steps = _STEP * problem.team.largest_radius * axes
     slopes = np.stack([shapes.signed_distance(at + s, items) - shapes.signed_distance(at - s, items) for s in steps], 1)
     lengths = np.linalg.norm(slopes, axis=1)

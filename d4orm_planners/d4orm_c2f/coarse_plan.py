@@ -96,26 +96,26 @@ _SHARES = np.linspace(0, 1, 9)[1:]
 
 
 def visible_subgoals(
-    problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, docked: BoolArray,
+    problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, arrived: BoolArray,
     walls: bool,
 ) -> IntArray:  # fmt: skip
     """``(K,)`` the furthest waypoints up to its subgoal that each robot can drive to straight, past what is at rest.
 
     A subgoal behind a corner, or behind a robot that has docked, would hold it there. Robots at ``positions``
     ``(K, d)`` are at the waypoints ``indices`` ``(K,)`` of ``path`` ``(H+1, K, d)`` [m] and head for ``targets``
-    ``(K,)``; those ``docked`` ``(K,)`` are at rest, and with ``walls`` obstacles count too.
+    ``(K,)``; those ``arrived`` ``(K,)`` are at rest, and with ``walls`` obstacles count too.
     """
-    radius, standing = np.asarray(problem.team.radius), np.flatnonzero(docked)
+    radius, standing = np.asarray(problem.team.radius), np.flatnonzero(arrived)
     result = targets.copy()
-    waiting = np.flatnonzero(~docked & (targets > indices + LEAST))
+    waiting = np.flatnonzero(~arrived & (targets > indices + LEAST))
     while len(waiting):
         offset = path[result[waiting], waiting] - positions[waiting]
         blocked = _meets_standing(
             positions[waiting], offset, radius[waiting] + problem.margin / 2, positions[standing], radius[standing]
         )
         if walls:
-            places = positions[waiting] + _SHARES[:, None, None] * offset
-            clearance = problem.world.clearance(places.reshape(-1, places.shape[-1])).reshape(places.shape[:-1])
+            points = positions[waiting] + _SHARES[:, None, None] * offset
+            clearance = problem.world.clearance(points.reshape(-1, points.shape[-1])).reshape(points.shape[:-1])
             blocked |= (clearance <= radius[waiting] + problem.margin / 2).any(axis=0)
         waiting = waiting[blocked]
         result[waiting] -= 1
@@ -124,14 +124,14 @@ def visible_subgoals(
 
 
 def _meets_standing(
-    begin: FloatArray, offset: FloatArray, reach: FloatArray, others: FloatArray, radius: FloatArray
+    begin: FloatArray, offset: FloatArray, safety_distance: FloatArray, others: FloatArray, radius: FloatArray
 ) -> BoolArray:
     """``(N,)`` whether the straight path from ``begin`` by ``offset`` comes within reach of one of the others."""
     gap = others - begin[:, None]
     square = (offset**2).sum(axis=1)[:, None]
     share = np.clip((gap * offset[:, None]).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)
     away = ((gap - share[:, :, None] * offset[:, None]) ** 2).sum(axis=2)
-    meets: BoolArray = (away <= (reach[:, None] + radius) ** 2).any(axis=1)
+    meets: BoolArray = (away <= (safety_distance[:, None] + radius) ** 2).any(axis=1)
     return meets
 
 

@@ -55,13 +55,13 @@ class CoarsePlanTracker:
         problem: The problem, with the limits that the robots are believed to have now.
         guidance: Coarse plan that is followed at present.
         index: Waypoint at which the team is.
-        anew: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
+        rerouted: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
         stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.
     """
 
     guidance: CoarseWaypoints
     index: int
-    anew: BoolArray
+    rerouted: BoolArray
     stuck: BoolArray
 
     def __init__(
@@ -81,29 +81,29 @@ class CoarsePlanTracker:
         self._late: tuple[JointState, BoolArray] | None = None
         self._planning = CoarsePlanning(config, seed, None if lifelong else last_step)
 
-    def begin(self, joint: JointState, docked: BoolArray) -> None:
-        """Plan for the episode, in which those ``docked`` ``(K,)`` stay where they are."""
+    def begin(self, joint: JointState, arrived: BoolArray) -> None:
+        """Plan for the episode, in which those ``arrived`` ``(K,)`` stay where they are."""
         everybody = np.ones(self.problem.num_robots, bool)
         self._patience, self.stuck = StagnationMonitor(joint), ~everybody
         warm = self._planning.warm_start(self.problem, joint)
-        self.guidance = self._planning.plan(self.problem, joint, docked, warm, self._config.coarse_iterations)
+        self.guidance = self._planning.plan(self.problem, joint, arrived, warm, self._config.coarse_iterations)
         self.index = 0
         self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
 
-    def _follow(self, joint: JointState, guidance: CoarseWaypoints, anew: BoolArray) -> None:
-        """Begin at the beginning of a guidance, which sends the robots ``anew`` ``(K,)`` another way than before."""
-        self.anew = anew
+    def _follow(self, joint: JointState, guidance: CoarseWaypoints, rerouted: BoolArray) -> None:
+        """Begin at the beginning of a guidance, which sends robots ``rerouted`` ``(K,)`` another way than before."""
+        self.rerouted = rerouted
         self.guidance = guidance
         self.index, self._indices = 0, np.zeros(len(joint.goals), int)
         self._goals, self._began = joint.goals, joint.steps
         self._nearest, self._nearest_at = float("inf"), joint.steps
 
-    def subgoals(self, joint: JointState, docked: BoolArray) -> IntArray:
+    def subgoals(self, joint: JointState, arrived: BoolArray) -> IntArray:
         """``(K,)`` waypoints that the robots head for; finds out where on the path they are (Algorithm 4, line 6)."""
         path, offset = self.guidance.path, self._config.subgoal_offset
         positions = joint.states[:, : self.problem.dimension]
         self._indices = nearest_indices(path, positions, self._indices, offset)
-        counted = np.ones_like(docked) if self._config.mean_of_all else ~docked & ~self.stuck
+        counted = np.ones_like(arrived) if self._config.mean_of_all else ~arrived & ~self.stuck
         if counted.any():
             self.index = round(float(self._indices[counted].mean()))
         lag = len(path) if self._config.max_lag is None else self._config.max_lag
@@ -111,7 +111,7 @@ class CoarsePlanTracker:
         if not self._config.line_of_sight:
             return targets
         walls = self.guidance.ordered
-        return visible_subgoals(self.problem, positions, path, self._indices, targets, docked, walls)
+        return visible_subgoals(self.problem, positions, path, self._indices, targets, arrived, walls)
 
     def followed(self, joint: JointState, horizon: int) -> FloatArray:
         """``(horizon, K, m)`` controls that take every robot along its path, from where on it it is."""
@@ -128,14 +128,14 @@ class CoarsePlanTracker:
 
     def fresh_start(self, base: FloatArray) -> None:
         """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
-        if self.anew.any() and isinstance(self.guidance, CoarsePlan):
+        if self.rerouted.any() and isinstance(self.guidance, CoarsePlan):
             # Each is held for as long as it stands for.
             held = np.repeat(self.guidance.controls, self._config.coarse_factor, axis=0)[: len(base)]
-            base[:, self.anew] = 0
-            base[: len(held), self.anew] = held[:, self.anew]
-            self.anew = np.zeros_like(self.anew)
+            base[:, self.rerouted] = 0
+            base[: len(held), self.rerouted] = held[:, self.rerouted]
+            self.rerouted = np.zeros_like(self.rerouted)
 
-    def replan_if_needed(self, joint: JointState, docked: BoolArray) -> bool:
+    def replan_if_needed(self, joint: JointState, arrived: BoolArray) -> bool:
         """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end.
 
         With a deadline that is done beside the control loops: the team goes on with the old plan until then.
@@ -143,14 +143,14 @@ class CoarsePlanTracker:
         if self._late is not None:
             done, late = self._replanning.result()
             if late is not None:
-                (begun, anew), self._late = self._late, None
-                self._follow(joint._replace(goals=begun.goals), late, anew)
+                (begun, rerouted), self._late = self._late, None
+                self._follow(joint._replace(goals=begun.goals), late, rerouted)
             return done
         changed = (joint.goals != self._goals).any(axis=1)
-        moving = ~docked
-        held_up, lost = np.zeros_like(docked), False
+        moving = ~arrived
+        held_up, lost = np.zeros_like(arrived), False
         if self._config.replan:
-            held_up = moving & self._idle_for_long(joint, docked)
+            held_up = moving & self._idle_for_long(joint, arrived)
             lost = bool(moving.any()) and self._is_lost(joint, moving)
         if not moving.any():
             return False
@@ -167,19 +167,19 @@ class CoarsePlanTracker:
         thorough = lost or bool(held_up.any())
         iterations = self._config.coarse_iterations if thorough else self._config.replan_iterations
         initial = self._beginning(joint, keep & (not lost))
-        work = partial(self._planning.plan, self.problem, joint, docked, initial, iterations, thorough)
-        anew = ~keep | lost
+        work = partial(self._planning.plan, self.problem, joint, arrived, initial, iterations, thorough)
+        rerouted = ~keep | lost
         if self._config.deadline is None:
-            self._follow(joint, work(), anew)
+            self._follow(joint, work(), rerouted)
             return True
         self._replanning.start(work)
-        self._late = joint, anew
+        self._late = joint, rerouted
         return False
 
-    def _idle_for_long(self, joint: JointState, docked: BoolArray) -> BoolArray:
+    def _idle_for_long(self, joint: JointState, arrived: BoolArray) -> BoolArray:
         """``(K,)`` robots that have got nowhere on this path for so long that they need another; notes the stuck."""
         idle, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
-        barred = self._barred(joint, docked, idle > BARRED_AFTER)
+        barred = self._barred(joint, arrived, idle > BARRED_AFTER)
         return np.minimum(idle, joint.steps - self._began) > np.where(barred, BARRED_AFTER, STUCK_AFTER)
 
     def _relayed(self, joint: JointState, changed: BoolArray) -> CoarseWaypoints | None:
@@ -207,14 +207,14 @@ class CoarsePlanTracker:
             initial[:, keep] = along[:, keep]
         return initial
 
-    def _barred(self, joint: JointState, docked: BoolArray, asked: BoolArray) -> BoolArray:
+    def _barred(self, joint: JointState, arrived: BoolArray, asked: BoolArray) -> BoolArray:
         """``(K,)`` those ``asked`` whose next waypoints, up to the subgoal, lie within robots at rest for good."""
-        robots, barred = np.flatnonzero(asked & ~docked), np.zeros_like(docked)
+        robots, barred = np.flatnonzero(asked & ~arrived), np.zeros_like(arrived)
         path, ahead = self.guidance.path, np.arange(self._config.subgoal_offset + 1)
         waypoints = path[np.minimum(self._indices[robots] + ahead[:, None], len(path) - 1), robots]
-        away = np.linalg.norm(waypoints[:, :, None] - joint.states[docked, : self.problem.dimension], axis=3)
+        away = np.linalg.norm(waypoints[:, :, None] - joint.states[arrived, : self.problem.dimension], axis=3)
         radius = np.asarray(self.problem.team.radius)
-        barred[robots] = (away < radius[robots, None] + radius[docked]).any(axis=(0, 2))
+        barred[robots] = (away < radius[robots, None] + radius[arrived]).any(axis=(0, 2))
         return barred
 
     def _waiting(self, joint: JointState) -> BoolArray:

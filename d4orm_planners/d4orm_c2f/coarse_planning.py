@@ -52,14 +52,14 @@ class CoarsePlanning:
         self,
         problem: Problem,
         joint: JointState,
-        docked: BoolArray,
+        arrived: BoolArray,
         initial: FloatArray | None,
         iterations: int,
         thorough: bool = False,
     ) -> CoarsePlan:
         """Plan for the whole team from where it is, until a plan passes the checks."""
         # Whoever has docked at the rim of its goal could leave it within a coarse step.
-        goals = np.where(docked[:, None], joint.states[:, : problem.dimension], joint.goals)
+        goals = np.where(arrived[:, None], joint.states[:, : problem.dimension], joint.goals)
         coarse = coarse_problem(problem.with_state(joint.states, goals), self._config.coarse_factor)
         chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
         last = joint.steps if self._last_step is None else self._last_step

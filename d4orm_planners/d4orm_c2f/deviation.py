@@ -11,7 +11,12 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.d4orm_c2f.direct_final_approach import docking_radius
-from d4orm_planners.d4orm_c2f.estimators import Lateness, Losses, Standing, Weakness
+from d4orm_planners.d4orm_c2f.estimators import (
+    ActuatorGainEstimator,
+    LatencyEstimator,
+    PacketLossEstimator,
+    StallEstimator,
+)
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round
 
@@ -118,17 +123,17 @@ class Deviation:
         speed: ``(K,)`` the largest deviation of each robot in a time step, over its length, of late [m/s].
         drift: The largest change of a robot's velocity from what was expected within a few steps of late [m/s].
         problem: The robots with the limits that they are believed to have now.
-        lateness: Estimator of the latency of commands.
-        losses: Estimator of the share of commands that are lost.
+        latency: Estimator of the latency of commands.
+        packet_loss: Estimator of the share of commands that are lost.
         standing: Robots that have stalled.
     """
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:
         self.problem, self._engine, self._docks = problem, engine, docks
-        self.lateness = Lateness(problem.team, config.delay)
-        self.losses = Losses(problem) if config.expect_losses else None
-        self._weakness = Weakness(problem) if config.learn_limits else None
-        self.standing = Standing(problem) if config.stalls else None
+        self.latency = LatencyEstimator(problem.team, config.delay)
+        self.packet_loss = PacketLossEstimator(problem) if config.expect_losses else None
+        self._weakness = ActuatorGainEstimator(problem) if config.learn_limits else None
+        self.standing = StallEstimator(problem) if config.stalls else None
         self._filter = StateFilter(problem) if config.filter_states else None
         self._measured: JointState | None = None
         self._estimated: JointState | None = None
@@ -140,11 +145,11 @@ class Deviation:
 
     def observe(self, joint: JointState) -> JointState:
         """Compare where the robots are with where they were expected; where they will be once commands arrive."""
-        commanded = self.lateness.observe(joint.controls, ~joint.arrived)
+        commanded = self.latency.observe(joint.controls, ~joint.arrived)
         joint = self._filtered(joint)
         going = ~joint.arrived if self.standing is None else ~joint.arrived & ~self.standing.robots
-        if self.losses is not None:
-            going &= ~self.losses.observe(commanded, joint.controls, going)
+        if self.packet_loss is not None:
+            going &= ~self.packet_loss.observe(commanded, joint.controls, going)
         if self._weakness is not None:
             self._weakness.observe(commanded, joint.controls, going)
             self.problem = self._weakness.problem
@@ -153,14 +158,14 @@ class Deviation:
         if self._expected is not None:
             self._compare(joint, *self._expected)
         self._seen = joint
-        for controls in self.lateness.under_way:
+        for controls in self.latency.under_way:
             joint = self._moved(joint, controls)
         return joint
 
-    def _compare(self, joint: JointState, places: FloatArray, velocities: FloatArray) -> None:
-        """Note how far robots are from the ``places`` and the ``velocities`` ``(K, d)`` that were expected."""
+    def _compare(self, joint: JointState, positions: FloatArray, velocities: FloatArray) -> None:
+        """Note how far robots are from the ``positions`` and the ``velocities`` ``(K, d)`` that were expected."""
         d, going = self.problem.dimension, ~joint.arrived[:, None]
-        away = np.linalg.norm(np.where(going, joint.states[:, :d] - places, 0), axis=1)
+        away = np.linalg.norm(np.where(going, joint.states[:, :d] - positions, 0), axis=1)
         self.speed = np.maximum(DECAY * self.speed, away.astype(np.float64) / self.problem.dt)
         change = np.where(going, present_velocities(self.problem, joint.states, joint.controls) - velocities, 0)
         self._changes = np.concatenate([change[None], self._changes[:-1]])
@@ -186,7 +191,7 @@ class Deviation:
     def expect(self, controls: FloatArray) -> None:
         """Remember where the robots should be in a time step, now that these controls ``(K, m)`` are sent."""
         step = self._engine.step(self.arrays(self._seen), self._seen.states, self._seen.arrived, controls)
-        now = self.lateness.send(step.controls)
+        now = self.latency.send(step.controls)
         states = step.states if now is step.controls else self._moved(self._seen, now).states
         self._expected = states[:, : self.problem.dimension], present_velocities(self.problem, states, now)
 
@@ -204,7 +209,7 @@ class Deviation:
         return joint._replace(states=step.states, arrived=step.arrived & self.problem.docks, bodies=bodies)
 
     @property
-    def caution(self) -> float:
+    def speed_slack(self) -> float:
         """Speed by which a robot may soon be too fast, whichever way it goes [m/s]."""
         return 0.0 if self.drift < STEADY * self._speed else min(self.drift, FASTEST * self._speed)
 
@@ -213,6 +218,6 @@ class Deviation:
 
         What makes a robot of first order stray is over with the next command to arrive.
         """
-        next_command = min((1 + len(self.lateness.under_way)) * self.problem.dt, reaction_time)
+        next_command = min((1 + len(self.latency.under_way)) * self.problem.dt, reaction_time)
         within = np.where(self._first_order, next_command, reaction_time)
         return min(float((within * self.speed).max()), MOST * self.problem.team.largest_radius)

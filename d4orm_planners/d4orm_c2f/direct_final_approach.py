@@ -31,7 +31,7 @@ def docking_radius(problem: Problem, docks: bool) -> float:
 
 
 def direct_final_approach(
-    window: Problem, engine: Engine, controls: FloatArray, near: BoolArray, docked: BoolArray
+    window: Problem, engine: Engine, controls: FloatArray, near: BoolArray, arrived: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """The controls, but straight drives for robots that dock by these no later, or manoeuvres (:func:`come_again`).
 
@@ -42,7 +42,7 @@ def direct_final_approach(
         engine: Engine for rollouts.
         controls: ``(H_predict, K, m)``.
         near: ``(K,)`` whose drives are tried.
-        docked: ``(K,)`` robots at rest for good.
+        arrived: ``(K,)`` robots at rest for good.
 
     Returns:
         ``(H_predict, K, m)`` controls, and ``(K,)`` robots on their final approach.
@@ -52,7 +52,7 @@ def direct_final_approach(
     speed, acceleration = (window.team.limits[:, limit, None] for limit in (SPEED, ACCELERATION))
     circle = window.team.turning_radius
     turning = (circle > 0) & np.isfinite(circle) & (window.dimension == 2)
-    beside = turning & ~docked & (away[:, 0] < NEARBY * circle)
+    beside = turning & ~arrived & (away[:, 0] < NEARBY * circle)
     near = near & (away <= speed * window.dt * window.horizon)[:, 0]
     home = np.zeros_like(near)
     if not (near | beside).any():
@@ -69,16 +69,16 @@ def direct_final_approach(
         trajectory = engine.rollout(window, straight)
         sooner = near & ~home & (_docking_times(trajectory) <= latest)
         if (asked := np.flatnonzero(sooner & turning)).size:
-            sooner[asked] = _keeps_clear(window, trajectory.positions[:, asked, None], asked, docked)[:, 0]
+            sooner[asked] = _keeps_clear(window, trajectory.positions[:, asked, None], asked, arrived)[:, 0]
         controls = np.where(sooner[:, None], straight, controls)
         home |= sooner
     beside &= ~home & (latest == window.horizon)
-    controls, coming = come_again(window, controls, np.flatnonzero(beside), docked)
+    controls, coming = come_again(window, controls, np.flatnonzero(beside), arrived)
     return controls, home | coming
 
 
 def come_again(
-    window: Problem, controls: FloatArray, robots: IntArray, docked: BoolArray
+    window: Problem, controls: FloatArray, robots: IntArray, arrived: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """The controls, but manoeuvres for robots ``(R,)`` that cannot turn in place and are beside their goals.
 
@@ -88,7 +88,7 @@ def come_again(
 
     The other arguments, and what is returned, are as for :func:`direct_final_approach`.
     """
-    coming = np.zeros_like(docked)
+    coming = np.zeros_like(arrived)
     if not len(robots):
         return controls, coming
     circle, speed = window.team.turning_radius[robots], window.team.limits[robots, SPEED]
@@ -101,7 +101,7 @@ def come_again(
     vias = alone.start[:, None, None, :2] + away[:, :, None, None] * directions
     vias = vias.reshape(len(robots), -1, 1, 2).astype(np.float32)
     rollouts = drives(alone, *standing(alone), np.zeros(vias.shape[:2], int), vias)
-    clear = _keeps_clear(window, rollouts.positions, robots, docked)
+    clear = _keeps_clear(window, rollouts.positions, robots, arrived)
     moves = (rollouts.states[1:] != rollouts.states[:-1]).any(axis=3)
     # The last step in which it moves.
     length = len(moves) - moves[::-1].argmax(axis=0)
@@ -115,14 +115,14 @@ def come_again(
     return controls, coming
 
 
-def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, docked: BoolArray) -> BoolArray:
+def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, arrived: BoolArray) -> BoolArray:
     """``(R, V)`` whether paths ``(T, R, V, d)`` keep the margin to all at rest, or come no nearer than at first."""
     radius = np.asarray(window.team.radius, np.float64)
     room = window.world.clearance(positions) - radius[robots, None]
     clear = _no_nearer(room, window)
-    if docked.any():
-        away = np.linalg.norm(positions[:, :, :, None] - window.start[docked, : window.dimension], axis=4)
-        clear &= _no_nearer(away - radius[robots, None, None] - radius[docked], window).all(axis=2)
+    if arrived.any():
+        away = np.linalg.norm(positions[:, :, :, None] - window.start[arrived, : window.dimension], axis=4)
+        clear &= _no_nearer(away - radius[robots, None, None] - radius[arrived], window).all(axis=2)
     return clear
 
 

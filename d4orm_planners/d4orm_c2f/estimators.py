@@ -48,7 +48,7 @@ def effort(problem: Problem, controls: FloatArray | NDArray[np.float64]) -> NDAr
     return np.sqrt((shares**2).sum(axis=1))
 
 
-class Weakness:
+class ActuatorGainEstimator:
     """Watches an episode for robots that never do as much as they are asked to, or are held back.
 
     What they do at most of what they are asked to is what they are able to. Something that is added to commands for
@@ -119,7 +119,7 @@ BETTER = 0.5
 """A lateness is believed once commands that late differ less than this share from those executed."""
 
 
-class Lateness:
+class LatencyEstimator:
     """Remembers the commands that were sent, and compares them with those executed.
 
     Args:
@@ -177,7 +177,7 @@ LONGEST_RUN = 10
 """Longer ones neither."""
 
 
-class Losses:
+class PacketLossEstimator:
     """Watches an episode for robots that go on with the command before instead of a new one.
 
     Attributes:
@@ -227,7 +227,7 @@ PROBE = 0.1
 """Share of its limits that a robot that has stalled is commanded, so that it is seen when it obeys again."""
 
 
-class Standing:
+class StallEstimator:
     """Watches an episode for robots that brake or stay at rest whatever they are commanded.
 
     Attributes:
@@ -238,7 +238,7 @@ class Standing:
         self._problem, self._d = problem, problem.dimension
         self._idle, self._braking = np.zeros((2, problem.num_robots), int)
         self.robots: BoolArray = np.zeros(problem.num_robots, bool)
-        self._places = np.zeros((problem.num_robots, self._d), np.float32)
+        self._positions = np.zeros((problem.num_robots, self._d), np.float32)
         self._brakes: FloatArray = np.zeros((problem.num_robots, problem.control_size), np.float32)
 
     def observe(self, joint: JointState, commanded: FloatArray) -> JointState:
@@ -248,7 +248,7 @@ class Standing:
             joint: State of the robots.
             commanded: ``(K, m)`` the commands that should have been executed in the last step.
         """
-        problem, places = self._problem, joint.states[:, : self._d]
+        problem, positions = self._problem, joint.states[:, : self._d]
         asked, done = effort(problem, commanded), effort(problem, joint.controls)
         idle = (asked > COMMANDED) & (done < DONE * asked)
         self._idle[idle] += 1
@@ -263,16 +263,18 @@ class Standing:
         rolling = braking & (effort(problem, self._brakes) > DONE)
         velocity = present_velocities(problem, joint.states, joint.controls)
         pace = np.linalg.norm(velocity, axis=1, keepdims=True)
-        to_rest = places + velocity * pace / (2 * problem.team.limits[:, ACCELERATION, None])
-        self._places = np.where((self.robots & rolling | new)[:, None], to_rest, self._places).astype(np.float32)
-        self.robots &= rolling | (np.linalg.norm(places - self._places, axis=1) <= MOVED * problem.team.largest_radius)
+        to_rest = positions + velocity * pace / (2 * problem.team.limits[:, ACCELERATION, None])
+        self._positions = np.where((self.robots & rolling | new)[:, None], to_rest, self._positions).astype(np.float32)
+        self.robots &= rolling | (
+            np.linalg.norm(positions - self._positions, axis=1) <= MOVED * problem.team.largest_radius
+        )
         if not self.robots.any():
             return joint
         stand, states = self.robots[:, None], np.zeros_like(joint.states)
-        states[:, : self._d] = self._places
+        states[:, : self._d] = self._positions
         states[:, self._d :] = np.where(stand, 0, joint.states[:, self._d :])
         return joint._replace(
             states=np.where(stand, states, joint.states),
-            goals=np.where(stand, self._places, joint.goals),
+            goals=np.where(stand, self._positions, joint.goals),
             arrived=joint.arrived | self.robots,
         )

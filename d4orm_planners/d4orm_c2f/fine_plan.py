@@ -40,7 +40,7 @@ class Situation(NamedTuple):
 
     Attributes:
         joint: State of the robots.
-        docked: ``(K,)`` robots that stay there.
+        arrived: ``(K,)`` robots that stay there.
         subgoals: ``(K, d)`` [m].
         base: ``(H_predict, K, m)`` controls to deform.
         left: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
@@ -50,7 +50,7 @@ class Situation(NamedTuple):
     """
 
     joint: JointState
-    docked: BoolArray
+    arrived: BoolArray
     subgoals: FloatArray
     base: FloatArray
     left: FloatArray
@@ -108,8 +108,8 @@ class Window:
         special = now.stuck
         if config.direct_final_approach and self._docks:
             # Who is not held at its goal keeps itself there.
-            near = self._near_goals(now) & ~(now.docked & problem.docks) & ~now.stuck
-            controls, home = direct_final_approach(truth, self._engine, controls, near, now.docked)
+            near = self._near_goals(now) & ~(now.arrived & problem.docks) & ~now.stuck
+            controls, home = direct_final_approach(truth, self._engine, controls, near, now.arrived)
             special = special | home
         return self._safe_mix(truth, controls, special, sampled, now)
 
@@ -124,7 +124,7 @@ class Window:
         near = self._near_goals(now)
         window = problem.with_state(
             now.joint.states,
-            np.where((near | now.docked)[:, None], goals, now.subgoals),
+            np.where((near | now.arrived)[:, None], goals, now.subgoals),
             horizon=config.predict_horizon,
             margin=problem.margin + config.extra_margin + now.room,
             goal_radius=docking_radius(problem, self._docks and bool(near.any())),
@@ -135,7 +135,7 @@ class Window:
             now.base,
             credit=config.credit,
             moving=self._bodies(now.joint, config.predict_horizon),
-            arrived=now.docked,
+            arrived=now.arrived,
             penalty=config.penalty,
             reference_distance=None if config.normalise_distance else reach,
         )
@@ -212,8 +212,8 @@ class Window:
         violated: BoolArray = np.any(trajectory.margin_violated[1:], axis=0)
         lenient = trajectory.margin_violated[0] | now.stuck
         if lenient.any():
-            places = trajectory.positions[0]
-            gap = min(least_gap(window, places[None]), float((window.world.clearance(places) - radius).min()))
+            positions = trajectory.positions[0]
+            gap = min(least_gap(window, positions[None]), float((window.world.clearance(positions) - radius).min()))
             allowed = min(gap - window.rounding, window.margin / 2 if now.stuck.any() else window.margin)
             nearer = window.with_state(window.start, window.goal, margin=max(allowed, 0.0))
             violated[lenient] = self._engine.rollout(nearer, controls).margin_violated[1:, lenient].any(axis=0)
@@ -229,15 +229,15 @@ class Window:
         meets: BoolArray = (away <= reach).any(axis=(0, 2))
         return meets
 
-    def touching(self, joint: JointState, docked: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
+    def touching(self, joint: JointState, arrived: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
         """``(K,)`` robots within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
         radius = docking_radius(self.problem, self._docks)
         present = self.problem.with_state(
             joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius
         )
         trajectory = self._engine.rollout(present, controls)
-        touches: BoolArray = trajectory.margin_violated[1:].any(axis=0) & ~docked
-        return touches | self._meets_bodies(joint, trajectory, gap) & ~docked
+        touches: BoolArray = trajectory.margin_violated[1:].any(axis=0) & ~arrived
+        return touches | self._meets_bodies(joint, trajectory, gap) & ~arrived
 
 
 def least_gap(problem: Problem, positions: FloatArray) -> float:

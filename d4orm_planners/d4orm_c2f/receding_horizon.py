@@ -144,11 +144,11 @@ class D4ormC2F(StatePolicy):
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
         """The controls ``(K, m)``, but for robots that might come to touch something: these brake, or evade."""
-        problem, docked = self._deviation.problem, self._docked
+        problem, arrived = self._deviation.problem, self._docked
         gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
-        touching = self._window.touching(joint, docked, self._plan[now:], gap)
-        caution = self._deviation.caution
-        if not touching.any() and not caution:
+        touching = self._window.touching(joint, arrived, self._plan[now:], gap)
+        speed_slack = self._deviation.speed_slack
+        if not touching.any() and not speed_slack:
             return controls
         if touching.any():
             # A late loop may still be reading the plan.
@@ -157,24 +157,24 @@ class D4ormC2F(StatePolicy):
         # Now they are told all that they may be able to do, whatever they are believed to be.
         braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
         controls = np.where(touching[:, None], braking, controls)
-        run = 0 if (losses := self._deviation.losses) is None else losses.run
+        run = 0 if (packet_loss := self._deviation.packet_loss) is None else packet_loss.run
         # Also in between, for there may be a corner to get around; and again, for one answer may be another's question.
         for steps in 2 * (1 + run, 1 + run // 2, 1) if run else (1,):
-            controls = self._braking_in_time(joint, controls, gap, caution if steps == 1 else 0.0, steps)
+            controls = self._braking_in_time(joint, controls, gap, speed_slack if steps == 1 else 0.0, steps)
         return controls
 
     def _braking_in_time(
-        self, joint: JointState, controls: FloatArray, gap: float, caution: float, steps: int
+        self, joint: JointState, controls: FloatArray, gap: float, speed_slack: float, steps: int
     ) -> FloatArray:
         """The controls ``(K, m)``, but for robots that could not brake in time any more after so many steps of them."""
-        problem, docked, states = self._deviation.problem, self._docked, joint.states
+        problem, arrived, states = self._deviation.problem, self._docked, joint.states
         arrays = self._deviation.arrays(joint)
         for _ in range(steps):
-            ahead = self._engine.step(arrays, states, docked, controls)
+            ahead = self._engine.step(arrays, states, arrived, controls)
             states = ahead.states
         wanted = present_velocities(problem, states, ahead.controls)
         # Other velocities are reached by the next step, by which everybody will be elsewhere.
-        safe = safe_velocities(problem, joint._replace(states=states), wanted, ~docked, gap, caution)
+        safe = safe_velocities(problem, joint._replace(states=states), wanted, ~arrived, gap, speed_slack)
         evading = np.abs(safe - wanted).max(axis=1) > NEARLY * problem.team.max_speed
         if steps > 1:
             velocities = present_velocities(problem, joint.states, joint.controls)
@@ -184,18 +184,18 @@ class D4ormC2F(StatePolicy):
     def _loop(self, joint: JointState) -> None:
         """One control loop (Algorithm 4, lines 6 to 9)."""
         begin = time.perf_counter()
-        guide, docked = self._guide, self._docked
-        replanned = guide.replan_if_needed(joint, docked)
+        guide, arrived = self._guide, self._docked
+        replanned = guide.replan_if_needed(joint, arrived)
         refined = not replanned and guide.refine(joint.steps, due=self._begun % self.config.refine_every == 0)
         self._begun += 1
-        targets = guide.subgoals(joint, docked)
+        targets = guide.subgoals(joint, arrived)
         self.subgoals = subgoals = guide.guidance.path[targets, np.arange(len(targets))]
         left, base = self._plan[self._next :], self._base(joint)
         seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
-        stuck = guide.stuck & ~docked
+        stuck = guide.stuck & ~arrived
         careful = guide.followed(joint, len(base)) if stuck.any() else None
         room = self._deviation.room(self.config.reaction_time)
-        now = Situation(joint, docked, subgoals, base, left, careful, stuck, room)
+        now = Situation(joint, arrived, subgoals, base, left, careful, stuck, room)
 
         def predict() -> Prediction:
             return self._window.predict(now, seed)

@@ -87,8 +87,8 @@ class JointRun:
         repeats = np.where((labels != 0) & (labels == self.labels), self.repeats + 1, 0)
         base = config.continued(search.current).copy()
         if config.clip_after is not None:
-            tired = repeats >= config.clip_after
-            base[:, tired], repeats[tired] = search.current.controls[:, tired], 0
+            stagnant = repeats >= config.clip_after
+            base[:, stagnant], repeats[stagnant] = search.current.controls[:, stagnant], 0
         if self.resets:
             base[:] = 0
         deformed = failed[None, :, None].astype(np.float32)

@@ -91,7 +91,7 @@ class D4ormD(DeformingPlanner):
         if not isinstance(state, Repairs):
             return state, iteration
         team = DeformedPlan(self, search, search.engine.rollout(search.problem, iteration.controls))
-        return state.shorten(team), replace(iteration, controls=team.controls)
+        return state.improve(team), replace(iteration, controls=team.controls)
 
     def is_big(self, problem: Problem) -> bool:
         """Return whether the team is a big one."""

@@ -119,10 +119,10 @@ class Repairs:
         repair.run(config)
         return Repairs(repair.failures, repair.recency)
 
-    def shorten(self, team: DeformedPlan) -> Repairs:
+    def improve(self, team: DeformedPlan) -> Repairs:
         """Let all robots turn to their goals as soon as that is no worse."""
         repair = _Repair(team, self)
-        repair.shorten()
+        repair.improve()
         return Repairs(repair.failures, repair.recency)
 
 
@@ -142,7 +142,7 @@ class _Repair:
             failed, _ = self.team.faults(everybody)
         if not failed.any():
             # The detours that got robots out of each other's way are longer than they need be.
-            self.shorten()
+            self.improve()
 
     def deform(self, failed: IntArray, config: D4ormDConfig) -> None:
         """Deform the controls of some of the robots that fail."""
@@ -162,15 +162,15 @@ class _Repair:
             # A robot that starts next to its goal has little to lose by making way, but would lose it many times over.
             reference_distance=float(max(distance.mean(), problem.goal_radius)),
         )
-        self.take_over(robots, part, trajectory)
+        self.accept(robots, part, trajectory)
 
-    def shorten(self) -> None:
+    def improve(self) -> None:
         """Let all robots turn to their goals as soon as that is no worse."""
         for _ in range(SHORTENINGS):
             if self.search.should_stop():
                 break
             trajectory = self.search.engine.rollout(self.problem, self.team.controls)
-            self.take_over(range(self.problem.num_robots), self.problem, trajectory)
+            self.accept(range(self.problem.num_robots), self.problem, trajectory)
 
     def next_robots(self, failed: IntArray) -> tuple[tuple[int, ...], str]:
         """Choose the robots to repair, and whose reward to use.
@@ -197,7 +197,7 @@ class _Repair:
         self.recency *= RECENCY_DECAY
         return robots, "robot"
 
-    def take_over(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
+    def accept(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
         """Let robots do as in the trajectory, or turn to their goals in time, and count the failures."""
         index = np.array(robots)
         approach_goals(self.team, index, part, trajectory, or_longer=True)

@@ -208,20 +208,20 @@ def k_means(points: ArrayLike, k: int, generator: np.random.Generator) -> IntArr
 
     There are fewer than ``k`` where there are fewer different points.
     """
-    places = np.asarray(points, np.float64)
-    centres = places[[generator.integers(len(places))]]
+    positions = np.asarray(points, np.float64)
+    centres = positions[[generator.integers(len(positions))]]
     while len(centres) < k:
-        gap2 = _square_distances(places, centres).min(axis=1)
+        gap2 = _square_distances(positions, centres).min(axis=1)
         if gap2.sum() == 0:
             break
-        centres = np.vstack([centres, places[generator.choice(len(places), p=gap2 / gap2.sum())]])
-    labels = _square_distances(places, centres).argmin(axis=1)
+        centres = np.vstack([centres, positions[generator.choice(len(positions), p=gap2 / gap2.sum())]])
+    labels = _square_distances(positions, centres).argmin(axis=1)
     for _ in range(ROUNDS):
         former = labels
         # A cluster that has lost all its points stays where it was.
         full = np.unique(labels)
-        centres[full] = [places[labels == cluster].mean(axis=0) for cluster in full]
-        labels = _square_distances(places, centres).argmin(axis=1)
+        centres[full] = [positions[labels == cluster].mean(axis=0) for cluster in full]
+        labels = _square_distances(positions, centres).argmin(axis=1)
         if (labels == former).all():
             break
     return labels

@@ -33,7 +33,7 @@ from d4orm_planners.engine.sampling_types import get_sampling_engine
 class RunningNodes:
     """The state of a solve: its nodes live from one iteration to the next."""
 
-    crew: NodePool
+    pool: NodePool
     opened: ExitStack
 
 
@@ -69,8 +69,8 @@ class DD4orm(Planner):
             selection = self.config.selection, self.config.k
             task = PlanningTask(number, search.seed, search.current.planned, *selection, self._links(search.problem))
             zenoh = self.config.zenoh
-            crew = self._local_crew(search, task, opened) if zenoh is None else self._network_crew(search, task, zenoh)
-            return RunningNodes(crew, opened.pop_all())
+            pool = self._local_pool(search, task, opened) if zenoh is None else self._network_pool(search, task, zenoh)
+            return RunningNodes(pool, opened.pop_all())
 
     def within(self, communication_range: float) -> DD4orm:
         """See :meth:`Planner.within`: where the robots are the nodes they hear each other within the range only."""
@@ -86,16 +86,16 @@ class DD4orm(Planner):
 
     def iterate(self, search: SolveRun, state: RunningNodes) -> tuple[RunningNodes, Iteration]:
         """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""
-        return state, state.crew.iterate(search)
+        return state, state.pool.iterate(search)
 
     def finish(self, search: SolveRun, state: RunningNodes) -> None:
         with state.opened:
-            best = state.crew.close()
+            best = state.pool.close()
             if best.rank > search.best.rank:
                 search.best = best
-            search.metrics |= state.crew.metrics()
+            search.metrics |= state.pool.metrics()
 
-    def _network_crew(self, search: SolveRun, task: PlanningTask, zenoh: ZenohSettings) -> NodePool:
+    def _network_pool(self, search: SolveRun, task: PlanningTask, zenoh: ZenohSettings) -> NodePool:
         """The one node of a network that this process is."""
         config = self.config
         config.check_node(task.num_nodes)
@@ -107,7 +107,7 @@ class DD4orm(Planner):
         node = Node(config.node, task, planner, transport, evaluator, sequence=time.time_ns())
         return NetworkNodePool(node, transport, config.timeout, evaluator, zenoh.grace_period)
 
-    def _local_crew(self, search: SolveRun, task: PlanningTask, opened: ExitStack) -> NodePool:
+    def _local_pool(self, search: SolveRun, task: PlanningTask, opened: ExitStack) -> NodePool:
         """All nodes, in threads of this process; what is to be closed after them is ``opened``."""
         config, problem, number = self.config, search.problem, task.num_nodes
         planners: list[Planner] = list(config.node_planners(number))

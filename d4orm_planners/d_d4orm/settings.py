@@ -9,7 +9,7 @@ from typing import Annotated, Any, Self, TypeAlias
 
 from pydantic import Field, InstanceOf, SkipValidation
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import unknown
 from d4orm_planners.base.planner import PlannerConfig
 from d4orm_planners.base.settings import NOTHING, Count, Positive, Seconds, Whole, one_of
@@ -155,7 +155,7 @@ def _own_names() -> tuple[str, ...]:
 def _node_planner(given: Mapping[str, object]) -> type[NodePlanner]:
     name = given.get("planner", D4orm.name)
     if not isinstance(name, str):
-        raise ValueError(f"planner must be text, not {shown(name)}")
+        raise ValueError(f"planner must be text, not {short_repr(name)}")
     if name not in NODE_PLANNERS:
         raise unknown("planner", name, NODE_PLANNERS)
     return NODE_PLANNERS[name]

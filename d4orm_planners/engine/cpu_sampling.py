@@ -107,14 +107,14 @@ def bound_boxes(arrays: ProblemArrays) -> FloatArray:
 def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
     """The bodies, with their boxes."""
     # Copies, for which one compilation serves: read-only arrays are of another type.
-    places, radius = (np.array(values, np.float32, order="C") for values in (moving.positions, moving.radius))
-    num_steps, num_blocks = len(places), -(-len(places) // BLOCK)
+    positions, radius = (np.array(values, np.float32, order="C") for values in (moving.positions, moving.radius))
+    num_steps, num_blocks = len(positions), -(-len(positions) // BLOCK)
     # A last block that is short goes on with its last place.
-    blocks = places[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
-    blocks = blocks.reshape(num_blocks, BLOCK, *places.shape[1:])
+    blocks = positions[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
+    blocks = blocks.reshape(num_blocks, BLOCK, *positions.shape[1:])
     boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
     headings = np.zeros((num_steps, 0)) if moving.headings is None else moving.headings
-    return Bodies(places, radius, boxes, moving.footprints, np.array(headings, np.float32, order="C"))
+    return Bodies(positions, radius, boxes, moving.footprints, np.array(headings, np.float32, order="C"))
 
 
 def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArray:
@@ -133,13 +133,13 @@ class Sampling:
         self.kernel = score.score_kernel(problem.team.models)
         self.spaces: dict[int, score.Workspace] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)
-        docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
+        arrived = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         if self.arrays.footprints is not None or moving.footprints is not None:
             # A disc among others that are none has a footprint too.
             self.arrays = self.arrays._replace(footprints=problem.team.all_footprint_arrays)
             moving = moving._replace(footprints=moving.footprints or _discs(moving.radius))
         self.scoring = score.Scoring(
-            docked=np.ascontiguousarray(docked, bool),
+            arrived=np.ascontiguousarray(arrived, bool),
             collisions=task.collisions,
             bodies=make_bodies(moving, self.arrays.margin),
             bounds=bound_boxes(self.arrays),

@@ -63,7 +63,7 @@ class _Inputs(NamedTuple):
     penalties: Array
     units: Array
     base: Array
-    docked: Array
+    arrived: Array
     moving: MovingObstacles | None
     seed: tuple[Array, Array]
 
@@ -118,7 +118,7 @@ def _rewards(static: _Static, inputs: _Inputs, deformations: Array) -> Array:
     num_robots, size, num_samples = deformations.shape[1:]
     begin = Worlds(
         jnp.broadcast_to(arrays.start[..., None], (*arrays.start.shape, num_samples)),
-        jnp.broadcast_to(inputs.docked[:, None], (num_robots, num_samples)),
+        jnp.broadcast_to(inputs.arrived[:, None], (num_robots, num_samples)),
         jnp.zeros((num_robots, size, num_samples), jnp.float32),
     )
     after = roll_out(static.models, arrays, begin, inputs.base[..., None] + deformations)
@@ -149,8 +149,8 @@ def _step_rewards(
     if not static.per_pair:
         near_robot = near_robot > 0
     near_obstacle = obstacle_contacts(arrays, state, arrays.margin)
-    place = state[:, : arrays.goal.shape[1]]
-    return rewards_of(arrays, place, near_robot, near_obstacle, inputs.penalties[:, None])
+    position = state[:, : arrays.goal.shape[1]]
+    return rewards_of(arrays, position, near_robot, near_obstacle, inputs.penalties[:, None])
 
 
 def _weighted_mean(samples: Array, weights: Array) -> Array:
@@ -232,9 +232,9 @@ class JaxSamplingEngine(JaxEngine):
         seed: int,
     ) -> tuple[jax.stages.Compiled, tuple[Any, ...]]:
         problem = task.problem
-        docked = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
+        arrived = np.zeros(problem.num_robots, bool) if task.arrived is None else task.arrived
         scored: tuple[Any, ...] = (
-            task.arrays, task.penalties, problem.team.control_units, task.base, docked, task.moving,
+            task.arrays, task.penalties, problem.team.control_units, task.base, arrived, task.moving,
             noise.seed_words(seed),
         )  # fmt: skip
         counted = task.collisions, task.penalty_per_pair, task.credit

@@ -39,14 +39,14 @@ class PathIndex:
     """
 
     def __init__(self, positions: FloatArray, radius: ArrayLike, margin: float) -> None:
-        places = np.array(positions, np.float32, order="C")
-        num_robots, num_blocks = places.shape[1], -(-(len(places) - 1) // BLOCK)
+        positions = np.array(positions, np.float32, order="C")
+        num_robots, num_blocks = positions.shape[1], -(-(len(positions) - 1) // BLOCK)
         radii = np.array(radius, np.float64)
-        reach = 2 * radii.max() + margin
+        safety_distance = 2 * radii.max() + margin
         # Robots as near to each other as they may be are about one in a cell.
-        scale = 1 / (2 * reach)
+        scale = 1 / (2 * safety_distance)
         self.table = PathTable(
-            BLOCK, places, radii, np.float64(margin), np.float64(reach), np.float64(scale),
+            BLOCK, positions, radii, np.float64(margin), np.float64(safety_distance), np.float64(scale),
             np.zeros((num_blocks, num_robots, 3)), np.zeros((num_blocks, num_robots)),
             np.zeros(1), np.zeros(1, np.int64),
             np.full((num_blocks, 1 << (2 * num_robots - 1).bit_length()), NOBODY),
@@ -58,7 +58,7 @@ class PathIndex:
     @property
     def positions(self) -> FloatArray:
         """``(H+1, K, d)`` the paths as they are [m]; not to be written to."""
-        return self.table.places
+        return self.table.positions
 
     def move(self, robots: ArrayLike, paths: FloatArray) -> None:
         """Put robots ``(R,)`` on other paths ``(H+1, R, d)`` [m]."""
@@ -90,7 +90,7 @@ class PathIndex:
         counts, when = np.empty((2, *paths.shape[:2]), np.int32)
 
         def count(part: IntArray) -> None:
-            met = np.empty((paths.shape[1], self.table.places.shape[1]), np.bool_)
+            met = np.empty((paths.shape[1], self.table.positions.shape[1]), np.bool_)
             _count_meetings(self.table, index, paths, last, part, met, counts, when)
 
         self._threads.over(len(index), count)
@@ -101,7 +101,7 @@ class PathIndex:
 def _link_all(table: PathTable) -> None:
     table = borrow(table)
     for block in range(table.first.shape[0]):
-        for robot in range(table.places.shape[1]):
+        for robot in range(table.positions.shape[1]):
             link(table, block, robot)
 
 
@@ -111,7 +111,7 @@ def _move(table: PathTable, robots: IntArray, paths: FloatArray) -> None:
     for i in range(robots.shape[0]):
         for t in range(paths.shape[0]):
             for axis in range(paths.shape[2]):
-                table.places[t, robots[i], axis] = paths[t, i, axis]
+                table.positions[t, robots[i], axis] = paths[t, i, axis]
         for block in range(table.first.shape[0]):
             unlink(table, block, robots[i])
             link(table, block, robots[i])
@@ -124,7 +124,7 @@ def _mark_near(
 ) -> tuple[int, int]:  # fmt: skip
     """Enter in ``met`` ``(K,)`` who is near in a block; return how many are new there and the first step of these."""
     begin = np.int64(0)  # a literal would compile what it is passed to once more
-    count, soonest = 0, table.places.shape[0]
+    count, soonest = 0, table.positions.shape[0]
     low_i, high_i, low_j, high_j, low_k, high_k = cells_around(table, middle, spread)
     for i in range(low_i, high_i + 1):
         for j in range(low_j, high_j + 1):
@@ -149,7 +149,7 @@ def _pairs(table: PathTable, robot_range: IntArray) -> IntArray:
         met[: robot + 1], met[robot + 1 :] = True, False
         for block in range(num_blocks):
             x, y, z = table.middle[block, robot]
-            _mark_near(table, robot, table.places[:, robot], (x, y, z), table.spread[block, robot], block, met)
+            _mark_near(table, robot, table.positions[:, robot], (x, y, z), table.spread[block, robot], block, met)
         for other in range(robot + 1, num_robots):
             if met[other]:
                 if count == found.shape[0]:
@@ -180,7 +180,7 @@ def _count_meetings(
         for block in range(min(num_blocks, until[r] // BLOCK + 1)):
             first, last = steps_of(table, block)
             for v in range(num_paths):
-                middle, spread = enclose(paths[r, v], table.places.shape[2], first, last)
+                middle, spread = enclose(paths[r, v], table.positions.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
                     continue  # Nothing is other than it was in the block before.
                 count, soonest = _mark_near(table, robot, paths[r, v], middle, spread, block, met[v])
@@ -218,14 +218,14 @@ def _check_alone(
     arrays = borrow(arrays)
     dimension, closed, never = arrays.goal.shape[1], is_closed(arrays), paths.shape[2]
     for r in range(robot_range[0], robot_range[1]):
-        reach, goal = arrays.radius[robots[r]] + arrays.margin, arrays.goal[robots[r]]
+        safety_distance, goal = arrays.radius[robots[r]] + arrays.margin, arrays.goal[robots[r]]
         for v in range(paths.shape[1]):
             path, last, touching, unsure = paths[r, v], never - 1, never, never
-            while last > 0 and _is_same_place(path, dimension, last):
+            while last > 0 and _is_same_position(path, dimension, last):
                 last -= 1
             # Where it stands from then on it is no nearer to anything.
             for t in range(max(last, 1), 0, -1):
-                if closed and touches_static(arrays, reach, path[t, :dimension]):
+                if closed and touches_static(arrays, safety_distance, path[t, :dimension]):
                     touching = t
                 if is_unsure(arrays, path[t], goal):
                     unsure = t
@@ -233,7 +233,7 @@ def _check_alone(
 
 
 @inlined
-def _is_same_place(path: FloatArray, dimension: int, t: int) -> bool:
+def _is_same_position(path: FloatArray, dimension: int, t: int) -> bool:
     same = True
     for axis in range(dimension):
         same &= path[t, axis] == path[t - 1, axis]
@@ -241,13 +241,13 @@ def _is_same_place(path: FloatArray, dimension: int, t: int) -> bool:
 
 
 @inlined
-def is_unsure(arrays: ProblemArrays, place: FloatArray, goal: FloatArray) -> bool:
+def is_unsure(arrays: ProblemArrays, position: FloatArray, goal: FloatArray) -> bool:
     """Check whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
     gap2, extent = 0.0, 0.0
     for axis in range(goal.shape[0]):
-        gap = np.float64(place[axis]) - np.float64(goal[axis])
+        gap = np.float64(position[axis]) - np.float64(goal[axis])
         gap2 += gap * gap
-        extent = max(extent, abs(np.float64(place[axis])))
+        extent = max(extent, abs(np.float64(position[axis])))
     if gap2 > 8 * np.float64(arrays.squared_goal_radius) + extent * extent * 2.0**-18:
         return False  # Mostly it is much farther away than that.
     goal_radius = np.sqrt(np.float64(arrays.squared_goal_radius))

@@ -28,10 +28,10 @@ class PathTable(NamedTuple):
 
     Attributes:
         block: :data:`BLOCK`.
-        places: ``(H+1, K, d)`` float32 [m].
+        positions: ``(H+1, K, d)`` float32 [m].
         radius: ``(K,)`` float64 [m].
         margin: ``()`` float64 [m].
-        reach: ``()`` float64 the largest distance at which two robots are near [m].
+        safety_distance: ``()`` float64 the largest distance at which two robots are near [m].
         scale: ``()`` float64 cells in a metre.
         middle: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
         spread: ``(B, K)`` float64 and how far from there it gets [m].
@@ -42,10 +42,10 @@ class PathTable(NamedTuple):
     """
 
     block: int
-    places: FloatArray
+    positions: FloatArray
     radius: NDArray[np.float64]
     margin: np.float64
-    reach: np.float64
+    safety_distance: np.float64
     scale: np.float64
     middle: NDArray[np.float64]
     spread: NDArray[np.float64]
@@ -59,7 +59,7 @@ class PathTable(NamedTuple):
 def steps_of(table: PathTable, block: Whole) -> tuple[Whole, Whole]:
     """First step of a block and the one after the last."""
     first = 1 + block * BLOCK
-    return first, min(first + BLOCK, table.places.shape[0])
+    return first, min(first + BLOCK, table.positions.shape[0])
 
 
 @inlined
@@ -101,7 +101,7 @@ def enclose(path: FloatArray, dimension: int, first: Whole, last: Whole) -> tupl
 @inlined
 def link(table: PathTable, block: Whole, robot: Whole) -> None:
     first, last = steps_of(table, block)
-    middle, spread = enclose(table.places[:, robot], table.places.shape[2], first, last)
+    middle, spread = enclose(table.positions[:, robot], table.positions.shape[2], first, last)
     table.middle[block, robot, 0], table.middle[block, robot, 1], table.middle[block, robot, 2] = middle
     table.spread[block, robot] = spread
     table.widest[0] = max(table.widest[0], spread)
@@ -139,18 +139,23 @@ def first_near(
 
     Its path begins with its place at step ``begin``.
     """
-    reach = table.radius[robot] + table.radius[other] + table.margin
+    safety_distance = table.radius[robot] + table.radius[other] + table.margin
     x, y, z = table.middle[block, other]
-    x, y, z, far = x - middle[0], y - middle[1], z - middle[2], _WIDER * (reach + spread + table.spread[block, other])
+    x, y, z, far = (
+        x - middle[0],
+        y - middle[1],
+        z - middle[2],
+        _WIDER * (safety_distance + spread + table.spread[block, other]),
+    )
     if x * x + y * y + z * z > far * far:
         return 0
     first, last = steps_of(table, block)
     for t in range(first, last):
         gap2 = 0.0
-        for axis in range(table.places.shape[2]):
-            gap = np.float64(path[t - begin, axis]) - np.float64(table.places[t, other, axis])
+        for axis in range(table.positions.shape[2]):
+            gap = np.float64(path[t - begin, axis]) - np.float64(table.positions[t, other, axis])
             gap2 += gap * gap
-        if gap2 <= reach * reach:
+        if gap2 <= safety_distance * safety_distance:
             return t
     return 0
 
@@ -161,8 +166,8 @@ def cells_around(
 ) -> tuple[int, int, int, int, int, int]:
     """Lowest and highest numbers of the cells around a path through a block, along three axes."""
     x, y, z = middle
-    far = _WIDER * (table.reach + spread + table.widest[0])
-    flat = table.places.shape[2] == 2
+    far = _WIDER * (table.safety_distance + spread + table.widest[0])
+    flat = table.positions.shape[2] == 2
     return (
         _cell(table, x - far), _cell(table, x + far), _cell(table, y - far), _cell(table, y + far),
         0 if flat else _cell(table, z - far), 0 if flat else _cell(table, z + far),
@@ -178,13 +183,13 @@ def _is_among(robot: Whole, robots: IntArray) -> bool:
 
 
 @compiled
-def count_near(table: PathTable, robot: Whole, without: IntArray, path: FloatArray, begin: Whole, block: Whole) -> int:
+def count_near(table: PathTable, robot: Whole, exclude: IntArray, path: FloatArray, begin: Whole, block: Whole) -> int:
     """Count the robots that one meets in a block, on a path that begins with its position at step ``begin``.
 
-    Those in ``without`` ``(N,)`` do not count; it has to be one of them.
+    Those in ``exclude`` ``(N,)`` do not count; it has to be one of them.
     """
     first, last = steps_of(table, block)
-    middle, spread = enclose(path, table.places.shape[2], first - begin, last - begin)
+    middle, spread = enclose(path, table.positions.shape[2], first - begin, last - begin)
     low_i, high_i, low_j, high_j, low_k, high_k = cells_around(table, middle, spread)
     count = 0
     for i in range(low_i, high_i + 1):
@@ -192,7 +197,7 @@ def count_near(table: PathTable, robot: Whole, without: IntArray, path: FloatArr
             for k in range(low_k, high_k + 1):
                 other = table.first[block, bucket_of(table, i, j, k)]
                 while other != NOBODY:
-                    if not _is_among(other, without):
+                    if not _is_among(other, exclude):
                         count += first_near(table, robot, path, begin, middle, spread, block, other) > 0
                     other = table.following[block, other]
     return count

@@ -1,9 +1,9 @@
 """Contacts that a tile has to check, so that the checks do not stay quadratic where nothing is near.
 
-A tile moves its robots a block of steps at a time and checks the block's places afterwards. Sixteen boxes hold a
-robot's places in the block, each those of four of the tile's samples, one box a lane of a vector: four comparisons tell
-that two robots keep apart in all of them. Every robot gets a list of those before it for which they do not tell. Then
-64 boxes, one a sample, tell which samples to look at. Moving bodies, obstacles and the bounds have boxes too.
+A tile moves its robots a block of steps at a time and checks the block's positions afterwards. Sixteen boxes hold
+those of a robot, each of four of the tile's samples, one box a lane of a vector: four comparisons tell that two robots
+keep apart in all of them. Every robot lists those before it for which they do not tell. Then 64 boxes, one a sample,
+tell which samples to look at. Moving bodies, obstacles and the bounds have boxes too.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Bodies(NamedTuple):
     """Bodies that move among the robots.
 
     Attributes:
-        places: ``(H, O, d)`` after every step.
+        positions: ``(H, O, d)`` after every step.
         radius: ``(O,)``.
         boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
             margin.
@@ -79,7 +79,7 @@ class Bodies(NamedTuple):
         headings: ``(H, F)`` of their bodies and trailers, or ``(H, 0)`` where all are discs.
     """
 
-    places: FloatArray
+    positions: FloatArray
     radius: FloatArray
     boxes: FloatArray
     footprints: FootprintArrays | None
@@ -96,7 +96,7 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
 
 
 @inlined
-def place_of(k: Whole, step: int, dimension: int) -> Whole:
+def position_of(k: Whole, step: int, dimension: int) -> Whole:
     """Return where the rows of robot ``k``'s positions after a step of the block begin: a row an axis."""
     return (k * BLOCK + step) * dimension * TILE
 
@@ -118,11 +118,11 @@ def box_of(thing: Whole, dimension: int) -> Whole:
 
 
 @inlined
-def enclose(k: int, reach: np.float32, dimension: int, places: FloatArray, boxes: FloatArray) -> None:
+def enclose(k: int, radius_sum: np.float32, dimension: int, positions: FloatArray, boxes: FloatArray) -> None:
     """Make the boxes of robot ``k`` in this block, for its radius and half of the margin as reach."""
     for axis in range(dimension):
-        first, begin = place_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
-        simd.enclose(places, first, dimension * TILE, WIDER * reach, boxes, begin)
+        first, begin = position_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
+        simd.enclose(positions, first, dimension * TILE, WIDER * radius_sum, boxes, begin)
 
 
 @inlined
@@ -142,11 +142,11 @@ def _samples_overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> n
 
 
 @inlined
-def _near_pair(reach: np.float32, a: Whole, b: Whole, dimension: int, places: FloatArray) -> np.uint64:
+def _near_pair(radius_sum: np.float32, a: Whole, b: Whole, dimension: int, positions: FloatArray) -> np.uint64:
     """Return where two centres are within reach, of the first ``CHUNK`` samples in the rows from ``a`` and ``b`` on."""
     if dimension == 2:
-        return chunk_within_2(places, a, b, reach * reach)
-    return chunk_within_3(places, a, b, reach * reach)
+        return chunk_within_2(positions, a, b, radius_sum * radius_sum)
+    return chunk_within_3(positions, a, b, radius_sum * radius_sum)
 
 
 @inlined
@@ -186,25 +186,25 @@ def _undecided(f: FootprintArrays | None, digits: int, both: np.uint64, chunk: i
 
 
 @compiled
-def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, poses: FloatArray, s: Scratch) -> None:
+def _mark_listed(arrays: ProblemArrays, digits: int, positions: FloatArray, poses: FloatArray, s: Scratch) -> None:
     """Count robots within the margin of those on their lists."""
     radius, margin, dimension = arrays.radius, arrays.margin, arrays.goal.shape[1]
     use_wide_registers()
     for k in range(radius.shape[0]):
         for i in range(s.num_robots[k]):
             other = np.int64(np.uint32(s.robots[k, i]))
-            reach = radius[k] + radius[other] + margin
+            radius_sum = radius[k] + radius[other] + margin
             samples = _samples_overlap(k, other, dimension, s.boxes)
             for chunk in range(0, TILE, CHUNK):
                 if (samples >> np.uint64(chunk)) & _CHUNK_BITS == NOWHERE:
                     continue
                 for step in range(BLOCK):
-                    a, b = place_of(k, step, dimension) + chunk, place_of(other, step, dimension) + chunk
-                    touch = _near_pair(reach, a, b, dimension, places)
+                    a, b = position_of(k, step, dimension) + chunk, position_of(other, step, dimension) + chunk
+                    touch = _near_pair(radius_sum, a, b, dimension, positions)
                     f, begin = arrays.footprints, pose_of(step) + chunk
                     touch = _undecided(f, digits, s.near[0, k, step] & s.near[0, other, step], chunk, touch)
                     touch = refine_chunk(
-                        f, k, other, touch, margin, dimension, places, a, b, poses, POSES, begin, s.buffer
+                        f, k, other, touch, margin, dimension, positions, a, b, poses, POSES, begin, s.buffer
                     )
                     touch <<= np.uint64(chunk)
                     _count(digits, k, step, touch, s.near)
@@ -213,21 +213,21 @@ def _mark_listed(arrays: ProblemArrays, digits: int, places: FloatArray, poses: 
 
 @compiled
 def _mark_bodies(
-    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, poses: FloatArray,
-    s: Scratch,
+    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, positions: FloatArray,
+    poses: FloatArray, s: Scratch,
 ) -> None:  # fmt: skip
     """Count moving bodies within the margin of robots."""
     radius, margin = arrays.radius, arrays.margin
-    _, num_bodies, dimension = bodies.places.shape
+    _, num_bodies, dimension = bodies.positions.shape
     limits, before = bodies.boxes.reshape(-1), first // BLOCK * num_bodies
     for k in range(radius.shape[0]):
         for body in range(num_bodies):
             if _meets(k, before + body, dimension, s.boxes, limits):
-                reach = radius[k] + bodies.radius[body] + margin
+                radius_sum = radius[k] + bodies.radius[body] + margin
                 for step in range(count):
-                    begin = place_of(k, step, dimension)
-                    rows = places[begin : place_of(k, step + 1, dimension)]
-                    touch = near_round(reach, bodies.places[first + step, body], dimension, rows, s.buffer)
+                    begin = position_of(k, step, dimension)
+                    rows = positions[begin : position_of(k, step + 1, dimension)]
+                    touch = near_round(radius_sum, bodies.positions[first + step, body], dimension, rows, s.buffer)
                     f, begin = arrays.footprints, pose_of(step)
                     touch = _refine_body(
                         f, bodies.footprints, arrays, bodies, body, first + step, k, touch, rows, poses, begin, s
@@ -249,8 +249,8 @@ def _refine_body(
         bit = np.uint64(1) << np.uint64(sample)
         if near & bit == NOWHERE:
             continue
-        x, y = bodies.places[t, body, 0] - rows[sample], bodies.places[t, body, 1] - rows[TILE + sample]
-        z = bodies.places[t, body, 2] - rows[2 * TILE + sample] if dimension == 3 else ZERO
+        x, y = bodies.positions[t, body, 0] - rows[sample], bodies.positions[t, body, 1] - rows[TILE + sample]
+        z = bodies.positions[t, body, 2] - rows[2 * TILE + sample] if dimension == 3 else ZERO
         if not meets_body(
             f, k, arrays.radius[k], poses, POSES, begin + sample, others, body, bodies.radius[body], turns,
             x, y, z, dimension == 2, arrays.margin, s.buffer,
@@ -261,8 +261,8 @@ def _refine_body(
 
 @inlined
 def mark_robots(
-    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, places: FloatArray, poses: FloatArray,
-    s: Scratch,
+    arrays: ProblemArrays, bodies: Bodies, digits: int, first: int, count: int, positions: FloatArray,
+    poses: FloatArray, s: Scratch,
 ) -> None:  # fmt: skip
     """Count in ``s.near`` robots and bodies within the margin of each robot in a block.
 
@@ -272,16 +272,16 @@ def mark_robots(
         digits: Binary digits to count in.
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
-        places: Rows of places, see :func:`place_of`.
+        positions: Rows of places, see :func:`position_of`.
         poses: Rows of poses, see :func:`pose_of`; of size zero where all bodies are discs.
         s: Scratch with the boxes of the robots in this block.
     """
     s.near[:digits] = NOWHERE
-    dimension = bodies.places.shape[2]
+    dimension = bodies.positions.shape[2]
     _list_near(dimension, s)
-    _mark_listed(arrays, digits, places, poses, s)
-    if bodies.places.shape[1] > 0:
-        _mark_bodies(arrays, bodies, digits, first, count, places, poses, s)
+    _mark_listed(arrays, digits, positions, poses, s)
+    if bodies.positions.shape[1] > 0:
+        _mark_bodies(arrays, bodies, digits, first, count, positions, poses, s)
 
 
 @inlined
@@ -292,8 +292,11 @@ def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatA
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
     if arrays.grid.clearance.shape[0] > 0:
         # The boxes are wider than the places by the radius and half of the margin.
-        reach, half = arrays.radius[k] + arrays.margin, WIDER * (arrays.radius[k] + np.float32(0.5) * arrays.margin)
-        touch = may_touch(arrays.grid, reach, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, buffer)
+        radius_sum, half = (
+            arrays.radius[k] + arrays.margin,
+            WIDER * (arrays.radius[k] + np.float32(0.5) * arrays.margin),
+        )
+        touch = may_touch(arrays.grid, radius_sum, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, buffer)
     for bound in range(bounds.shape[0]):
         touch |= _meets(k, bound, dimension, boxes, limits)
     return touch

@@ -23,7 +23,7 @@ from d4orm_env.engine.stepping import READ, WRITE, Docking, Row, make_stepper
 from d4orm_planners.engine.proximity import POSES, pose_of
 
 # First rows of a robot in the workspace: see tiles, which has others because it keeps more of a robot.
-STATE, DOCKED, TOTAL, ROWS = 0, 6, 7, 9
+STATE, ARRIVED, TOTAL, ROWS = 0, 6, 7, 9
 STRIDE = ROWS * TILE
 
 CONTROL_ROWS = 3
@@ -73,7 +73,7 @@ def runner(name: str) -> Callable[..., None]:
     def run(
         all_limits: FloatArray, h: TimeStep, docking: Docking, goal: Row, inverse: np.float32,
         offset: FloatArray, scale: FloatArray, draws: FloatArray, controls: FloatArray, moved: FloatArray,
-        places: FloatArray, f: FootprintArrays | None, k: int, poses: FloatArray, w: FloatArray,
+        positions: FloatArray, f: FootprintArrays | None, k: int, poses: FloatArray, w: FloatArray,
     ) -> None:  # fmt: skip
         use_wide_registers()
         limits, goal = to_fixed_tuple(all_limits, num_limits), goal[:dimension]
@@ -83,16 +83,16 @@ def runner(name: str) -> Callable[..., None]:
         for i in range(offset.shape[0]):
             u = controls[i * CONTROL_ROWS * TILE : (i + 1) * CONTROL_ROWS * TILE]
             for s in range(TILE):
-                standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
+                standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
                 x = move(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, h)
                 write_x(moved, 0, s, x)
             for s in range(TILE):
-                standing = transition.stands(w[DOCKED * TILE + s] > ZERO, docking[2])
-                x, gap2, docked = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
+                standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
+                x, gap2, arrived = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
-                w[DOCKED * TILE + s] = ONE if docked else ZERO
+                w[ARRIVED * TILE + s] = ONE if arrived else ZERO
                 w[TOTAL * TILE + s] += transition.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
-            _copy(w[: dimension * TILE], places[i * dimension * TILE : (i + 1) * dimension * TILE])
+            _copy(w[: dimension * TILE], positions[i * dimension * TILE : (i + 1) * dimension * TILE])
             if f is not None:
                 place_bodies(f, k, w, poses, POSES, pose_of(i))
 
@@ -112,31 +112,31 @@ def add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: Fl
 
 @inlined
 def all_docked(w: FloatArray) -> bool:
-    if w[DOCKED * TILE] == ZERO:
+    if w[ARRIVED * TILE] == ZERO:
         return False
     total = ZERO
     for s in range(TILE):
-        total += w[DOCKED * TILE + s]
+        total += w[ARRIVED * TILE + s]
     return total == np.float32(TILE)
 
 
 @inlined
-def begin_tile(arrays: ProblemArrays, docked: BoolArray, w: FloatArray) -> None:
+def begin_tile(arrays: ProblemArrays, arrived: BoolArray, w: FloatArray) -> None:
     for k in range(arrays.radius.shape[0]):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
         for i in range(arrays.start.shape[1]):
             robot[(STATE + i) * TILE : (STATE + i + 1) * TILE] = arrays.start[k, i]
-        robot[DOCKED * TILE : (DOCKED + 1) * TILE] = ONE if docked[k] else ZERO
+        robot[ARRIVED * TILE : (ARRIVED + 1) * TILE] = ONE if arrived[k] else ZERO
         robot[TOTAL * TILE : (TOTAL + 1) * TILE] = ZERO
 
 
 @inlined
 def stay(
-    dimension: int, f: FootprintArrays | None, k: int, w: FloatArray, places: FloatArray, poses: FloatArray
+    dimension: int, f: FootprintArrays | None, k: int, w: FloatArray, positions: FloatArray, poses: FloatArray
 ) -> None:
     """Fill the places and the poses of every step of a block with where the robot is."""
     for step in range(BLOCK):
-        _copy(w[: dimension * TILE], places[step * dimension * TILE : (step + 1) * dimension * TILE])
+        _copy(w[: dimension * TILE], positions[step * dimension * TILE : (step + 1) * dimension * TILE])
     if f is not None:
         for step in range(BLOCK):
             place_bodies(f, k, w, poses, POSES, pose_of(step))

@@ -57,7 +57,7 @@ class SamplingTask:
         credit: ``"team"`` weights samples by the mean reward of the team (the paper), ``"robot"`` weights each robot's
             part of a sample by that robot's own reward.
         moving: Bodies to avoid that are not sampled, or ``None``.
-        arrived: ``(K,)`` robots docked from the beginning, or ``None`` for none.
+        arrived: ``(K,)`` robots arrived from the beginning, or ``None`` for none.
         penalty: Factor of the problem's collision penalty: of all robots, or ``(K,)`` of each.
         penalty_per_pair: Whether a robot pays for every robot and moving body that it is near, not once for all.
         noise_factor: Factors on the noise of the first step that go with ``(H, K, m)``: zero for robots that are not

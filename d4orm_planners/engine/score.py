@@ -37,12 +37,12 @@ from d4orm_planners.engine.proximity import (
     make_scratch,
     mark_robots,
     near_static,
-    place_of,
     pose_of,
+    position_of,
 )
 from d4orm_planners.engine.sample_rollout import (
+    ARRIVED,
     CONTROL_ROWS,
-    DOCKED,
     STRIDE,
     TOTAL,
     add_standing,
@@ -60,10 +60,10 @@ class Workspace(NamedTuple):
 
     Attributes:
         w: ``(K STRIDE,)`` the robots.
-        places: Their places in a block, see :func:`~d4orm_planners.engine.proximity.place_of`.
+        positions: Their places in a block, see :func:`~d4orm_planners.engine.proximity.position_of`.
         draws: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block.
         controls: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block.
-        moved: ``(DOCKED TILE,)`` one robot's states, moved and not docked yet.
+        moved: ``(ARRIVED TILE,)`` one robot's states, moved and not docked yet.
         keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
         standing: ``(K,)`` whether a robot has docked in all samples.
         scratch: Scratch of :mod:`~d4orm_planners.engine.proximity`.
@@ -71,7 +71,7 @@ class Workspace(NamedTuple):
     """
 
     w: FloatArray
-    places: FloatArray
+    positions: FloatArray
     draws: FloatArray
     controls: FloatArray
     moved: FloatArray
@@ -85,7 +85,7 @@ class Scoring(NamedTuple):
     """Rules by which samples are scored, in all steps of a run.
 
     Attributes:
-        docked: ``(K,)`` bool, docked from the beginning.
+        arrived: ``(K,)`` bool, docked from the beginning.
         collisions: Whether robots count when near each other or near a moving body.
         bodies: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`.
         bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`.
@@ -93,7 +93,7 @@ class Scoring(NamedTuple):
         per_pair: Whether it costs so much for every robot and body that is near.
     """
 
-    docked: BoolArray
+    arrived: BoolArray
     collisions: bool
     bodies: Bodies
     bounds: FloatArray
@@ -110,7 +110,7 @@ def make_workspace(shape: tuple[int, ...], dimension: int, num_bodies: int) -> W
     num_steps, num_robots, num_controls = shape
     return Workspace(
         aligned_zeros(num_robots * STRIDE), aligned_zeros(num_robots * BLOCK * dimension * TILE),
-        aligned_zeros(BLOCK * 4 * DRAWS), aligned_zeros(BLOCK * CONTROL_ROWS * TILE), aligned_zeros(DOCKED * TILE),
+        aligned_zeros(BLOCK * 4 * DRAWS), aligned_zeros(BLOCK * CONTROL_ROWS * TILE), aligned_zeros(ARRIVED * TILE),
         np.empty((2, num_robots * num_steps * ((num_controls + 1) // 2)), np.uint32), np.empty(num_robots, np.bool_),
         make_scratch(num_robots, dimension), aligned_zeros(num_bodies * POSES),
     )  # fmt: skip
@@ -130,7 +130,7 @@ def _punish_near(near: NDArray[np.uint64], digits: int, count: int, penalties: F
 
 @inlined
 def _punish_static(
-    arrays: ProblemArrays, scoring: Scoring, k: int, count: int, rest: int, places: FloatArray, poses: FloatArray,
+    arrays: ProblemArrays, scoring: Scoring, k: int, count: int, rest: int, positions: FloatArray, poses: FloatArray,
     scratch: Scratch, w: FloatArray,
 ) -> None:  # fmt: skip
     """Take the penalty from robot ``k`` where it is near an obstacle or the bounds; ``rest`` times more at the end."""
@@ -138,7 +138,7 @@ def _punish_static(
     if not near_static(arrays, k, scoring.bounds, scratch.boxes, buffer):
         return
     for step in range(count):
-        rows = places[step * dimension * TILE : (step + 1) * dimension * TILE]
+        rows = positions[step * dimension * TILE : (step + 1) * dimension * TILE]
         touch = obstacles.near_obstacles(arrays, radius + margin, rows, buffer)
         begin = pose_of(step)
         touch = refine_static(arrays.footprints, arrays, k, touch, margin, rows, poses, POSES, begin, buffer)
@@ -153,21 +153,25 @@ def _advance_robot(
 ) -> None:  # fmt: skip
     """Move robot ``k`` for ``count`` steps of a block from ``first`` on, and reward it, but for what moves as well."""
     num_steps, _, num_controls = drawing.offset.shape
-    num_pairs, dimension, reach = (num_controls + 1) // 2, arrays.goal.shape[1], arrays.radius[k] + HALF * arrays.margin
+    num_pairs, dimension, safety_distance = (
+        (num_controls + 1) // 2,
+        arrays.goal.shape[1],
+        arrays.radius[k] + HALF * arrays.margin,
+    )
     # The noise of a robot that stands counts in the mean all the same.
     draw_block(space.keys, counter, (k * num_steps + first) * num_pairs, count, num_pairs, kept, space.draws)
     robot, footprints = space.w[k * STRIDE : (k + 1) * STRIDE], arrays.footprints
-    places = space.places[place_of(k, 0, dimension) : place_of(k + 1, 0, dimension)]
+    positions = space.positions[position_of(k, 0, dimension) : position_of(k + 1, 0, dimension)]
     if space.standing[k]:
-        stay(dimension, footprints, k, robot, places, space.poses)
-        enclose(k, reach, dimension, space.places, space.scratch.boxes)
+        stay(dimension, footprints, k, robot, positions, space.poses)
+        enclose(k, safety_distance, dimension, space.positions, space.scratch.boxes)
         return
     goals, last = arrays.goal, first + count
     goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
     run_robot(
         arrays.model_codes[k], arrays.limits[k], h, docking_of(arrays, k), goal, arrays.inverse_initial_distance[k],
-        drawing.offset[first:last, k], drawing.scale[first:last, k], space.draws, space.controls, space.moved, places,
-        footprints, k, space.poses, robot,
+        drawing.offset[first:last, k], drawing.scale[first:last, k], space.draws, space.controls, space.moved,
+        positions, footprints, k, space.poses, robot,
     )  # fmt: skip
     # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags towards
     # static obstacles.
@@ -176,8 +180,8 @@ def _advance_robot(
         space.standing[k] = True
         rest = num_steps - last
         add_standing(goals[k], arrays.inverse_initial_distance[k], np.float32(rest), robot)
-    enclose(k, reach, dimension, space.places, space.scratch.boxes)
-    _punish_static(arrays, scoring, k, count, rest, places, space.poses, space.scratch, robot)
+    enclose(k, safety_distance, dimension, space.positions, space.scratch.boxes)
+    _punish_static(arrays, scoring, k, count, rest, positions, space.poses, space.scratch, robot)
 
 
 @inlined
@@ -190,13 +194,13 @@ def _score_tile(
     h = TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
     num_steps, num_robots, _ = drawing.offset.shape
     space.standing[:] = False
-    begin_tile(arrays, scoring.docked, space.w)
+    begin_tile(arrays, scoring.arrived, space.w)
     for first in range(0, num_steps, BLOCK):
         count = min(BLOCK, num_steps - first)
         for k in range(num_robots):
             _advance_robot(run_robot, arrays, scoring, drawing, counter, kept, space, h, k, first, count)
         if scoring.collisions:
-            mark_robots(arrays, scoring.bodies, digits, first, count, space.places, space.poses, space.scratch)
+            mark_robots(arrays, scoring.bodies, digits, first, count, space.positions, space.poses, space.scratch)
             _punish_near(space.scratch.near, digits, count, penalties, space.w)
 
 

@@ -164,10 +164,10 @@ def boxed_problem(num_boxes: int, where: Where) -> Problem:
     random = np.random.default_rng(0)
     if where == "near":
         distance, angle = 2.0 * np.sqrt(random.uniform(0, 1, num_boxes)), random.uniform(0, 2 * np.pi, num_boxes)
-        places = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        positions = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     else:
-        places = random.uniform(8, 20, (num_boxes, 2)) * random.choice([-1, 1], (num_boxes, 2))
-    return problem.replace(world=World(boxes=np.hstack([places - SIZE / 2, places + SIZE / 2])))
+        positions = random.uniform(8, 20, (num_boxes, 2)) * random.choice([-1, 1], (num_boxes, 2))
+    return problem.replace(world=World(boxes=np.hstack([positions - SIZE / 2, positions + SIZE / 2])))
 
 
 def measure_obstacles(

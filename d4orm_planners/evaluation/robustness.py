@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.render.style import own_style
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
@@ -31,7 +31,7 @@ def _check_given(given: object, kind: type, source: str) -> None:
     """Refuse what is no list of so many results, at least one."""
     listed = given if isinstance(given, Sequence) else ()
     if not listed or not all(isinstance(one, kind) for one in listed):
-        raise ValueError(f"{shown(given)} is no list of {kind.__name__}; give the result of {source}")
+        raise ValueError(f"{short_repr(given)} is no list of {kind.__name__}; give the result of {source}")
 
 
 def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
@@ -173,7 +173,7 @@ class Tolerance:
     The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
 
     Attributes:
-        stands: The last level before that, from harmless to bad; ``None`` if it fails at the first.
+        passes: The last level before that, from harmless to bad; ``None`` if it fails at the first.
         fails: The first level with a success rate below the threshold; ``None`` if it tolerates all. Both are ``None``
             where no level can be named: without an undisturbed success rate, or with one of 0.
         undisturbed: Success rate without any disturbance but the noise; ``None`` if no level without effect was run.
@@ -186,7 +186,7 @@ class Tolerance:
     model: str
     control_noise_std: float
     disturbance: str
-    stands: float | None
+    passes: float | None
     fails: float | None
     undisturbed: float | None
     threshold: float | None
@@ -196,7 +196,7 @@ class Tolerance:
         """Return the level as text: ``"4"``, ``"over 4"`` where it tolerates the last level, 4, or ``"-"`` for none."""
         if self.fails is not None:
             return f"{self.fails:g}"
-        return "-" if self.stands is None else f"over {self.stands:g}"
+        return "-" if self.passes is None else f"over {self.passes:g}"
 
 
 def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
@@ -230,11 +230,11 @@ def _from_harmless(line: Sequence[SuccessRate]) -> Sequence[SuccessRate]:
 
 def _tolerance(line: Sequence[SuccessRate], undisturbed: float | None, share: float) -> Tolerance:
     first, threshold = line[0], None if undisturbed is None else share * undisturbed
-    stands = fails = None
+    passes = fails = None
     if threshold:
         levels = [rate.level for rate in line]
         failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
-        stands, fails = ([None, *levels][failing], [*levels, None][failing])
+        passes, fails = ([None, *levels][failing], [*levels, None][failing])
     return Tolerance(
         label=first.label,
         scenario=first.scenario,
@@ -242,7 +242,7 @@ def _tolerance(line: Sequence[SuccessRate], undisturbed: float | None, share: fl
         model=first.model,
         control_noise_std=first.control_noise_std,
         disturbance=first.disturbance,
-        stands=stands,
+        passes=passes,
         fails=fails,
         undisturbed=undisturbed,
         threshold=threshold,

@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_planners.evaluation.sqlite_file import SqliteFile
 
 STORE = "trials.sqlite"
@@ -267,7 +267,7 @@ def checked_trial(values: Mapping[str, Any]) -> Trial:
     """
     for name, kinds in _KINDS.items():
         if not isinstance(values[name], kinds) or (name in _JSON and not _is_json(values[name], _JSON[name])):
-            raise ValueError(f"has {shown(values[name])} as {name}")
+            raise ValueError(f"has {short_repr(values[name])} as {name}")
     truths = {name: None if values[name] is None else bool(values[name]) for name in _TRUTHS}
     return Trial(**{**values, **truths})
 

@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-from d4orm_env.core.arrays import duration, positive_number, shown, whole_number
+from d4orm_env.core.arrays import duration, positive_number, short_repr, whole_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances import Disturbance
@@ -163,7 +163,7 @@ def _labelled(policies: Policies) -> dict[str, tuple[PolicyLike, dict[str, objec
 
 def _checked_label(label: object) -> str:
     if not isinstance(label, str):
-        raise ValueError(f"policy {shown(label)} is no name; give one of {', '.join(list_policies())}")
+        raise ValueError(f"policy {short_repr(label)} is no name; give one of {', '.join(list_policies())}")
     return label
 
 
@@ -175,7 +175,7 @@ def _checked(label: str, given: Any) -> tuple[PolicyLike, dict[str, object]]:
     if is_brought(given) or (isinstance(given, str) and ":" in given):
         return given, {}
     raise ValueError(
-        f"policies[{label!r}] is {shown(given)}; give the settings of a policy, as {{}} or "
+        f"policies[{label!r}] is {short_repr(given)}; give the settings of a policy, as {{}} or "
         "{'policy': 'd4orm', 'num_samples': 128}, or a policy or function of your own"
     )
 
@@ -240,7 +240,7 @@ def conditions(
     if disturbances is None:
         return tuple(Condition(std) for std in noise)
     if not isinstance(disturbances, Mapping):
-        raise ValueError(f"disturbances is {shown(disturbances)}; give levels by name, as {{'delay': [0, 1, 2]}}")
+        raise ValueError(f"disturbances is {short_repr(disturbances)}; give levels by name, as {{'delay': [0, 1, 2]}}")
     varied = [one for name, levels in disturbances.items() for one in _varied(name, levels)]
     if not varied:
         raise ValueError("disturbances is empty; give levels by name, as {'delay': [0, 1, 2]}, or leave it out")

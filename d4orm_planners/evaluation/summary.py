@@ -170,8 +170,8 @@ def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, 
     mean = float(np.mean(values))
     if len(values) == 1:
         return mean, None, None
-    reach = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
-    return mean, mean - reach, mean + reach
+    half_width = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
+    return mean, mean - half_width, mean + half_width
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from d4orm_env.core.arrays import shown
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import replaced_when_done, require_file
 from d4orm_env.core.lazy import LazyModule, load
@@ -118,7 +118,7 @@ def _trials(file: ParquetFile) -> Iterator[Trial]:
     defaults = {field.name: field.default for field in fields(Trial) if field.default is not MISSING}
     names, required = set(file.schema_arrow.names), {field.name for field in fields(Trial)} - defaults.keys()
     if wrong := sorted((names - required - defaults.keys()) | (required - names)):
-        raise ValueError(f"its columns differ from those of trials in {', '.join(map(shown, wrong[:5]))}")
+        raise ValueError(f"its columns differ from those of trials in {', '.join(map(short_repr, wrong[:5]))}")
     number = 0
     for batch in file.iter_batches(batch_size=1024):
         for row in batch.to_pylist():

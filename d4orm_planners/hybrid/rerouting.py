@@ -92,13 +92,13 @@ def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitive
     present = team.controls[:, pair], team.states[:, pair], team.arrived[pair]
     for first, second in (pair, pair[::-1]):
         # Who goes second stays where it is as long as the first may need to get away.
-        beside = np.full((1, 1, problem.horizon + 1, problem.dimension), AWAY, np.float32)
-        beside[:, :, : STANDING * BLOCK + 1] = problem.start[second, : problem.dimension]
+        extra = np.full((1, 1, problem.horizon + 1, problem.dimension), AWAY, np.float32)
+        extra[:, :, : STANDING * BLOCK + 1] = problem.start[second, : problem.dimension]
         paths = []
         for robot, other in ((first, second), (second, first)):
-            others = OtherAgents(pair[None], beside, radius[[[other]]])
+            others = OtherAgents(pair[None], extra, radius[[[other]]])
             paths.append(find_paths(team, np.array([robot]), 0, primitives, rules, others=others))
-            beside = np.ascontiguousarray(np.moveaxis(paths[-1].positions, 0, 2))
+            extra = np.ascontiguousarray(np.moveaxis(paths[-1].positions, 0, 2))
         controls = np.concatenate([path.controls[:, :, 0] for path in paths], axis=1)
         states = np.concatenate([path.states[:, :, 0] for path in paths], axis=1)
         team.move([first, second], controls, states, [path.arrived[0, 0] for path in paths])
@@ -110,7 +110,7 @@ def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitive
 def _try_detours(team: WorkingPlan, robots: IntArray, random: np.random.Generator) -> None:
     """Let robots ``(R,)`` drive by random points around their straight paths, if that is better."""
     part = team.problem.select(robots.tolist())
-    start, goal = (places[:, None] for places in (part.start[:, : part.dimension], part.goal))
+    start, goal = (positions[:, None] for positions in (part.start[:, : part.dimension], part.goal))
     size = (len(robots), DETOURS)
     spread = 0.5 * np.linalg.norm(goal - start, axis=2, keepdims=True) + SPREAD * part.team.largest_radius
     vias = start + random.random((*size, 1)) * (goal - start)

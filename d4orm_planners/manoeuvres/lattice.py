@@ -106,7 +106,7 @@ def is_free(body: RobotBody, pose: Pose, buffer: FloatArray) -> bool:
     """Check whether the robot is clear of obstacles and bounds there."""
     if is_far_from_all(body, pose[0], pose[1], 0.0):
         return True
-    place, poses = (np.float32(pose[0]), np.float32(pose[1]), np.float32(0)), buffer[2 * TILE :]
+    position, poses = (np.float32(pose[0]), np.float32(pose[1]), np.float32(0)), buffer[2 * TILE :]
     i, trailer, placed = np.int64(body.robot), 0, placed_first(body, body.robot, pose[2], ZERO, ZERO)
     while i >= 0:
         for row in range(POSE):
@@ -114,7 +114,7 @@ def is_free(body: RobotBody, pose: Pose, buffer: FloatArray) -> bool:
         placed = placed_next(body, i, placed, hitch_of(pose, trailer))
         i, trailer = np.int64(body.footprints.following[i]), trailer + 1
     k, stride = body.robot, POSE * TILE
-    return not touches_static(body.footprints, body.arrays, k, place, poses, stride, 0, body.extra, buffer)
+    return not touches_static(body.footprints, body.arrays, k, position, poses, stride, 0, body.extra, buffer)
 
 
 @compiled

@@ -85,7 +85,7 @@ class Task(NamedTuple):
         lattice: Cells and sectors.
         costs: Steps to the goal; none in a world without obstacles.
         weight: Times that these count more than the steps behind.
-        patience: Steps between departures that are tried.
+        departure_interval: Steps between departures that are tried.
         horizon: Last step.
         number: Of the search; no two with the same nodes have the same.
     """
@@ -98,7 +98,7 @@ class Task(NamedTuple):
     lattice: PoseLattice
     costs: Costs
     weight: float
-    patience: int
+    departure_interval: int
     horizon: int
     number: int
 

@@ -95,9 +95,9 @@ def _extra(model: Model) -> int:
 
 def area_of(problem: Problem) -> Area:
     """The room that robots may use."""
-    places = np.concatenate([problem.start[:, :2], problem.goal]).astype(np.float64)
+    positions = np.concatenate([problem.start[:, :2], problem.goal]).astype(np.float64)
     largest = float(problem.team.radius.max())
-    low, high = places.min(axis=0) - 2 * ROOM * largest, places.max(axis=0) + 2 * ROOM * largest
+    low, high = positions.min(axis=0) - 2 * ROOM * largest, positions.max(axis=0) + 2 * ROOM * largest
     if problem.world.num_obstacles:
         lower, upper = problem.world.shapes.extent()
         low, high = np.minimum(low, lower - 4 * largest), np.maximum(high, upper + 4 * largest)

@@ -24,7 +24,7 @@ from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_sinc
 
 NOTHING, PAUSED = -1, -2
 """Results of a search that ends without a motion, and of one that is to go on if there is time."""
-PATIENCE = 2000
+DEPARTURE_INTERVAL = 2000
 """Nodes that are followed until it is asked whether there is time."""
 SHORT, EVERY = 40, 8
 """Steps of a last stretch that every node tries, if it is about as quick as any way; longer ones only every eighth."""
@@ -116,7 +116,7 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
             depart = max(depart, end - count)
         if not waits:
             return
-        depart += task.patience * max(1, -((depart - gone) // task.patience))
+        depart += task.departure_interval * max(1, -((depart - gone) // task.departure_interval))
 
 
 @compiled
@@ -164,7 +164,7 @@ def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode:
     """
     if not goes_on:
         _begin(task, traffic, nodes, start, mode)
-    for _ in range(PATIENCE):
+    for _ in range(DEPARTURE_INTERVAL):
         if nodes.heap.filled[0] == 0 or nodes.filled[0] >= nodes.mode.shape[0]:
             return NOTHING
         _, node = pop(nodes.heap)

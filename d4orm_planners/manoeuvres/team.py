@@ -27,7 +27,7 @@ FIRST_NODES = 400_000
 team it is quicker to change others' motions."""
 WEIGHT = 1.5
 """Times that the steps ahead count more than those behind."""
-PATIENCE = 0.7
+DEPARTURE_INTERVAL = 0.7
 """Time between departures that are tried, in what the fastest robot takes for the radius of the largest one."""
 
 
@@ -135,13 +135,13 @@ class TeamMotions:
         else:
             steps = np.array([[own.steps for own in some if own] for some in (self.motions, self.alone)], float)
             delay = np.maximum(steps[0] - steps[1], 1.0)
-        places = self._poses[:, :, :2].swapaxes(0, 1).copy()
+        positions = self._poses[:, :, :2].swapaxes(0, 1).copy()
         until = np.full(len(missing), self.problem.horizon)
         for robot in np.flatnonzero(missing):
             own = self.alone[robot]
             if own is not None:
-                places[: own.steps + 1, robot], places[own.steps :, robot] = own.poses[:, :2], own.poses[-1, :2]
-        return Odds(delay, places, until, 4 * self._reach, (2, 4))
+                positions[: own.steps + 1, robot], positions[own.steps :, robot] = own.poses[:, :2], own.poses[-1, :2]
+        return Odds(delay, positions, until, 4 * self._reach, (2, 4))
 
     def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
         """See :meth:`LowLevelPlanner.replan`."""
@@ -160,11 +160,11 @@ class TeamMotions:
                     self._take(robot, motion)
 
     def _plan_in_turn(self, order: list[int], held: dict[int, int]) -> None:
-        for place, robot in enumerate(order):
+        for position, robot in enumerate(order):
             if self.should_stop():
                 return
             others = [other for other, motion in enumerate(self.motions) if motion is not None and other != robot]
-            later = {other: held.get(other, 0) for other in order[place + 1 :]}
+            later = {other: held.get(other, 0) for other in order[position + 1 :]}
             self._take(robot, self._find(robot, self._traffic(others, later)))
 
     def _drop(self, robot: int) -> None:
@@ -204,10 +204,10 @@ class TeamMotions:
     def _search(self, number: int, traffic: Traffic, nodes: Nodes, search: int, most: int) -> Motion | None:
         """Look for a robot's motion in about so many nodes."""
         robot, problem = self.robots[number], self.problem
-        patience = max(1, round(PATIENCE * float(problem.team.radius.max()) / problem.stride))
+        departure_interval = max(1, round(DEPARTURE_INTERVAL * float(problem.team.radius.max()) / problem.stride))
         task = Task(
             robot.body, robot.primitives, robot.limits, robot.curves, robot.goal, robot.lattice, robot.costs, WEIGHT,
-            patience, problem.horizon, search,
+            departure_interval, problem.horizon, search,
         )  # fmt: skip
         nodes.filled[0] = 0
         goes_on, node = False, PAUSED

@@ -81,18 +81,20 @@ def count_visits(
         _note(first, visits, size, at, robot, since, gone[robot] - 1)
 
 
-def traffic_of(poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, high: Floats, reach: float) -> Traffic:
+def traffic_of(
+    poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, high: Floats, radius_sum: float
+) -> Traffic:
     """The motions of robots ``(K, T + 1, 6)``; who has none moves last at step -1."""
-    counted = np.maximum(np.ceil((high - low) / reach), 1)
+    counted = np.maximum(np.ceil((high - low) / radius_sum), 1)
     size = (int(counted[0]), int(counted[1]))
     cells = size[0] * size[1]
     counts = np.zeros(cells, np.int64)
-    count_visits(poses, last, gone, low, 1 / reach, size, counts, np.empty((0, 3), np.int64))
+    count_visits(poses, last, gone, low, 1 / radius_sum, size, counts, np.empty((0, 3), np.int64))
     end = int(max(last.max(), gone[gone < NEVER].max(initial=0)))
     first = np.concatenate([[0], np.cumsum(counts)])
     visits = np.empty((max(int(first[-1]), 1), 3), np.int64)
-    count_visits(poses, last, gone, low, 1 / reach, size, first[:-1].copy(), visits)
-    return Traffic(poses, last, gone, end, low, 1 / reach, size, first, visits)
+    count_visits(poses, last, gone, low, 1 / radius_sum, size, first[:-1].copy(), visits)
+    return Traffic(poses, last, gone, end, low, 1 / radius_sum, size, first, visits)
 
 
 @compiled
@@ -111,15 +113,15 @@ def _meets(
     """Check whether another robot is too near to this one in a step that ends at a number, between two poses of it."""
     arrays, k, last = body.arrays, body.robot, traffic.last[other]
     end, begin = traffic.poses[other, min(step, last)], traffic.poses[other, min(max(step - 1, 0), last)]
-    reach = arrays.radius[k] + arrays.radius[other] + body.extra
+    radius_sum = arrays.radius[k] + arrays.radius[other] + body.extra
     dx, dy = np.float32(end[0] - after[0]), np.float32(end[1] - after[1])
-    far = reach + np.float32(2 * body.stride)
+    far = radius_sum + np.float32(2 * body.stride)
     if dx * dx + dy * dy > far * far:
         return False
     for part in range(parts):
         pose, its_pose = pose_between(before, after, part / parts), pose_between(begin, end, part / parts)
         dx, dy = np.float32(its_pose[0]) - np.float32(pose[0]), np.float32(its_pose[1]) - np.float32(pose[1])
-        if dx * dx + dy * dy <= reach * reach and _touches(body, other, pose, its_pose, dx, dy, buffer):
+        if dx * dx + dy * dy <= radius_sum * radius_sum and _touches(body, other, pose, its_pose, dx, dy, buffer):
             return True
     return False
 

@@ -30,13 +30,13 @@ class OtherAgents(NamedTuple):
     """Agents that robots which look for a path avoid, other than the team as it drives at present.
 
     Attributes:
-        without: ``(R, N)`` numbers of robots that each does not mind, its own among them.
-        beside: ``(R, M, H+1, d)`` paths that it minds as well [m].
+        exclude: ``(R, N)`` numbers of robots that each does not mind, its own among them.
+        extra: ``(R, M, H+1, d)`` paths that it minds as well [m].
         radius: ``(R, M)`` radii of the agents on them [m].
     """
 
-    without: IntArray
-    beside: FloatArray
+    exclude: IntArray
+    extra: FloatArray
     radius: Floats
 
 
@@ -166,11 +166,11 @@ def keep(new: Beam, node: Whole, kept: Beam, size: Whole, numbers: IntArray, eve
 
 
 @compiled
-def sink(bounds: Floats, heap: IntArray, place: Whole, size: Whole) -> None:
+def sink(bounds: Floats, heap: IntArray, position: Whole, size: Whole) -> None:
     """Let what is at a place of a heap sink below all that comes before it: lower bounds, then lower numbers."""
-    node = heap[place]
-    while 2 * place + 1 < size:
-        child = 2 * place + 1
+    node = heap[position]
+    while 2 * position + 1 < size:
+        child = 2 * position + 1
         if child + 1 < size:
             left, right = heap[child], heap[child + 1]
             if bounds[right] < bounds[left] or (bounds[right] == bounds[left] and right < left):
@@ -178,8 +178,8 @@ def sink(bounds: Floats, heap: IntArray, place: Whole, size: Whole) -> None:
         other = heap[child]
         if bounds[node] < bounds[other] or (bounds[node] == bounds[other] and node < other):
             break
-        heap[place], place = other, child
-    heap[place] = node
+        heap[position], position = other, child
+    heap[position] = node
 
 
 @compiled

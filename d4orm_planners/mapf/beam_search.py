@@ -48,15 +48,15 @@ def _count_beside(
 ) -> int:
     """Count the further paths that a path meets from one step to another; at its end it is at rest."""
     count, end = 0, path.shape[0] - 1
-    for other in range(others.beside.shape[1]):
-        reach = table.radius[robot] + others.radius[r, other] + table.margin
+    for other in range(others.extra.shape[1]):
+        safety_distance = table.radius[robot] + others.radius[r, other] + table.margin
         for t in range(first, last):
             gap2 = 0.0
             for axis in range(path.shape[1]):
-                place = np.float64(path[min(t - first, end), axis])
-                gap = place - np.float64(others.beside[r, other, t, axis])
+                position = np.float64(path[min(t - first, end), axis])
+                gap = position - np.float64(others.extra[r, other, t, axis])
                 gap2 += gap * gap
-            if gap2 <= reach * reach:
+            if gap2 <= safety_distance * safety_distance:
                 count += 1
                 break
     return count
@@ -66,7 +66,7 @@ def _count_beside(
 def _count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
     """Count those whom a path through a block meets there."""
     robot, (first, last) = queries.robots[r], steps_of(table, block)
-    count = count_near(table, robot, queries.others.without[r], path, first, block)
+    count = count_near(table, robot, queries.others.exclude[r], path, first, block)
     return count + _count_beside(table, robot, queries.others, r, path, first, last)
 
 
@@ -91,8 +91,8 @@ def _keep_best(
     root = size = np.int64(0)  # literals would compile what they are passed to once more
     for node in range(count):
         heap[node], counted[node] = node, False
-    for place in range(count // 2 - 1, -1, -1):
-        sink(new.bounds, heap, place, count)
+    for position in range(count // 2 - 1, -1, -1):
+        sink(new.bounds, heap, position, count)
     while size < numbers.shape[0] and count > 0 and new.bounds[heap[0]] < best:
         node = heap[0]
         alike = is_like_another(new, node, space.beam, size, dedup2)
@@ -120,8 +120,8 @@ def _count_passing(
             path[row, axis] = path[last - first - 1, axis]
     count = 0
     for later in range(block + 1, last_busy + 1):
-        count += count_near(table, robot, others.without[r], path, steps_of(table, later)[0], later)
-    return count + _count_beside(table, robot, others, r, path, last, len(table.places))
+        count += count_near(table, robot, others.exclude[r], path, steps_of(table, later)[0], later)
+    return count + _count_beside(table, robot, others, r, path, last, len(table.positions))
 
 
 def _move_follower(model: Model) -> Callable[..., int]:

@@ -47,14 +47,14 @@ def find_paths(
     problem, horizon = team.problem, team.problem.horizon
     blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))
     if others is None:
-        beside = np.zeros((len(robots), 0, horizon + 1, problem.dimension), np.float32)
-        others = OtherAgents(robots[:, None], beside, np.zeros((len(robots), 0)))
+        extra = np.zeros((len(robots), 0, horizon + 1, problem.dimension), np.float32)
+        others = OtherAgents(robots[:, None], extra, np.zeros((len(robots), 0)))
     u, x = (np.ascontiguousarray(rows[:, robots].swapaxes(0, 1)) for rows in (team.controls, team.states))
     arrived = np.zeros(len(robots), bool)
     for model, members in by_model(problem):
         mine = np.flatnonzero(np.isin(robots, members))
         if len(mine):
-            minded = OtherAgents(others.without[mine], others.beside[mine], others.radius[mine])
+            minded = OtherAgents(others.exclude[mine], others.extra[mine], others.radius[mine])
             queries = Queries(robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], minded)
             moves = primitives.moves(problem.dimension, has_heading=model.heading_index is not None)
             u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, queries, u[mine], x[mine])

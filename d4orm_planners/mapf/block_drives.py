@@ -50,7 +50,7 @@ def block_driver(model: Model) -> BlockDriver:
     approach, step_towards, (aim_of, slowed) = inlined(model.functions.approach), velocity_step(model), aiming(model)
     n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
     read_x, write_x, pick_x = READ[n], WRITE[n], PICK[n]
-    read_u, write_u, pick_u, read_place, write_place = READ[m], WRITE[m], PICK[m], READ[d], WRITE[d]
+    read_u, write_u, pick_u, read_position, write_position = READ[m], WRITE[m], PICK[m], READ[d], WRITE[d]
     no_control = (ZERO,) * m
 
     @compiled
@@ -61,15 +61,15 @@ def block_driver(model: Model) -> BlockDriver:
         limits, at = to_fixed_tuple(arrays.limits[robot], num_limits), to_fixed_tuple(arrays.goal[robot], d)
         for t in range(steps):
             for s in range(TILE):
-                stands = transition.stands(w[_ARRIVED * TILE + s] > ZERO, docking[2])
-                x, aim = read_x(w, _STATE * TILE, s), read_place(w, _AIM * TILE, s)
+                absorbed = transition.absorbed(w[_ARRIVED * TILE + s] > ZERO, docking[2])
+                x, aim = read_x(w, _STATE * TILE, s), read_position(w, _AIM * TILE, s)
                 velocity = slowed(approach(x, aim, limits, h, OPS), w[_PACE * TILE + s])
                 u, after, arrives = step_towards(x, velocity, limits, at, docking, h)
-                after = pick_x(stands, x, after)
-                write_u(w, _CONTROL * TILE, s, pick_u(stands, read_u(w, _CONTROL * TILE, s), u))
+                after = pick_x(absorbed, x, after)
+                write_u(w, _CONTROL * TILE, s, pick_u(absorbed, read_u(w, _CONTROL * TILE, s), u))
                 write_x(w, _STATE * TILE, s, after)
-                w[_ARRIVED * TILE + s] = ONE if stands | arrives else ZERO
-                w[_END * TILE + s] = w[_END * TILE + s] if stands else np.float32(t)
+                w[_ARRIVED * TILE + s] = ONE if absorbed | arrives else ZERO
+                w[_END * TILE + s] = w[_END * TILE + s] if absorbed else np.float32(t)
             # Apart from the rest, because where these rows are is not known when that is compiled.
             for axis in range(d):
                 for s in range(TILE):
@@ -89,7 +89,7 @@ def block_driver(model: Model) -> BlockDriver:
                 frame = frame_at(beam.states[node], goal)
             write_x(w, _STATE * TILE, s, state)
             write_u(w, _CONTROL * TILE, s, no_control)
-            write_place(w, _AIM * TILE, s, aim_of(frame, state, limits, goal, goal_radius, moves, number))
+            write_position(w, _AIM * TILE, s, aim_of(frame, state, limits, goal, goal_radius, moves, number))
             w[_PACE * TILE + s], w[_ARRIVED * TILE + s], w[_END * TILE + s] = moves.pace[number], ZERO, ZERO
         drive(arrays, robot, steps, w)
 
@@ -124,13 +124,13 @@ def path_reader(model: Model) -> PathReader:
 @compiled
 def count_faults(arrays: ProblemArrays, robot: Whole, s: Whole, steps: Whole, w: FloatArray, path: FloatArray) -> float:
     """Count in robots met what a path does wrong by itself in a block; ``path`` ``(BLOCK, d)`` is output."""
-    goal, reach, faults = arrays.goal[robot], arrays.radius[robot] + arrays.margin, 0.0
+    goal, safety_distance, faults = arrays.goal[robot], arrays.radius[robot] + arrays.margin, 0.0
     closed, d = is_closed(arrays), arrays.goal.shape[1]
     for t in range(steps):
         for axis in range(d):
             path[t, axis] = w[(_PLACES + t * d + axis) * TILE + s]
         if t <= w[_END * TILE + s] and is_unsure(arrays, path[t], goal):
             faults += 1.0
-        if closed and touches_static(arrays, reach, path[t]):
+        if closed and touches_static(arrays, safety_distance, path[t]):
             faults += _TOUCH
     return faults

@@ -25,7 +25,7 @@ class SearchConstraint(NamedTuple):
     """Robots that must go to nodes in the next step."""
 
     robots: tuple[int, ...] = ()
-    places: tuple[int, ...] = ()
+    nodes: tuple[int, ...] = ()
 
 
 @dataclass(eq=False)
@@ -56,8 +56,8 @@ class TeamConfiguration:
         if len(constraint.robots) < len(self.order):
             robot = int(self.order[len(constraint.robots)])
             at = int(self.positions[robot])
-            for place in (at, *roadmap.heads[roadmap.first[at] : roadmap.first[at + 1]].tolist()):
-                self.untried.append(SearchConstraint((*constraint.robots, robot), (*constraint.places, place)))
+            for node in (at, *roadmap.heads[roadmap.first[at] : roadmap.first[at + 1]].tolist()):
+                self.untried.append(SearchConstraint((*constraint.robots, robot), (*constraint.nodes, node)))
         return constraint
 
 
@@ -83,10 +83,10 @@ class TeamOnRoadmap:
         self.bodies = Footprints(
             radius=radius,
             size=problem.team.largest_radius,
-            reach=radius * (1 - ROUNDING) + problem.margin,
+            safety_distance=radius * (1 - ROUNDING) + problem.margin,
             margin=float(problem.margin),
             slack=PAIR_SLACK * problem.team.largest_radius,
-            docked=float(problem.goal_radius),
+            goal_radius=float(problem.goal_radius),
             docks=problem.docks,
             starts=roadmap.starts,
             goals=roadmap.goals,
@@ -108,27 +108,27 @@ class TeamOnRoadmap:
         """``(K,)`` robots without a path once a robot has docked, which must arrive before it."""
         alone, others = self.nobody.copy(), self.nobody.copy()
         alone[robot] = True
-        docked, starts = self.docked_at(alone), self.roadmap.starts
+        arrived, starts = self.arrived_at(alone), self.roadmap.starts
         for other in range(len(alone)):
             costs = self.bodies.costs[other]
             if other == robot or not np.isfinite(costs[starts[other]]):
                 continue
-            if not is_open(self.roadmap, self.bodies, docked, other, starts[other], costs):
+            if not is_open(self.roadmap, self.bodies, arrived, other, starts[other], costs):
                 around = np.empty_like(costs)
-                fill_costs(self.roadmap, self.bodies, docked, other, self.roadmap.goals[other], around)
+                fill_costs(self.roadmap, self.bodies, arrived, other, self.roadmap.goals[other], around)
                 others[other] = not np.isfinite(around[starts[other]])
         return others
 
-    def docked_at(self, mask: BoolArray) -> NDArray[np.int32]:
-        """``(N,)`` the robot docked at each node, of those in a mask ``(K,)``; -1 for none."""
-        docked = np.full(len(self.roadmap.nodes), -1, np.int32)
-        docked[self.roadmap.goals[mask]] = np.flatnonzero(mask)
-        return docked
+    def arrived_at(self, mask: BoolArray) -> NDArray[np.int32]:
+        """``(N,)`` the robot arrived at each node, of those in a mask ``(K,)``; -1 for none."""
+        arrived = np.full(len(self.roadmap.nodes), -1, np.int32)
+        arrived[self.roadmap.goals[mask]] = np.flatnonzero(mask)
+        return arrived
 
     def fill(self, robot: int, mask: BoolArray, holds: bool = False) -> None:
         """A robot's paths anew: to its goal, or while it holds for others to where it started, out of their path."""
         end = self.roadmap.starts[robot] if holds else self.roadmap.goals[robot]
-        fill_costs(self.roadmap, self.bodies, self.docked_at(mask), robot, end, self.bodies.costs[robot])
+        fill_costs(self.roadmap, self.bodies, self.arrived_at(mask), robot, end, self.bodies.costs[robot])
         self.masks[robot], self.holds[robot] = mask, holds
 
     def arrived(self, positions: IntArray) -> BoolArray:
@@ -138,14 +138,14 @@ class TeamOnRoadmap:
     def find_paths(self, positions: IntArray) -> bool:
         """Bring all paths up to date; whether each robot has one, around those that have docked."""
         mask = self.arrived(positions) if self.bodies.docks else self.nobody
-        docked = self.docked_at(mask)
+        arrived = self.arrived_at(mask)
         for robot in np.flatnonzero(~mask).tolist():
             before, holds = self.masks[robot], bool((self.waits_for[robot] & ~mask).any())
             if holds == self.holds[robot] and (before is mask or (before == mask).all()):
                 continue
             costs, at = self.bodies.costs[robot], positions[robot]
             stale = holds != self.holds[robot] or bool((before & ~mask).any())
-            if stale or not (holds or is_open(self.roadmap, self.bodies, docked, robot, at, costs)):
+            if stale or not (holds or is_open(self.roadmap, self.bodies, arrived, robot, at, costs)):
                 self.fill(robot, mask, holds)
                 if not np.isfinite(costs[at]):
                     return False
@@ -159,7 +159,7 @@ class TeamOnRoadmap:
         A configuration that is ``known`` is returned itself; others are added.
         """
         bodies, constraint = self.bodies, here.next_constraint(self.roadmap)
-        forced = np.array(constraint.robots, np.int64), np.array(constraint.places, np.int64)
+        forced = np.array(constraint.robots, np.int64), np.array(constraint.nodes, np.int64)
         self.find_paths(here.positions)
         scratch.may_dock[:] = ~self.holds
         while True:

@@ -22,14 +22,14 @@ class Odds(NamedTuple):
 
     Attributes:
         delay: ``(K,)`` chance of each to be the late one, in any unit.
-        places: ``(T + 1, K, d)`` [m].
+        positions: ``(T + 1, K, d)`` [m].
         until: ``(K,)`` the last step of each at which it may come near to others.
         nearness: Random distance by which a robot may be farther away and still be chosen [m].
         sizes: The least and the greatest number of robots.
     """
 
     delay: Floats
-    places: FloatArray | Floats
+    positions: FloatArray | Floats
     until: IntArray
     nearness: float
     sizes: tuple[int, int]
@@ -37,8 +37,8 @@ class Odds(NamedTuple):
     def draw(self, random: np.random.Generator) -> IntArray:
         """A robot that is late, and some that it comes near to, in random order."""
         robot = int(random.choice(len(self.delay), p=self.delay / self.delay.sum()))
-        places = self.places[: self.until[robot] + 1]
-        gaps = np.sqrt(((places - places[:, [robot]]) ** 2).sum(axis=2).min(axis=0))
+        positions = self.positions[: self.until[robot] + 1]
+        gaps = np.sqrt(((positions - positions[:, [robot]]) ** 2).sum(axis=2).min(axis=0))
         gaps += self.nearness * random.random(len(self.delay))
         gaps[robot] = -1.0
         return random.permutation(np.argsort(gaps, kind="stable")[: random.integers(*self.sizes, endpoint=True)])

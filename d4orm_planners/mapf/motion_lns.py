@@ -139,10 +139,10 @@ class _Motions:
         """Sum of all costs [s]."""
         return float((self.arrival + self.lag).sum())
 
-    def costs(self, robots: IntArray, places: FloatArray) -> tuple[Floats, Floats]:
-        """``(R,)`` arrival times of robots at places ``(H+1, R, d)``, and their distances left over time [s]."""
-        still = (places[1:] == places[:-1]).all(axis=2)
-        gap = np.linalg.norm(places[1:] - self.problem.goal[robots], axis=2).sum(axis=0, dtype=np.float64)
+    def costs(self, robots: IntArray, positions: FloatArray) -> tuple[Floats, Floats]:
+        """``(R,)`` arrival times of robots at positions ``(H+1, R, d)``, and their distances left over time [s]."""
+        still = (positions[1:] == positions[:-1]).all(axis=2)
+        gap = np.linalg.norm(positions[1:] - self.problem.goal[robots], axis=2).sum(axis=0, dtype=np.float64)
         lag: Floats = self.problem.dt * gap / np.maximum(self.distance[robots], self.problem.goal_radius)
         # Who does not move from one step to the next has arrived by the first of the two.
         return self.problem.dt * arrival_steps(np.concatenate([still, np.ones_like(still[:1])])).astype(float), lag
@@ -185,9 +185,9 @@ class _Motions:
             budget[found] -= self.costs(robots, paths.positions[:, :, 0])[0]
             found[found] = paths.arrived[:, 0]
         for number in np.flatnonzero(found):
-            self.take_over(groups[number], controls[:, number], states[:, number], slack[number])
+            self.accept(groups[number], controls[:, number], states[:, number], slack[number])
 
-    def take_over(self, robots: IntArray, controls: FloatArray, states: FloatArray, slack: float) -> None:
+    def accept(self, robots: IntArray, controls: FloatArray, states: FloatArray, slack: float) -> None:
         """Let robots ``(R,)`` do as they found, if it fits what the others do and costs no more than so much [s]."""
         arrival, lag = self.costs(robots, states[..., : self.problem.dimension])
         before = (self.arrival[robots] + self.lag[robots]).sum()

@@ -70,11 +70,11 @@ class MotionPrimitives:
 
 
 @compiled
-def frame_at(place: FloatArray, goal: FloatArray) -> Row:
+def frame_at(position: FloatArray, goal: FloatArray) -> Row:
     """Unit vectors from a place to its goal, across in the plane, and upright to both, one after the other."""
-    x, y, z = goal[0] - place[0], goal[1] - place[1], ZERO
+    x, y, z = goal[0] - position[0], goal[1] - position[1], ZERO
     if goal.shape[0] == 3:
-        z = goal[2] - place[2]
+        z = goal[2] - position[2]
     length = np.sqrt(x * x + y * y + z * z)
     if length > ZERO:
         x, y, z = x / length, y / length, z / length
@@ -88,18 +88,18 @@ def frame_at(place: FloatArray, goal: FloatArray) -> Row:
 
 
 @compiled
-def _turned_2(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
+def _turned_2(position: Row, far: np.float32, turn: Row, frame: Row) -> Row:
     x, y, _, i, j, _, _, _ = frame
-    return place[0] + far * (turn[0] * x + turn[1] * i), place[1] + far * (turn[0] * y + turn[1] * j)
+    return position[0] + far * (turn[0] * x + turn[1] * i), position[1] + far * (turn[0] * y + turn[1] * j)
 
 
 @compiled
-def _turned_3(place: Row, far: np.float32, turn: Row, frame: Row) -> Row:
+def _turned_3(position: Row, far: np.float32, turn: Row, frame: Row) -> Row:
     x, y, z, i, j, u, v, w = frame
     return (
-        place[0] + far * (turn[0] * x + turn[1] * i + turn[2] * u),
-        place[1] + far * (turn[0] * y + turn[1] * j + turn[2] * v),
-        place[2] + far * (turn[0] * z + turn[2] * w),
+        position[0] + far * (turn[0] * x + turn[1] * i + turn[2] * u),
+        position[1] + far * (turn[0] * y + turn[1] * j + turn[2] * v),
+        position[2] + far * (turn[0] * z + turn[2] * w),
     )
 
 
@@ -121,7 +121,7 @@ def aiming(model: Model) -> tuple[AimOf, SlowedTo]:
     """Compiled ``(frame, at, limits, goal, goal_radius, moves, number) -> aim``, the position that a robot of this
     model heads for in a move, and ``(velocity, pace) -> velocity`` at that share of it.
 
-    ``frame`` is :func:`frame_at` the robot's place, with which ``at`` begins.
+    ``frame`` is :func:`frame_at` the robot's position, with which ``at`` begins.
     """
     d = model.dimension
     turned, slowed = (_turned_2, _slowed_2) if d == 2 else (_turned_3, _slowed_3)

@@ -81,8 +81,8 @@ def _fill_boxes(positions: Floats, i: Whole, boxes: Floats) -> None:
         for axis in range(3):
             low, high = np.inf, -np.inf
             for step in range(block * BLOCK, min((block + 1) * BLOCK, positions.shape[0])):
-                place = positions[step, i, axis]
-                low, high = min(low, place), max(high, place)
+                position = positions[step, i, axis]
+                low, high = min(low, position), max(high, position)
             boxes[block, axis, i], boxes[block, axis + 3, i] = low, high
 
 
@@ -93,20 +93,22 @@ def _fill_visits(
     """Number of a robot's visits; as many as there is room for are written. ``last`` ``(N,)`` is -1, and is again."""
     nodes, rows, used, step = cells.points, positions.shape[0], 0, 0
     while step < rows:
-        place = positions[step, i]
+        position = positions[step, i]
         # Who stands still is looked at once.
         end = step + 1
         while end < rows and (
-            positions[end, i, 0] == place[0] and positions[end, i, 1] == place[1] and positions[end, i, 2] == place[2]
+            positions[end, i, 0] == position[0]
+            and positions[end, i, 1] == position[1]
+            and positions[end, i, 2] == position[2]
         ):
             end += 1
-        (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, place, place, need)
+        (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, position, position, need)
         for ci in range(low_i, high_i):
             for cj in range(low_j, high_j):
                 first, after_last = items_in(cells, ci, cj, low_k, high_k)
                 for number in range(first, after_last):
                     n = cells.items[number]
-                    dx, dy, dz = nodes[n, 0] - place[0], nodes[n, 1] - place[1], nodes[n, 2] - place[2]
+                    dx, dy, dz = nodes[n, 0] - position[0], nodes[n, 1] - position[1], nodes[n, 2] - position[2]
                     if dx * dx + dy * dy + dz * dz >= need * need:
                         continue
                     v = last[n]
@@ -164,12 +166,12 @@ def find_near_boxes(
 
 
 @cached_kernel(variant="meetings", **OPTIONS)
-def find_meetings(others: Others, places: Floats, met: BoolArray) -> None:
+def find_meetings(others: Others, positions: Floats, met: BoolArray) -> None:
     """Find to whom places ``(S + 1, 3)`` are nearer than is needed, after the start; ``met`` ``(K,)`` is output."""
     met[:], near = False, np.empty(others.need.shape[0] + 1, np.int64)
-    for block in range((places.shape[0] - 1) // BLOCK + 1):
-        first, last = max(block * BLOCK, 1), min((block + 1) * BLOCK, places.shape[0])
-        x, y, z = places[first:last, 0], places[first:last, 1], places[first:last, 2]
+    for block in range((positions.shape[0] - 1) // BLOCK + 1):
+        first, last = max(block * BLOCK, 1), min((block + 1) * BLOCK, positions.shape[0])
+        x, y, z = positions[first:last, 0], positions[first:last, 1], positions[first:last, 2]
         if first == last:
             break
         for number in range(
@@ -177,8 +179,11 @@ def find_meetings(others: Others, places: Floats, met: BoolArray) -> None:
         ):
             i = near[number]
             for step in range(first, last):
-                dx, dy = others.positions[step, i, 0] - places[step, 0], others.positions[step, i, 1] - places[step, 1]
-                dz = others.positions[step, i, 2] - places[step, 2]
+                dx, dy = (
+                    others.positions[step, i, 0] - positions[step, 0],
+                    others.positions[step, i, 1] - positions[step, 1],
+                )
+                dz = others.positions[step, i, 2] - positions[step, 2]
                 if dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
                     met[i] = True
                     break
@@ -251,17 +256,17 @@ def bucket_of(buckets: Buckets, block: Whole, x: float, y: float) -> Whole:
 
 
 @compiled
-def last_passage(others: Others, place: Floats, near: IntArray) -> Whole:
+def last_passage(others: Others, position: Floats, near: IntArray) -> Whole:
     """The last step at which another comes too near to a place, -1 if none does; ``near`` ``(K + 1,)`` is scratch."""
-    point = (place[0], place[1], place[2])
+    point = (position[0], position[1], position[2])
     for block in range(others.boxes.shape[0] - 1, -1, -1):
         first, last = block * BLOCK, min((block + 1) * BLOCK, others.positions.shape[0])
         latest = np.int64(-1)
         for number in range(find_near_boxes(others, block, point, point, near)):
             i = near[number]
             for step in range(first, last):
-                dx, dy = others.positions[step, i, 0] - place[0], others.positions[step, i, 1] - place[1]
-                dz = others.positions[step, i, 2] - place[2]
+                dx, dy = others.positions[step, i, 0] - position[0], others.positions[step, i, 1] - position[1]
+                dz = others.positions[step, i, 2] - position[2]
                 if dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
                     latest = max(latest, np.int64(step))
         if latest >= 0:

@@ -79,7 +79,7 @@ def _rank_options(
     for e in range(roadmap.first[at], roadmap.first[at + 1] + 1):
         if e < roadmap.first[at + 1]:
             head = np.int64(roadmap.heads[e])
-            if roadmap.room[e] < bodies.reach[k] or not costs[head] < np.inf:
+            if roadmap.room[e] < bodies.safety_distance[k] or not costs[head] < np.inf:
                 continue
             value, option = np.float64(costs[head]) + roadmap.lengths[e], np.int64(e)
         elif pushed:
@@ -88,11 +88,11 @@ def _rank_options(
             value, option = np.float64(costs[at]) + IDLE * bodies.size, np.int64(STAY)
         # Ties are broken at random, lest two robots go on getting into each other's way.
         value += TIE * bodies.size * _mixed(np.uint64(seed) + np.uint64(k), np.uint64(e))
-        place = count
-        while place > 0 and worth[place - 1] > value:
-            worth[place], options[place] = worth[place - 1], options[place - 1]
-            place -= 1
-        worth[place], options[place] = value, option
+        position = count
+        while position > 0 and worth[position - 1] > value:
+            worth[position], options[position] = worth[position - 1], options[position - 1]
+            position -= 1
+        worth[position], options[position] = value, option
         count += 1
     options[count] = NOTHING
 
@@ -107,7 +107,7 @@ def _blocking_robot(
     for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
         u = np.int64(roadmap.near[number])
         if bodies.docks and u == bodies.goals[k] and u != at:
-            if head != u and roadmap.gaps[number] < bodies.docked + bodies.slack / 2:
+            if head != u and roadmap.gaps[number] < bodies.goal_radius + bodies.slack / 2:
                 return -2  # It would dock in passing.
             if head == u and not scratch.may_dock[k]:
                 return -2
@@ -206,7 +206,7 @@ def step_team(
     scratch: PibtWorkspace,
     order: IntArray,
     robots: IntArray,
-    places: IntArray,
+    targets: IntArray,
     seed: int,
     positions: IntArray,
 ) -> int:
@@ -218,7 +218,7 @@ def step_team(
         scratch: Working space; its moves are output.
         order: ``(K,)`` robots, the first one first.
         robots: ``(C,)`` robots that must go ...
-        places: ... to these nodes ``(C,)``, or stay there.
+        targets: ... to these nodes ``(C,)``, or stay there.
         seed: Of ties.
         positions: ``(K,)`` int64 the robots' nodes, changed in place.
 
@@ -234,13 +234,13 @@ def step_team(
             scratch.state[k] = DONE
     for number in range(robots.shape[0]):
         k = robots[number]
-        if positions[k] == places[number]:
+        if positions[k] == targets[number]:
             scratch.state[k] = DONE
     for number in range(robots.shape[0]):
         k = robots[number]
         if scratch.state[k] == FREE:
-            count = _move(roadmap, bodies, scratch, positions, k, places[number], seed, count)
-        if positions[k] != places[number]:
+            count = _move(roadmap, bodies, scratch, positions, k, targets[number], seed, count)
+        if positions[k] != targets[number]:
             return -1
     for number in range(order.shape[0]):
         k = order[number]

@@ -59,7 +59,7 @@ class RoadmapPaths:
         if late.any() and random.random() < 0.5:
             delay[~late] = 0.0
         sizes = (1, min(len(delay), self.most))
-        return Odds(delay, driven.places, driven.arrivals, NEARNESS * replanning.size, sizes)
+        return Odds(delay, driven.positions, driven.arrivals, NEARNESS * replanning.size, sizes)
 
     def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
         """See :meth:`LowLevelPlanner.replan`; what is worse is never accepted."""

@@ -42,18 +42,18 @@ def stops_of(roadmap: Roadmap, moves: IntArray, num_robots: int) -> Corners:
     begin = np.append(0, np.cumsum(np.bincount(moves[:, 0], minlength=num_robots) + 1)).astype(np.int64)
     moving = np.ones(begin[-1], bool)
     moving[begin[:-1]] = False
-    places, times = np.empty((begin[-1], 3)), np.full(begin[-1], -1.0)
-    places[~moving] = roadmap.nodes[roadmap.starts]
-    places[moving] = roadmap.nodes[roadmap.heads[moves[order, 1]]]
+    positions, times = np.empty((begin[-1], 3)), np.full(begin[-1], -1.0)
+    positions[~moving] = roadmap.nodes[roadmap.starts]
+    positions[moving] = roadmap.nodes[roadmap.heads[moves[order, 1]]]
     times[moving] = order
-    return Corners(places, begin, times, times)
+    return Corners(positions, begin, times, times)
 
 
 def make_routes(problem: Problem, stops: Corners, robots: Sequence[int], cut: float) -> list[Route]:
     """The routes of robots along corners, which are rounded by ``cut`` at most [m], less where walls are near."""
     owner = np.repeat(np.asarray(robots), np.diff(stops.begin))
     spacing = SPACING * problem.team.largest_radius
-    points, first, times, bends = _rounded(stops, _corner_radii(problem, stops.places, owner, cut), spacing)
+    points, first, times, bends = _rounded(stops, _corner_radii(problem, stops.positions, owner, cut), spacing)
     ends = [slice(low, high) for low, high in pairwise(first)]
     return [Route(points[own], times[own], bends[own]) for own in ends]
 
@@ -145,30 +145,30 @@ def _lengths(steps: Floats) -> Floats:
 
 def _rounded(stops: Corners, radii: Floats, spacing: float) -> tuple[Floats, IntArray, Floats, Floats]:
     """``(points, first, times, bends)``, so far apart at most, along paths with corners rounded by these radii."""
-    corners, rounded = stops.places, np.flatnonzero((radii > 0) & np.isfinite(radii))
+    corners, rounded = stops.positions, np.flatnonzero((radii > 0) & np.isfinite(radii))
     arcs = _arcs(_bends_at(corners, rounded), radii[rounded], ARC_POINTS)
     # Corners that are rounded become as many points, others stay one.
     repeats = np.ones(len(corners), np.int64)
     repeats[rounded] = ARC_POINTS
-    places, bends, arrive = (np.repeat(array, repeats, axis=0) for array in (corners, radii, stops.arrives))
+    positions, bends, arrive = (np.repeat(array, repeats, axis=0) for array in (corners, radii, stops.arrives))
     depart = np.repeat(stops.departs, repeats)
     at = np.append(0, np.cumsum(repeats))
     index = at[rounded][:, None] + np.arange(ARC_POINTS)
-    places[index.ravel()] = arcs.reshape(-1, 3)
+    positions[index.ravel()] = arcs.reshape(-1, 3)
     # The first half of an arc belongs to the stretch before the corner, the second to the one after it.
     depart[index[:, 1:].ravel()] = np.repeat(stops.arrives[rounded], ARC_POINTS - 1)
     late = index[:, ARC_POINTS // 2 + 1 :]
     depart[late.ravel()] = arrive[late.ravel()] = np.repeat(stops.departs[rounded + 1], late.shape[1])
     # Long stretches become several points each.
-    start = np.zeros(len(places), bool)
+    start = np.zeros(len(positions), bool)
     start[at[stops.begin[:-1]]] = True
-    steps = np.diff(places, axis=0, prepend=places[:1])
+    steps = np.diff(positions, axis=0, prepend=positions[:1])
     steps[start] = 0.0
     parts = np.maximum(np.ceil(_lengths(steps) / spacing).astype(np.int64), 1)
     last = np.cumsum(parts)
     part = np.arange(last[-1]) - np.repeat(last - parts, parts) + 1
     share = part / np.repeat(parts, parts)
-    points = np.repeat(places - steps, parts, axis=0) + np.repeat(steps, parts, axis=0) * share[:, None]
+    points = np.repeat(positions - steps, parts, axis=0) + np.repeat(steps, parts, axis=0) * share[:, None]
     times = np.repeat(depart, parts) + np.repeat(arrive - depart, parts) * share
     inside = np.repeat(bends, parts)
     inside[part < np.repeat(parts, parts)] = np.inf

@@ -39,24 +39,24 @@ def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: i
         return None
     result = paths[np.minimum(np.arange(problem.horizon + 1), len(paths) - 1)]
     present = _driven(problem, result, dwell)
-    present.places[:, changed] = FAR
-    before, random, robots = present.places.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
+    present.positions[:, changed] = FAR
+    before, random, robots = present.positions.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
     order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
     driven = replanning.settle(present, order, random, lambda: False, TURNS * num_robots)
     if driven is None:
         return None
-    for robot in np.flatnonzero((driven.places != before).any(axis=(0, 2))):
+    for robot in np.flatnonzero((driven.positions != before).any(axis=(0, 2))):
         end = int(driven.arrivals[robot]) + 1
-        result[:end, robot], result[end:, robot] = driven.places[:end, robot, :d], problem.goal[robot]
+        result[:end, robot], result[end:, robot] = driven.positions[:end, robot, :d], problem.goal[robot]
     return result
 
 
 def _driven(problem: Problem, paths: FloatArray, dwell: int) -> TeamRollout:
     """A team on its paths ``(H + 1, K, d)``, which leaves its goals again; nothing is known of its controls."""
     steps, num_robots, d = problem.horizon, problem.num_robots, problem.dimension
-    there = np.linalg.norm(paths - problem.goal, axis=2) <= problem.goal_radius
-    arrivals = np.where(there.any(axis=0), there.argmax(axis=0), steps)
-    places = np.zeros((steps + 1, num_robots, 3))
-    places[:, :, :d] = paths
-    places[np.arange(steps + 1)[:, None] > arrivals + dwell] = FAR
-    return TeamRollout(np.zeros((steps, num_robots, problem.control_size), np.float32), places, arrivals)
+    at_goal = np.linalg.norm(paths - problem.goal, axis=2) <= problem.goal_radius
+    arrivals = np.where(at_goal.any(axis=0), at_goal.argmax(axis=0), steps)
+    positions = np.zeros((steps + 1, num_robots, 3))
+    positions[:, :, :d] = paths
+    positions[np.arange(steps + 1)[:, None] > arrivals + dwell] = FAR
+    return TeamRollout(np.zeros((steps, num_robots, problem.control_size), np.float32), positions, arrivals)

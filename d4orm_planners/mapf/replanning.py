@@ -116,32 +116,34 @@ def _departure(
         until = depart + steps + lost
         if until + left > trip.latest:
             break
-        there = interval_at(safe, head, until)
-        if there == safe.first[head + 1]:
+        arrival = interval_at(safe, head, until)
+        if arrival == safe.first[head + 1]:
             break
-        before = search.came[there]
-        if safe.begins[there] > until:
-            depart += safe.begins[there] - until
+        before = search.came[arrival]
+        if safe.begins[arrival] > until:
+            depart += safe.begins[arrival] - until
         elif before >= 0 and tree[before, 2] <= until:
-            depart += safe.ends[there] - until
+            depart += safe.ends[arrival] - until
         elif until <= dock:
             depart += 1
-        elif safe.ends[there] < min(until + trip.dwell, trip.latest):
-            depart += 1 + safe.ends[there] - until
+        elif safe.ends[arrival] < min(until + trip.dwell, trip.latest):
+            depart += 1 + safe.ends[arrival] - until
         else:
-            return depart, until, np.int64(there)
+            return depart, until, np.int64(arrival)
     return depart, depart, np.int64(-1)
 
 
 @compiled
-def _add_entry(tree: _Tree, head: Whole, depart: Whole, until: Whole, entry: Whole, there: Whole, cost: float) -> None:
-    entries, heap, number, place = tree.entries, tree.heap, tree.sizes[0], tree.sizes[1]
+def _add_entry(
+    tree: _Tree, head: Whole, depart: Whole, until: Whole, entry: Whole, arrival: Whole, cost: float
+) -> None:
+    entries, heap, number, position = tree.entries, tree.heap, tree.sizes[0], tree.sizes[1]
     entries[number, 0], entries[number, 1], entries[number, 2] = head, depart, until
-    entries[number, 3], entries[number, 4], tree.costs[number] = entry, there, cost
+    entries[number, 3], entries[number, 4], tree.costs[number] = entry, arrival, cost
     # It has the highest number, so it rises above what costs more only.
-    while place > 0 and tree.costs[heap[(place - 1) // 2]] > cost:
-        heap[place], place = heap[(place - 1) // 2], (place - 1) // 2
-    heap[place] = number
+    while position > 0 and tree.costs[heap[(position - 1) // 2]] > cost:
+        heap[position], position = heap[(position - 1) // 2], (position - 1) // 2
+    heap[position] = number
     tree.sizes[0], tree.sizes[1] = number + 1, tree.sizes[1] + 1
 
 
@@ -154,16 +156,16 @@ def _follow_edge(
     node, head, depart = entries[entry, 0], np.int64(roadmap.heads[e]), entries[entry, 2]
     steps, failures = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0
     while True:
-        depart, until, there = _departure(search, entries, entry, head, steps, left, trip, dock, depart)
-        if there < 0:
+        depart, until, arrival = _departure(search, entries, entry, head, steps, left, trip, dock, depart)
+        if arrival < 0:
             return
         if not is_edge_free(search.others, search.buckets, nodes[node], nodes[head], depart, until):
             # Whoever stands in the way often does so for long.
             failures += 1
             depart += 1 + failures // 4
             continue
-        search.came[there] = tree.sizes[0]
-        _add_entry(tree, head, depart, until, entry, there, until + left)
+        search.came[arrival] = tree.sizes[0]
+        _add_entry(tree, head, depart, until, entry, arrival, until + left)
         depart += 1
 
 
@@ -171,9 +173,9 @@ def _follow_edge(
 def _is_way(roadmap: Roadmap, bodies: Footprints, k: Whole, node: Whole, e: Whole) -> bool:
     """Check whether a robot can take an edge from a node: it fits, leads to the goal, and does not dock in passing."""
     nodes, head, goal = roadmap.nodes, np.int64(roadmap.heads[e]), bodies.goals[k]
-    if roadmap.room[e] < bodies.reach[k] or not bodies.costs[k, head] < np.inf:
+    if roadmap.room[e] < bodies.safety_distance[k] or not bodies.costs[k, head] < np.inf:
         return False
-    aside = (bodies.docked + bodies.slack / 2) ** 2
+    aside = (bodies.goal_radius + bodies.slack / 2) ** 2
     docks = bodies.docks and head != goal
     return not (docks and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside)
 

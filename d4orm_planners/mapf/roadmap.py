@@ -68,29 +68,31 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
     """
     d, radius = problem.dimension, np.asarray(problem.team.radius, np.float64)
     spread = 2 * radius.max() + problem.margin + PAIR_SLACK * problem.team.largest_radius
-    reaches = np.unique(radius + problem.margin)
+    safety_distances = np.unique(radius + problem.margin)
     space = make_space(problem) if problem.world.num_obstacles else None
     ends = np.unique(in_space(np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)), axis=0)
     asked, most = float(np.sqrt(2.0) * spread / fineness), min(MAX_NODES, MAX_COSTS // problem.num_robots)
-    lattice = lay_lattice(problem, space, float(reaches[-1]) * (1 + WALL_SLACK), asked, most, pad=PAD * asked)
-    places, step = lattice.places, lattice.step
-    near_end = np.diff(find_near(sort_into_cells(ends, step), places, places, REPLACED * step)[0]) > 0
-    nodes = np.concatenate([places[~near_end], ends])
+    lattice = lay_lattice(problem, space, float(safety_distances[-1]) * (1 + WALL_SLACK), asked, most, pad=PAD * asked)
+    positions, step = lattice.positions, lattice.step
+    near_end = np.diff(find_near(sort_into_cells(ends, step), positions, positions, REPLACED * step)[0]) > 0
+    nodes = np.concatenate([positions[~near_end], ends])
     far = step * (1.5 if d == 2 else 1.8)
     line_first, others = find_near(sort_into_cells(nodes, far), nodes, nodes, far, after=True)
     one, other = np.repeat(np.arange(len(nodes)), np.diff(line_first)), others.astype(np.int64)
-    room = _room(problem, space, reaches, nodes[one], nodes[other])
+    room = _room(problem, space, safety_distances, nodes[one], nodes[other])
     one, other, room = one[room > 0], other[room > 0], room[room > 0]
     return _assembled(problem, nodes, one, other, room, spread + problem.goal_radius)
 
 
-def _assembled(problem: Problem, nodes: Floats, one: IntArray, other: IntArray, room: Floats, reach: float) -> Roadmap:
+def _assembled(
+    problem: Problem, nodes: Floats, one: IntArray, other: IntArray, room: Floats, safety_distance: float
+) -> Roadmap:
     """The roadmap of nodes and undirected edges."""
     tails, heads = np.concatenate([one, other]), np.concatenate([other, one])
     order = np.lexsort((heads, tails))
     tails, heads, room = tails[order], heads[order], np.concatenate([room, room])[order]
     first = np.searchsorted(tails, np.arange(len(nodes) + 1)).astype(np.int64)
-    near_first, near = find_near(sort_into_cells(nodes, reach), nodes[tails], nodes[heads], reach)
+    near_first, near = find_near(sort_into_cells(nodes, safety_distance), nodes[tails], nodes[heads], safety_distance)
     gaps = np.empty(len(near))
     measure_gaps(nodes, tails, heads, near_first, near, gaps)
     d = problem.dimension
@@ -108,21 +110,21 @@ def _assembled(problem: Problem, nodes: Floats, one: IntArray, other: IntArray, 
     )
 
 
-def _numbers(nodes: Floats, places: FloatArray) -> IntArray:
-    """``(K,)`` the nodes that are at places ``(K, d)``."""
-    wanted = in_space(places.astype(np.float64))
-    return np.array([int(np.flatnonzero((nodes == place).all(axis=1))[-1]) for place in wanted], np.int64)
+def _numbers(nodes: Floats, positions: FloatArray) -> IntArray:
+    """``(K,)`` the nodes that are at positions ``(K, d)``."""
+    wanted = in_space(positions.astype(np.float64))
+    return np.array([int(np.flatnonzero((nodes == position).all(axis=1))[-1]) for position in wanted], np.int64)
 
 
-def _room(problem: Problem, space: Space | None, reaches: Floats, tails: Floats, heads: Floats) -> Floats:
-    """``(Q,)`` the largest of the ``reaches`` that passes on lines; zero where none does."""
+def _room(problem: Problem, space: Space | None, safety_distances: Floats, tails: Floats, heads: Floats) -> Floats:
+    """``(Q,)`` the largest of the ``safety_distances`` that passes on lines; zero where none does."""
     room = np.zeros(len(tails))
-    for reach in reaches:
+    for safety_distance in safety_distances:
         free = np.ones(len(tails), bool)
         if space is not None:
             # Where there is room, a little more is kept, because nobody drives exactly on the line.
-            free_lines(space, float(reach) * (1 + WALL_SLACK * 2 / 3), tails, heads, free)
-        room[free] = reach
+            free_lines(space, float(safety_distance) * (1 + WALL_SLACK * 2 / 3), tails, heads, free)
+        room[free] = safety_distance
     return room
 
 
@@ -146,10 +148,10 @@ class Footprints(NamedTuple):
     Attributes:
         radius: ``(K,)`` [m].
         size: The largest of them [m].
-        reach: ``(K,)`` radius and margin to obstacles [m].
+        safety_distance: ``(K,)`` radius and margin to obstacles [m].
         margin: Between robots [m].
         slack: Distance beyond it that they keep where they can [m].
-        docked: Distance from its goal at which a robot may stop [m].
+        goal_radius: Distance from its goal at which a robot may stop [m].
         docks: Whether a robot that has arrived stays there for good.
         starts: ``(K,)`` int64 nodes.
         goals: ``(K,)`` int64 nodes.
@@ -158,10 +160,10 @@ class Footprints(NamedTuple):
 
     radius: Floats
     size: float
-    reach: Floats
+    safety_distance: Floats
     margin: float
     slack: float
-    docked: float
+    goal_radius: float
     docks: bool
     starts: IntArray
     goals: IntArray
@@ -183,8 +185,8 @@ def passes_too_near(
     comes no nearer on the way.
     """
     hard = bodies.radius[k] + bodies.radius[i] + bodies.margin
-    docked = bodies.docks and u == bodies.goals[i]
-    need = hard + (bodies.slack / 2 + bodies.docked if docked else bodies.slack)
+    arrived = bodies.docks and u == bodies.goals[i]
+    need = hard + (bodies.slack / 2 + bodies.goal_radius if arrived else bodies.slack)
     if gap >= need:
         return False
     if tail == bodies.starts[k] or tail == bodies.goals[k]:
@@ -195,30 +197,30 @@ def passes_too_near(
 
 
 @compiled
-def closed(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
+def closed(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
     """Check whether an edge is closed to a robot for good: it would dock in passing, or be too near a docked one.
 
-    ``docked`` ``(N,)`` is the robot docked at each node, -1 for none.
+    ``arrived`` ``(N,)`` is the robot docked at each node, -1 for none.
     """
     head = np.int64(roadmap.heads[e])
-    if roadmap.room[e] < bodies.reach[k]:
+    if roadmap.room[e] < bodies.safety_distance[k]:
         return True
     if not bodies.docks:
         return False
     for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
         u = np.int64(roadmap.near[number])
         if u == bodies.goals[k]:
-            if u != head and u != tail and roadmap.gaps[number] < bodies.docked + bodies.slack / 2:
+            if u != head and u != tail and roadmap.gaps[number] < bodies.goal_radius + bodies.slack / 2:
                 return True
-        elif docked[u] >= 0:
-            i = docked[u]
+        elif arrived[u] >= 0:
+            i = arrived[u]
             if i != k and passes_too_near(roadmap, bodies, k, tail, head, i, u, roadmap.gaps[number]):
                 return True
     return False
 
 
 @cached_kernel(variant="costs", **OPTIONS)
-def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
+def fill_costs(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
     """Length of a robot's shortest path from every node to one; ``costs`` ``(N,)`` is output."""
     costs[:] = np.inf
     heap = [(0.0, np.int64(end))]
@@ -231,22 +233,22 @@ def fill_costs(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, end
             head = np.int64(roadmap.heads[e])
             # Compared as they are kept, in single precision, or rounding would let nodes come up for ever.
             through = np.float32(cost + roadmap.lengths[e])
-            if through < costs[head] and not closed(roadmap, bodies, docked, k, n, e):
+            if through < costs[head] and not closed(roadmap, bodies, arrived, k, n, e):
                 costs[head] = through
                 heapq.heappush(heap, (np.float64(through), head))
 
 
 @cached_kernel(variant="open", **OPTIONS)
-def is_open(roadmap: Roadmap, bodies: Footprints, docked: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
+def is_open(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
     """Check whether no docked robot closes the path that a robot at a node would take by these costs."""
     if not costs[at] < np.inf:
         return False
     while at != bodies.goals[k]:
         best, edge = costs[at], -1
         for e in range(roadmap.first[at], roadmap.first[at + 1]):
-            if costs[roadmap.heads[e]] < best and roadmap.room[e] >= bodies.reach[k]:
+            if costs[roadmap.heads[e]] < best and roadmap.room[e] >= bodies.safety_distance[k]:
                 best, edge = costs[roadmap.heads[e]], e
-        if edge < 0 or closed(roadmap, bodies, docked, k, at, edge):
+        if edge < 0 or closed(roadmap, bodies, arrived, k, at, edge):
             return False
         at = np.int64(roadmap.heads[edge])
     return True

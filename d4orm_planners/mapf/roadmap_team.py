@@ -47,7 +47,7 @@ what starts and goals themselves must be apart less, for rounding."""
 
 
 Drive: TypeAlias = tuple[FloatArray, Floats, int]
-"""Controls ``(T, m)``, places ``(T + 1, 3)`` and step of arrival of a robot."""
+"""Controls ``(T, m)``, positions ``(T + 1, 3)`` and step of arrival of a robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,20 +56,20 @@ class TeamRollout:
 
     Attributes:
         controls: ``(T, K, m)`` float32.
-        places: ``(T + 1, K, 3)`` float64 [m].
+        positions: ``(T + 1, K, 3)`` float64 [m].
         arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for one that has not arrived.
     """
 
     controls: FloatArray
-    places: Floats
+    positions: Floats
     arrivals: IntArray
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> TeamRollout:
         """Return the rollout of a team that docks."""
-        places = np.zeros((*trajectory.positions.shape[:2], 3))
-        places[..., : trajectory.positions.shape[2]] = trajectory.positions
-        return cls(trajectory.controls, places, arrival_steps(trajectory.arrived))
+        positions = np.zeros((*trajectory.positions.shape[:2], 3))
+        positions[..., : trajectory.positions.shape[2]] = trajectory.positions
+        return cls(trajectory.controls, positions, arrival_steps(trajectory.arrived))
 
     def cost(self, horizon: int) -> tuple[int, int]:
         """Less is better: robots that come too late, and the sum of all arrival steps."""
@@ -112,13 +112,13 @@ class Replanning:
         speed, acceleration = (np.asarray(problem.team.limits[:, column], np.float64) for column in (0, 1))
         self.strides = problem.dt * speed
         self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
-        places = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
-        gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in places]
-        self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.docked) - ROUNDING * self.size
+        positions = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
+        gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in positions]
+        self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.goal_radius) - ROUNDING * self.size
         # Who turns in place need not back up.
         self.turns = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
         d = problem.dimension
-        ends = np.stack([problem.world.clearance(place[:, :d]) for place in places])
+        ends = np.stack([problem.world.clearance(position[:, :d]) for position in positions])
         self.own_room = ends.min(axis=0) - TOUCH * self.size
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
@@ -127,8 +127,10 @@ class Replanning:
     ) -> TeamRollout | None:
         """The team with new paths for some robots, planned in their order; ``None`` if one finds none, or in time."""
         last = int(driven.arrivals.max())
-        changed = TeamRollout(driven.controls[:last].copy(), driven.places[: last + 1].copy(), driven.arrivals.copy())
-        occupancy = Occupancy(self.cells, changed.places)
+        changed = TeamRollout(
+            driven.controls[:last].copy(), driven.positions[: last + 1].copy(), driven.arrivals.copy()
+        )
+        occupancy = Occupancy(self.cells, changed.positions)
         occupancy.put(robots, FAR)
         latest = np.minimum(driven.arrivals + LATER, last)
         for robot in robots.tolist():
@@ -148,9 +150,9 @@ class Replanning:
             All robots' paths within the horizon; ``None`` if they were not found.
         """
         problem, steps, num_robots = self.problem, self.problem.horizon, self.problem.num_robots
-        places = np.full((steps + 1, num_robots, 3), FAR)
+        positions = np.full((steps + 1, num_robots, 3), FAR)
         controls = np.zeros((steps, num_robots, problem.control_size), np.float32)
-        driven = TeamRollout(controls, places, np.full(num_robots, steps + 1))
+        driven = TeamRollout(controls, positions, np.full(num_robots, steps + 1))
         waiting = np.argsort(self.alone + random.random(num_robots))
         return self.settle(driven, waiting, random, should_stop, most)
 
@@ -165,7 +167,7 @@ class Replanning:
         """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
         steps, waiting, num_robots = len(driven.controls), robots.tolist(), self.problem.num_robots
         settled, met = np.ones((2, num_robots), bool)
-        settled[robots], occupancy = False, Occupancy(self.cells, driven.places)
+        settled[robots], occupancy = False, Occupancy(self.cells, driven.positions)
         while waiting and not should_stop():
             most -= 1
             if most < 0:
@@ -178,7 +180,7 @@ class Replanning:
             else:
                 return None
             others = occupancy.around(self.separation(robot, KEEP))._replace(need=self.separation(robot, TOUCH))
-            find_meetings(others, driven.places[: self.leaves(int(driven.arrivals[robot])), robot], met)
+            find_meetings(others, driven.positions[: self.leaves(int(driven.arrivals[robot])), robot], met)
             displaced = settled & met
             occupancy.put(displaced, FAR)
             settled &= ~displaced
@@ -192,8 +194,8 @@ class Replanning:
 
     def separation(self, robot: int, beyond: float) -> Floats:
         """``(K,)`` how far a robot keeps from each other beyond radii and margin, where ends are so far apart [m]."""
-        reach = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + beyond * self.size
-        need: Floats = np.minimum(reach, self.ends_apart[robot])
+        safety_distance = self.bodies.radius[robot] + self.bodies.radius + self.bodies.margin + beyond * self.size
+        need: Floats = np.minimum(safety_distance, self.ends_apart[robot])
         need[robot] = 0.0
         return need
 
@@ -210,7 +212,7 @@ class Replanning:
         haste, others = 1 - random.random() * LEISURE, occupancy.around(self.separation(robot, KEEP))
         if minded is not None:
             others = others._replace(need=np.where(minded, others.need, 0.0))
-        close, usual = None, min(TOUCH * self.size, float(self.own_room[robot] - self.bodies.reach[robot]))
+        close, usual = None, min(TOUCH * self.size, float(self.own_room[robot] - self.bodies.safety_distance[robot]))
         for cruise, cut in SPEED_PROFILES:
             for drive in self.drives(others, robot, latest, cruise * haste, cut):
                 room = self.room_at_walls(others, robot, drive, latest)
@@ -225,10 +227,10 @@ class Replanning:
 
     def take(self, driven: TeamRollout, occupancy: Occupancy, robot: int, drive: Drive) -> None:
         """Let a robot drive so in ``driven``."""
-        driven.controls[:, robot], places, driven.arrivals[robot] = drive
-        occupancy.put(robot, places)
+        driven.controls[:, robot], positions, driven.arrivals[robot] = drive
+        occupancy.put(robot, positions)
         if self.dwell is not None:
-            driven.places[self.leaves(drive[2]) :, robot] = FAR
+            driven.positions[self.leaves(drive[2]) :, robot] = FAR
 
     def drives(self, others: Others, robot: int, latest: int, cruise: float, cut: float) -> Iterator[Drive]:
         """Rollouts of a robot along its path, if it has one, in one of the :data:`SPEED_PROFILES`."""
@@ -242,8 +244,8 @@ class Replanning:
                 break
         else:
             return
-        reach = bodies.reach[robot] * (1 + WALL_SLACK * 2 / 3)
-        left = straighten(roadmap, bodies, self.space, others, robot, reach, path)
+        safety_distance = bodies.safety_distance[robot] * (1 + WALL_SLACK * 2 / 3)
+        left = straighten(roadmap, bodies, self.space, others, robot, safety_distance, path)
         nodes, departs, arrives = path[:left].T
         stops = Corners(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
@@ -253,17 +255,17 @@ class Replanning:
 
     def room_at_walls(self, others: Others, robot: int, drive: Drive, latest: int) -> float:
         """Room that a robot's rollout leaves at obstacles beyond its margin [m]; -inf if late or too near to others."""
-        _, places, arrival = drive
+        _, positions, arrival = drive
         if arrival > latest:
             return -np.inf
         touch, met = np.minimum(self.separation(robot, TOUCH), others.need), np.empty(len(others.need), bool)
-        find_meetings(others._replace(need=touch), places[: self.leaves(arrival)], met)
+        find_meetings(others._replace(need=touch), positions[: self.leaves(arrival)], met)
         if met.any():
             return -np.inf
         if self.space is None:
             return np.inf
-        room = self.problem.world.clearance(places[1 : arrival + 1, : self.problem.dimension])
-        return float(room.min() - self.bodies.reach[robot])
+        room = self.problem.world.clearance(positions[1 : arrival + 1, : self.problem.dimension])
+        return float(room.min() - self.bodies.safety_distance[robot])
 
 
 def is_compiled(problem: Problem) -> bool:

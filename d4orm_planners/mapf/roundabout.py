@@ -46,7 +46,7 @@ class Bends(NamedTuple):
     angles: Floats
 
     def at(self, lengths: Floats) -> tuple[Floats, Floats]:
-        """``(K, 2)`` places and unit directions so far along the paths ``(K,)``."""
+        """``(K, 2)`` positions and unit directions so far along the paths ``(K,)``."""
         round_ = np.clip((lengths - self.first) / self.radius, 0, np.abs(self.angles[:, 1]))
         side = np.sign(self.angles[:, 1])
         angle = self.angles[:, 0] + side * round_
@@ -128,16 +128,16 @@ def _bends(problem: Problem, side: int) -> Bends | None:
     return Bends(begin, centre, bend, straight[0], np.stack([first, angle], axis=1))
 
 
-def _nearest_to_all(places: Floats, normals: Floats) -> Floats | None:
-    """``(2,)`` the place nearest to straight paths through ``places`` ``(K, 2)``; ``None`` if they are parallel.
+def _nearest_to_all(positions: Floats, normals: Floats) -> Floats | None:
+    """``(2,)`` the position nearest to straight paths through ``positions`` ``(K, 2)``; ``None`` if they are parallel.
 
     By normal equations whose sums are exact, so that it is the same on every processor.
     """
-    offset = (normals * places).sum(axis=1)
+    offset = (normals * positions).sum(axis=1)
     x, y = normals.T
     xx, xy, yy = (math.fsum((a * b).tolist()) for a, b in ((x, x), (x, y), (y, y)))
     right, up = (math.fsum((a * offset).tolist()) for a in (x, y))
     determinant = xx * yy - xy * xy
-    if determinant < PARALLEL * len(places) ** 2:
+    if determinant < PARALLEL * len(positions) ** 2:
         return None
     return np.array([yy * right - xy * up, xx * up - xy * right]) / determinant

@@ -57,11 +57,11 @@ def free_intervals(others: Others, start: Whole, num_nodes: Whole, steps: Whole)
         # The few visits to a node by their first steps.
         own, visit = 0, np.int64(last[n])
         while visit >= 0:
-            place = own
-            while place > 0 and visits[order[place - 1], 0] > visits[visit, 0]:
-                order[place] = order[place - 1]
-                place -= 1
-            order[place], own, visit = visit, own + 1, visits[visit, 2]
+            position = own
+            while position > 0 and visits[order[position - 1], 0] > visits[visit, 0]:
+                order[position] = order[position - 1]
+                position -= 1
+            order[position], own, visit = visit, own + 1, visits[visit, 2]
         if n == start and own > 0 and visits[order[0], 0] == 0:
             begins[used], ends[used] = 0, 1
             used += 1

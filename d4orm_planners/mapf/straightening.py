@@ -26,10 +26,10 @@ def _meets(others: Others, i: Whole, block: Whole, tail: Floats, head: Floats, d
     ):
         return False
     for step in range(max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)):
-        share, place = (step - depart) / (arrive - depart), others.positions[step, i]
-        dx = tail[0] + share * (head[0] - tail[0]) - place[0]
-        dy = tail[1] + share * (head[1] - tail[1]) - place[1]
-        dz = tail[2] + share * (head[2] - tail[2]) - place[2]
+        share, position = (step - depart) / (arrive - depart), others.positions[step, i]
+        dx = tail[0] + share * (head[0] - tail[0]) - position[0]
+        dy = tail[1] + share * (head[1] - tail[1]) - position[1]
+        dz = tail[2] + share * (head[2] - tail[2]) - position[2]
         if dx * dx + dy * dy + dz * dz < need * need:
             return True
     return False
@@ -58,7 +58,13 @@ def is_edge_free(others: Others, buckets: Buckets, tail: Floats, head: Floats, d
 
 @cached_kernel(variant="straighten", **OPTIONS)
 def straighten(
-    roadmap: Roadmap, bodies: Footprints, space: Space | None, others: Others, k: Whole, reach: float, path: IntArray
+    roadmap: Roadmap,
+    bodies: Footprints,
+    space: Space | None,
+    others: Others,
+    k: Whole,
+    safety_distance: float,
+    path: IntArray,
 ) -> int:
     """Leave out nodes of a path where the straight line is free of obstacles and of others.
 
@@ -68,24 +74,24 @@ def straighten(
         space: The world; ``None`` where there are no obstacles.
         others: Their motions.
         k: The robot.
-        reach: Distance that it keeps from obstacles [m].
+        safety_distance: Distance that it keeps from obstacles [m].
         path: ``(n, 3)`` of :func:`~d4orm_planners.mapf.replanning.find_path`, changed in place.
 
     Returns:
         How many are left.
     """
-    nodes, goal, docked, count, i = roadmap.nodes, bodies.goals[k], bodies.docked + bodies.slack, 1, 0
+    nodes, goal, arrived, count, i = roadmap.nodes, bodies.goals[k], bodies.goal_radius + bodies.slack, 1, 0
     while i + 1 < path.shape[0]:
         j = i + 1
         depart, tail = path[j, 1], nodes[path[i, 0]]
         while j + 1 < path.shape[0]:
             head = nodes[path[j + 1, 0]]
             near = near_neighbours.squared_gap(nodes, goal, nodes, path[i, 0], nodes, path[j + 1, 0])
-            if bodies.docks and path[j + 1, 0] != goal and near < docked * docked:
+            if bodies.docks and path[j + 1, 0] != goal and near < arrived * arrived:
                 break
             # Nested, because the compiler leaves out what is never reached.
             if space is not None:  # noqa: SIM102
-                if not is_free_line(space, reach, tail, head):
+                if not is_free_line(space, safety_distance, tail, head):
                     break
             if not _is_line_free(others, tail, head, depart, path[j + 1, 2]):
                 break

@@ -27,22 +27,22 @@ _ATTEMPTS = 500
 KINDS = ("circles", "spheres", "cylinders", "boxes", "polygons")
 
 
-def move_goal(problem: Problem, robot: int, place: ArrayLike) -> Problem:
-    """Send a robot elsewhere: ``place`` ``(d,)`` [m]."""
+def move_goal(problem: Problem, robot: int, position: ArrayLike) -> Problem:
+    """Send a robot elsewhere: ``position`` ``(d,)`` [m]."""
     check_robot(problem, robot)
     goal = np.array(problem.goal)
-    goal[robot] = place
-    _check_place(problem, "the goal", robot, goal)
+    goal[robot] = position
+    _check_position(problem, "the goal", robot, goal)
     return problem.with_state(problem.start, goal)
 
 
-def move_robot(problem: Problem, robot: int, place: ArrayLike) -> Problem:
-    """Put a robot elsewhere, at rest: ``place`` ``(d,)`` [m]."""
+def move_robot(problem: Problem, robot: int, position: ArrayLike) -> Problem:
+    """Put a robot elsewhere, at rest: ``position`` ``(d,)`` [m]."""
     check_robot(problem, robot)
     start = np.array(problem.start)
-    start[robot, : problem.dimension] = place
+    start[robot, : problem.dimension] = position
     _stop(problem, start, robot)
-    _check_place(problem, "the robot", robot, start[:, : problem.dimension])
+    _check_position(problem, "the robot", robot, start[:, : problem.dimension])
     return problem.with_state(start, problem.goal)
 
 
@@ -72,8 +72,8 @@ def add_robot(problem: Problem, random: np.random.Generator) -> Problem:
     count = problem.num_robots
     if count >= MOST_ROBOTS:
         raise ValueError(f"there are {count} robots, which is the most here; remove one first")
-    positions = np.vstack([problem.start[:, : problem.dimension], _free_place(problem, problem.start, random)])
-    goals = np.vstack([problem.goal, _free_place(problem, problem.goal, random)])
+    positions = np.vstack([problem.start[:, : problem.dimension], _free_position(problem, problem.start, random)])
+    goals = np.vstack([problem.goal, _free_position(problem, problem.goal, random)])
     start = np.zeros((count + 1, problem.start.shape[1]), np.float32)
     start[:count] = problem.start
     start[count, : problem.dimension] = positions[count]
@@ -94,11 +94,11 @@ def add_obstacle(problem: Problem, kind: str, random: np.random.Generator) -> Pr
     if world.num_obstacles >= MOST_OBSTACLES:
         raise ValueError(f"there are {world.num_obstacles} obstacles, which is the most here; remove one first")
     taken = np.vstack([problem.start[:, : problem.dimension], problem.goal])
-    place = _free_place(problem, taken, random, reach + float(np.max(problem.team.radius)))
+    position = _free_position(problem, taken, random, reach + float(np.max(problem.team.radius)))
     if kind == "box":
-        return _with_world(problem, boxes=[*world.boxes, [*(place - 0.2), *(place + 0.2)]])
+        return _with_world(problem, boxes=[*world.boxes, [*(position - 0.2), *(position + 0.2)]])
     name = "circles" if problem.dimension == 2 else "spheres"
-    return _with_world(problem, **{name: [*getattr(world, name), [*place, 0.2]]})
+    return _with_world(problem, **{name: [*getattr(world, name), [*position, 0.2]]})
 
 
 def remove_obstacle(problem: Problem) -> Problem:
@@ -129,17 +129,17 @@ def move_obstacle(problem: Problem, kind: str, index: int, shift: ArrayLike) -> 
 def followed(before: Problem, after: Problem, other: Problem, who: str) -> Problem:
     """Another team's scene changed as this one was: what was moved, added or removed is, all else stays."""
     kept = min(before.num_robots, after.num_robots)
-    places, moved = [], []
-    for here, there, elsewhere in zip(_places(before), _places(after), _places(other)):
+    positions, moved = [], []
+    for here, there, elsewhere in zip(_positions(before), _positions(after), _positions(other)):
         same = (there[:kept] == here[:kept]).all(axis=1)
         there[:kept][same] = elsewhere[:kept][same]
-        places.append(there)
+        positions.append(there)
         moved.append([*np.flatnonzero(~same), *range(kept, len(there))])
-    changed = after.with_state(*places)
+    changed = after.with_state(*positions)
     try:
-        for what, rows, robots in zip(("the robot", "the goal"), places, moved):
+        for what, rows, robots in zip(("the robot", "the goal"), positions, moved):
             for robot in robots:
-                _check_place(changed, what, int(robot), rows[:, : changed.dimension])
+                _check_position(changed, what, int(robot), rows[:, : changed.dimension])
         if after.world is not before.world:
             _check_world(changed)
     except ValueError as error:
@@ -147,7 +147,7 @@ def followed(before: Problem, after: Problem, other: Problem, who: str) -> Probl
     return changed
 
 
-def _places(problem: Problem) -> tuple[FloatArray, FloatArray]:
+def _positions(problem: Problem) -> tuple[FloatArray, FloatArray]:
     """Copies of starts and goals."""
     return np.array(problem.start), np.array(problem.goal)
 
@@ -161,21 +161,21 @@ def _with_world(problem: Problem, **changes: object) -> Problem:
 def _check_world(problem: Problem) -> None:
     """Refuse obstacles on robots and goals."""
     radius = np.asarray(problem.team.radius, np.float64)
-    for what, places in (("robot", problem.start[:, : problem.dimension]), ("goal of robot", problem.goal)):
-        touched = np.flatnonzero(problem.world.clearance(places) <= radius)
+    for what, positions in (("robot", problem.start[:, : problem.dimension]), ("goal of robot", problem.goal)):
+        touched = np.flatnonzero(problem.world.clearance(positions) <= radius)
         if len(touched):
             raise ValueError(f"the obstacle would touch the {what}_{touched[0]}; put it elsewhere")
 
 
-def _check_place(problem: Problem, what: str, robot: int, places: FloatArray) -> None:
-    """Refuse the place of a robot among ``places`` ``(K, d)`` if it is none, or touches something."""
+def _check_position(problem: Problem, what: str, robot: int, positions: FloatArray) -> None:
+    """Refuse the place of a robot among ``positions`` ``(K, d)`` if it is none, or touches something."""
     radius = np.asarray(problem.team.radius, np.float64)
-    if not np.isfinite(places[robot]).all():
+    if not np.isfinite(positions[robot]).all():
         raise ValueError(f"{what} of robot_{robot} is not at a place; drag it again")
-    check_resolution(problem.team, places, problem.dt, problem.goal_radius)
-    if problem.world.clearance(places[robot]) <= radius[robot]:
+    check_resolution(problem.team, positions, problem.dt, problem.goal_radius)
+    if problem.world.clearance(positions[robot]) <= radius[robot]:
         raise ValueError(f"{what} of robot_{robot} would touch an obstacle or the bounds; it stays where it was")
-    gaps = np.linalg.norm(places - places[robot], axis=1) - radius - radius[robot]
+    gaps = np.linalg.norm(positions - positions[robot], axis=1) - radius - radius[robot]
     gaps[robot] = np.inf
     if gaps.min() <= 0:
         raise ValueError(
@@ -183,19 +183,19 @@ def _check_place(problem: Problem, what: str, robot: int, places: FloatArray) ->
         )
 
 
-def _free_place(
+def _free_position(
     problem: Problem, taken: ArrayLike, random: np.random.Generator, reach: float | None = None
 ) -> FloatArray:
-    """``(d,)`` a random place with room for a robot of the first one's size among ``taken`` ``(N, d or more)``."""
+    """``(d,)`` a random position with room for a robot of the first one's size among ``taken`` ``(N, d or more)``."""
     others = np.asarray(taken, np.float32)[:, : problem.dimension]
     reach = float(problem.team.radius[0]) + problem.margin if reach is None else reach
     room = reach + float(np.max(problem.team.radius))
     low, high = goal_region(problem)
     for _ in range(_ATTEMPTS):
-        place = random.uniform(low, high).astype(np.float32)
-        clear = problem.world.clearance(place) > reach
-        if clear and (np.linalg.norm(others - place, axis=1) > room).all():
-            return place
+        position = random.uniform(low, high).astype(np.float32)
+        clear = problem.world.clearance(position) > reach
+        if clear and (np.linalg.norm(others - position, axis=1) > room).all():
+            return position
     raise ValueError("there is no room for one more; remove something first")
 
 

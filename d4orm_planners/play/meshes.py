@@ -27,9 +27,9 @@ NO_LINES: tuple[Points, Colors] = np.zeros((0, 2, 3), np.float32), np.zeros((0, 
 def in_space(points: ArrayLike) -> Points:
     """Points ``(..., d)`` as new ones ``(..., 3)``."""
     given = np.asarray(points, np.float32)
-    places = np.zeros((*given.shape[:-1], 3), np.float32)
-    places[..., : given.shape[-1]] = given
-    return places
+    positions = np.zeros((*given.shape[:-1], 3), np.float32)
+    positions[..., : given.shape[-1]] = given
+    return positions
 
 
 def linear(colors: Numbers) -> Colors:
@@ -112,10 +112,10 @@ def polylines(
     Returns:
         ``(N, 2, 3)`` ends and their colours.
     """
-    places, share = in_space(path), np.linspace(shares[0], shares[1], len(path))[:, None]
+    positions, share = in_space(path), np.linspace(shares[0], shares[1], len(path))[:, None]
     points, tones = [NO_LINES[0]], [NO_LINES[1].astype(np.float64)]
     for robot, taken in enumerate(knots):
-        path, tone = places[taken, robot], paper + share[taken] * (colors[robot] - paper)
+        path, tone = positions[taken, robot], paper + share[taken] * (colors[robot] - paper)
         points.append(np.stack([path[:-1], path[1:]], axis=1))
         tones.append(np.stack([tone[:-1], tone[1:]], axis=1))
     return np.concatenate(points), linear(np.concatenate(tones))
@@ -171,7 +171,7 @@ def body_groups(problem: Problem) -> list[BodyGroup]:
     planar = problem.team.shapes and problem.dimension == 2
     for number, body in enumerate(problem.team.bodies):
         kinds.setdefault(body.footprint if planar else None, []).append(number)
-    return [_group(problem, f"robots_{place}", *kind) for place, kind in enumerate(kinds.items())]
+    return [_group(problem, f"robots_{position}", *kind) for position, kind in enumerate(kinds.items())]
 
 
 def _group(problem: Problem, name: str, footprint: Footprint | None, numbers: list[int]) -> BodyGroup:
@@ -194,16 +194,16 @@ def _group(problem: Problem, name: str, footprint: Footprint | None, numbers: li
     return BodyGroup(name, bodies, robots, mesh, sizes, (mesh, sizes + margin))
 
 
-def body_places(problem: Problem, states: FloatArray, places: Points) -> tuple[Points, FloatArray | None]:
-    """``(F, 3)`` positions and ``(F, 4)`` quaternions of all bodies, their robots drawn at ``places`` ``(K, 3)``.
+def body_positions(problem: Problem, states: FloatArray, positions: Points) -> tuple[Points, FloatArray | None]:
+    """``(F, 3)`` positions and ``(F, 4)`` quaternions of all bodies, their robots drawn at ``positions`` ``(K, 3)``.
 
     A body lies from its robot as it does in ``states`` ``(K, n)``. What is round has no turn: ``None``.
     """
     if not problem.team.shapes or problem.dimension == 3:
-        return places, None
+        return positions, None
     d, poses = problem.dimension, problem.team.body_poses(states)
     robots = [body.robot for body in problem.team.bodies]
-    shown = places[robots] + in_space(poses[:, :d] - states[robots, :d])
+    shown = positions[robots] + in_space(poses[:, :d] - states[robots, :d])
     half = 0.5 * poses[:, d]
     turns = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=1)
     return shown, turns.astype(np.float32)
@@ -222,14 +222,14 @@ def goal_poses(problem: Problem, goals: Points) -> tuple[Points, NDArray[np.intp
     return np.concatenate(lines), np.concatenate(owners)
 
 
-def heading_lines(problem: Problem, states: FloatArray, places: Points) -> Points:
+def heading_lines(problem: Problem, states: FloatArray, positions: Points) -> Points:
     """``(N, 2, 3)`` lines from the centre to the front of robots that have one."""
     models, fronts = problem.team.robot_models, [shape.outline()[:, 0].max() for shape in problem.team.footprint]
     drives = [(robot, model.heading_index) for robot, model in enumerate(models) if model.heading_index is not None]
     points = np.zeros((len(drives), 2, 3), np.float32)
     for row, (robot, index) in enumerate(drives):
         angle = states[robot, index]
-        points[row] = places[robot] + np.array([0, 0, 0.3 * problem.team.radius[robot]])
+        points[row] = positions[robot] + np.array([0, 0, 0.3 * problem.team.radius[robot]])
         points[row, 1, :2] += fronts[robot] * np.array([np.cos(angle), np.sin(angle)])
     return points
 

@@ -75,13 +75,13 @@ class View:
     def _rebuild(self, frames: tuple[Frame, ...]) -> None:
         """Make all shapes anew."""
         limits = in_space(view_limits(frames[0].problem))
-        places = _places(len(frames), limits)
+        positions = _positions(len(frames), limits)
         with self._server.atomic():
             for lane in self._lanes:
                 lane.remove()
             self._lanes = [
-                LaneView(self._server, self._session, index, frame, place, self.shown)
-                for index, (frame, place) in enumerate(zip(frames, places, strict=True))
+                LaneView(self._server, self._session, index, frame, position, self.shown)
+                for index, (frame, position) in enumerate(zip(frames, positions, strict=True))
             ]
             if len(frames) > 1:
                 top = np.array([limits[:, 0].mean(), limits[1, 1], limits[:, 2].mean()], np.float32)
@@ -91,11 +91,11 @@ class View:
         scene = (problem.name, problem.num_robots, problem.dimension, len(frames))
         if scene != self._looked_at:
             self._looked_at = scene
-            corners = limits + places[:, None]
+            corners = limits + positions[:, None]
             self._camera.show(np.stack([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]), problem.dimension)
 
 
-def _places(number: int, limits: Points) -> Points:
+def _positions(number: int, limits: Points) -> Points:
     """``(number, 3)`` where scenes of this size are side by side, in rows of about as many."""
     columns = math.ceil(math.sqrt(number))
     row, column = np.divmod(np.arange(number), columns)

@@ -92,11 +92,11 @@ class Frame:
 
 def closest_approach(problem: Problem, states: FloatArray) -> float:
     """Least distance between the surfaces of two robots, or of one and an obstacle or the bounds [m]."""
-    places = states[:, : problem.dimension].astype(np.float64)
+    positions = states[:, : problem.dimension].astype(np.float64)
     radius = np.asarray(problem.team.radius, np.float64)
-    least = float((problem.world.clearance(places) - radius).min())
-    gaps = np.linalg.norm(places[:, None] - places, axis=2) - radius[:, None] - radius
-    gaps[np.diag_indices(len(places))] = np.inf
+    least = float((problem.world.clearance(positions) - radius).min())
+    gaps = np.linalg.norm(positions[:, None] - positions, axis=2) - radius[:, None] - radius
+    gaps[np.diag_indices(len(positions))] = np.inf
     return min(least, float(gaps.min()))
 
 

@@ -125,7 +125,7 @@ class Session:
         chosen = leader.farthest if robot is None else robot
         leader.push(chosen, given)
         for other in self._lanes:
-            if other is not leader and not other.docked[chosen]:
+            if other is not leader and not other.arrived[chosen]:
                 other.push(chosen, given)
         self._show(self._state)
 

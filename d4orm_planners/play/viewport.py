@@ -143,7 +143,7 @@ class Viewport:
         return not self._env.agents
 
     @property
-    def docked(self) -> BoolArray:
+    def arrived(self) -> BoolArray:
         """``(K,)`` bool: at the goal for good."""
         return self._joint.arrived & self._scene.docks
 
@@ -182,7 +182,7 @@ class Viewport:
         """
         joint, problem = self._joint, self._scene
         check_robot(problem, robot)
-        if self.docked[robot]:
+        if self.arrived[robot]:
             raise ValueError(f"robot_{robot} of {self.name} has docked; push one that is under way")
         given = np.zeros((1, problem.num_robots, problem.dimension), np.float32)
         given[0, robot] = velocity

@@ -22,7 +22,7 @@ from d4orm_planners.play.meshes import (
     Points,
     ball,
     body_groups,
-    body_places,
+    body_positions,
     edges,
     goal_poses,
     heading_lines,
@@ -65,7 +65,7 @@ class LaneView:
         session: Session,
         index: int,
         frame: Frame,
-        place: Points,
+        position: Points,
         shown: Mapping[str, bool],
     ) -> None:
         self._scene, self._session, self._index, self._shown = server.scene, session, index, shown
@@ -76,8 +76,8 @@ class LaneView:
         self._paths = {name: PathLines(frame.problem) for name in ("plans", "guidance")}
         self._colors = self._own_colors = 255 * robot_colors(frame.problem.num_robots)
         self._groups = body_groups(frame.problem)
-        self._places: dict[str, Points] = {}
-        self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=place)}
+        self._positions: dict[str, Points] = {}
+        self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=position)}
         self._add_team(frame)
         self._add_world(frame.problem)
         self._add_bodies(frame)
@@ -87,10 +87,10 @@ class LaneView:
                 f"{self._root}/{name}", NO_LINES[0], color, thickness=wide, thickness_units="screen",
             )  # fmt: skip
 
-    def name(self, text: str, place: Points) -> None:
+    def name(self, text: str, position: Points) -> None:
         """Write the policy's name at a position of this scene."""
         self._nodes["name"] = self._scene.add_label(
-            f"{self._root}/name", text, position=place, anchor="bottom-center", font_screen_scale=1.3
+            f"{self._root}/name", text, position=position, anchor="bottom-center", font_screen_scale=1.3
         )
 
     def remove(self) -> None:
@@ -106,11 +106,11 @@ class LaneView:
                 self._trail = [*self._trail[-TRAIL_STEPS:], frame.states[:, : frame.problem.dimension]]
             self._seen = seen
             self._color(frame)
-        places = self._with_held("robot", in_space(frame.positions(now)))
+        positions = self._with_held("robot", in_space(frame.positions(now)))
         goals = self._with_held("goal", in_space(frame.goals))
-        self._places = {"robot": places, "goal": goals}
-        self._move_team(frame, places)
-        nodes["heading"].points = heading_lines(frame.problem, frame.states, places)
+        self._positions = {"robot": positions, "goal": goals}
+        self._move_team(frame, positions)
+        nodes["heading"].points = heading_lines(frame.problem, frame.states, positions)
         nodes["goals"].batched_positions = goals
         if len(frame.bodies):
             nodes["bodies"].batched_positions = in_space(frame.body_positions(now))
@@ -121,9 +121,9 @@ class LaneView:
             self._lines_at = now
             self._draw_lines(frame)
 
-    def _move_team(self, frame: Frame, places: Points) -> None:
-        """Move all bodies, their robots to ``places`` ``(K, 3)``."""
-        shown, turns = body_places(frame.problem, frame.states, places)
+    def _move_team(self, frame: Frame, positions: Points) -> None:
+        """Move all bodies, their robots to ``positions`` ``(K, 3)``."""
+        shown, turns = body_positions(frame.problem, frame.states, positions)
         for group in self._groups:
             margins = self._nodes[f"margins_{group.name}"]
             margins.visible = self._shown["margins"]
@@ -132,12 +132,12 @@ class LaneView:
                 if turns is not None:
                     node.batched_wxyzs = turns[group.bodies]
 
-    def _with_held(self, kind: str, places: Points) -> Points:
+    def _with_held(self, kind: str, positions: Points) -> Points:
         """Positions, with those that are dragged at the pointer."""
-        for (what, index), place in list(self._held.items()):
-            if what == kind and index < len(places):
-                places[index] = place
-        return places
+        for (what, index), position in list(self._held.items()):
+            if what == kind and index < len(positions):
+                positions[index] = position
+        return positions
 
     def _add_team(self, frame: Frame) -> None:
         problem = frame.problem
@@ -145,34 +145,42 @@ class LaneView:
         radius = np.array([footprint.outer_radius for footprint in problem.team.footprint], np.float32)
         flat = problem.dimension == 2
         mark, dot = 1.5 * radius if flat else 1.4 * radius, 0.35 * radius
-        places, goals = in_space(frame.positions(time.perf_counter())), in_space(frame.goals)
-        shown = body_places(problem, frame.states, places)[0]
+        positions, goals = in_space(frame.positions(time.perf_counter())), in_space(frame.goals)
+        shown = body_positions(problem, frame.states, positions)[0]
         for group in self._groups:
             at, colors = shown[group.bodies], self._colors[group.robots]
             self._add_many(group.name, group.mesh, at, group.scales, colors, 1.0)
             self._add_many(f"margins_{group.name}", group.margin[0], at, group.margin[1], np.array(MARGIN), 0.25)
-            move = lambda index, place, _: lambda problem: edits.move_robot(problem, index, place)  # noqa: E731
+            move = lambda index, position, _: lambda problem: edits.move_robot(problem, index, position)  # noqa: E731
             self._drag(group.name, "robot", move, group.robots)
             self._drag_pushes(group)
         diamond = puck(4, 0.2) if flat else ball(0)
         self._add_many("goals", diamond, goals, np.stack([mark] * 3, axis=1), self._colors, 0.6 if flat else 0.35)
-        self._add_many("subgoals", ball(0), places, np.stack([dot] * 3, axis=1), self._colors, 0.9)
-        self._drag("goals", "goal", lambda index, place, _: lambda problem: edits.move_goal(problem, index, place))
+        self._add_many("subgoals", ball(0), positions, np.stack([dot] * 3, axis=1), self._colors, 0.9)
+        self._drag(
+            "goals", "goal", lambda index, position, _: lambda problem: edits.move_goal(problem, index, position)
+        )
 
     def _add_bodies(self, frame: Frame) -> None:
         """Add the dynamic obstacles."""
         if len(frame.bodies):
             radius = frame.bodies[:, -1]
             mesh, high = (puck(24), 0.5 * radius) if frame.problem.dimension == 2 else (ball(2), radius)
-            places = in_space(frame.bodies[:, : frame.problem.dimension])
-            self._add_many("bodies", mesh, places, np.stack([radius, radius, high], axis=1), np.array(BODY), 1.0)
+            positions = in_space(frame.bodies[:, : frame.problem.dimension])
+            self._add_many("bodies", mesh, positions, np.stack([radius, radius, high], axis=1), np.array(BODY), 1.0)
 
     def _add_many(
-        self, name: str, mesh: trimesh.Trimesh, places: Points, scales: FloatArray, colors: FloatArray, opacity: float
+        self,
+        name: str,
+        mesh: trimesh.Trimesh,
+        positions: Points,
+        scales: FloatArray,
+        colors: FloatArray,
+        opacity: float,
     ) -> None:
         self._nodes[name] = self._scene.add_batched_meshes_simple(
             f"{self._root}/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32),
-            np.tile(np.array([1, 0, 0, 0], np.float32), (len(places), 1)), places, batched_scales=scales,
+            np.tile(np.array([1, 0, 0, 0], np.float32), (len(positions), 1)), positions, batched_scales=scales,
             batched_colors=linear(colors), opacity=opacity, material="toon5", lod="off", cast_shadow=False,
             receive_shadow=False,
         )  # fmt: skip
@@ -226,7 +234,7 @@ class LaneView:
     def _follow_hand(
         self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, whose: Whose = None
     ) -> None:
-        """Call ``moved(number, place, shift so far, ended)`` while one of a node's shapes is dragged.
+        """Call ``moved(number, position, shift so far, ended)`` while one of a node's shapes is dragged.
 
         The number is that of the shape, or what ``whose`` ``(N,)`` has for it.
         """
@@ -237,7 +245,7 @@ class LaneView:
             instance = event.instance_index or 0
             index, hand = instance if whose is None else int(whose[instance]), (event.client_id, instance)
             if event.phase == "start":
-                at = self._place_of(kind, index)
+                at = self._position_of(kind, index)
                 grips[hand] = (at, self._pointed(event, at))
             if hand in grips:
                 (at, grip), ended = grips[hand], event.phase == "end"
@@ -250,9 +258,9 @@ class LaneView:
         frames = self._session.frames
         return frames[min(self._index, len(frames) - 1)]
 
-    def _place_of(self, kind: str, index: int) -> Points:
+    def _position_of(self, kind: str, index: int) -> Points:
         """``(3,)`` where the page shows it; the session may be further on."""
-        return np.array(self._places[kind][index] if kind in self._places else self._nodes[kind].position)
+        return np.array(self._positions[kind][index] if kind in self._positions else self._nodes[kind].position)
 
     def _pointed(self, event: viser.SceneNodeDragEvent[viser.SceneNodeHandle], at: Points) -> Points:
         """Return the pointer's position: on the plane that planar robots drive on, or as far off as the shape."""
@@ -289,11 +297,11 @@ class LaneView:
         for name, path, shades in (("plans", frame.plan, (1.0, 0.4)), ("guidance", frame.guidance, (0.8, 0.25))):
             if path is not None and len(path) > 1 and self._shown[name]:
                 lines[name] = self._paths[name].drawn(path, self._colors, self._paper, shades)
-        poses, owners = goal_poses(frame.problem, self._places["goal"])
+        poses, owners = goal_poses(frame.problem, self._positions["goal"])
         lines["goal_poses"] = poses, linear(np.repeat(self._colors[owners][:, None], 2, axis=1))
         for name, (points, colors) in lines.items():
             self._nodes[name].points, self._nodes[name].colors = points, colors
 
 
 def _mover(kind: str, index: int) -> Callable[[int, FloatArray, FloatArray], edits.Edit]:
-    return lambda _, place, shift: lambda problem: edits.move_obstacle(problem, kind, index, shift)
+    return lambda _, position, shift: lambda problem: edits.move_obstacle(problem, kind, index, shift)

@@ -221,13 +221,17 @@ class Checkpoint:
         room = _room(model, env)
         numbers = {}
         with (self.folder / "state.npz").open("rb") as stream, ArrayArchive(stream, room) as archive:
-            for name, place in room.items():
+            for name, position in room.items():
                 if not (fresh or name.startswith(tuple(f"{running}_" for running in _running(env)))):
                     continue
-                numbers[name] = array = archive.array(name, place.nbytes)
-                same = array.shape[1:] == place.shape[1:] and array.ndim == place.ndim and array.dtype == place.dtype
-                if not same or (not name.startswith("replay_") and array.shape != place.shape):
-                    raise ValueError(f"{name} is {array.dtype} {array.shape}, not {place.dtype} {place.shape}")
+                numbers[name] = array = archive.array(name, position.nbytes)
+                same = (
+                    array.shape[1:] == position.shape[1:]
+                    and array.ndim == position.ndim
+                    and array.dtype == position.dtype
+                )
+                if not same or (not name.startswith("replay_") and array.shape != position.shape):
+                    raise ValueError(f"{name} is {array.dtype} {array.shape}, not {position.dtype} {position.shape}")
         return numbers
 
     def _set_parameters(self, model: BaseAlgorithm) -> None:

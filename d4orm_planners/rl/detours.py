@@ -22,12 +22,12 @@ class Detours:
         self._docked = np.zeros(problem.num_robots, np.bool_)
         self._alone: dict[int, Problem] = {}
 
-    def goals(self, joint: JointState, places: FloatArray) -> FloatArray:
+    def goals(self, joint: JointState, positions: FloatArray) -> FloatArray:
         """Return where robots should head: their goals, or along their paths where a docked robot is in the way.
 
         Args:
             joint: The team.
-            places: ``(K, d)`` where the robots are [m].
+            positions: ``(K, d)`` where the robots are [m].
 
         Returns:
             ``(K, d)`` [m].
@@ -38,26 +38,26 @@ class Detours:
             kind = "circles" if world.dimension == 2 else "spheres"
             self._world = world.replace(**{kind: np.concatenate([world.balls, round_ones])})
         heads = joint.goals.copy()
-        for robot in self._blocked(joint, places).tolist():
+        for robot in self._blocked(joint, positions).tolist():
             if robot not in self._alone:
                 one = self._problem.select([robot])
                 start = joint.states[[robot], : one.state_size]
                 self._alone[robot] = one.with_state(start, joint.goals[[robot]], world=self._world)
-            heads[robot] = goals_along_paths(self._alone[robot], places[[robot]], joint.goals[[robot]])[0]
+            heads[robot] = goals_along_paths(self._alone[robot], positions[[robot]], joint.goals[[robot]])[0]
         return heads
 
     @property
     def _radius(self) -> FloatArray:
         return self._problem.team.radius
 
-    def _blocked(self, joint: JointState, places: FloatArray) -> IntArray:
+    def _blocked(self, joint: JointState, positions: FloatArray) -> IntArray:
         """Numbers of the robots that a docked one is in the way of."""
-        docked, ahead = self._docked, joint.goals - places
-        beside = joint.states[docked, : self._problem.dimension] - places[:, None]
+        arrived, ahead = self._docked, joint.goals - positions
+        beside = joint.states[arrived, : self._problem.dimension] - positions[:, None]
         along = (
             np.einsum("kd,knd->kn", ahead, beside)
             / np.maximum((ahead * ahead).sum(axis=1), np.finfo(np.float32).tiny)[:, None]
         )
         gaps = np.linalg.norm(beside - np.clip(along, 0, 1)[..., None] * ahead[:, None], axis=2)
-        reach = self._radius[:, None] + self._radius[docked] + self._problem.margin
-        return np.flatnonzero((gaps < reach).any(axis=1) & ~docked)
+        reach = self._radius[:, None] + self._radius[arrived] + self._problem.margin
+        return np.flatnonzero((gaps < reach).any(axis=1) & ~arrived)

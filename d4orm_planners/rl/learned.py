@@ -147,16 +147,16 @@ class LearnedPolicy(Policy):
         """
         features = network.features_for(seen.shape[1])
         assert features is not None, "reset has checked the observations"
-        places, own = joint.goals.copy(), features.slices.own.goal
-        places[robots] -= seen[:, own]
+        positions, own = joint.goals.copy(), features.slices.own.goal
+        positions[robots] -= seen[:, own]
         if network.header.shortest_paths:
-            heads = goals_along_paths(self.problem, places, joint.goals)
+            heads = goals_along_paths(self.problem, positions, joint.goals)
         elif self._detours is not None and joint.arrived.any():
-            heads = self._detours.goals(joint, places)
+            heads = self._detours.goals(joint, positions)
         else:
             return
         elsewhere = (heads != joint.goals).any(axis=1)[robots]
-        seen[elsewhere, own] = (heads - places)[robots][elsewhere]
+        seen[elsewhere, own] = (heads - positions)[robots][elsewhere]
 
 
 def _paths_matter(world: World) -> bool:

@@ -43,14 +43,14 @@ def perturbed(
 
 
 def clutter(
-    seed: int, num_robots: int, *, places: int = 0, obstacles: int = 6, size: float = 5.0, **settings: Any
+    seed: int, num_robots: int, *, positions: int = 0, obstacles: int = 6, size: float = 5.0, **settings: Any
 ) -> Problem:
     """Random starts and goals in a square with round obstacles, which are the same for every seed.
 
     Args:
         seed: Of starts and goals.
         num_robots: Size of the team.
-        places: Seed of the obstacles.
+        positions: Seed of the obstacles.
         obstacles: Number of obstacles.
         size: Side of the square [m].
         **settings: Of scenario ``random``.
@@ -59,7 +59,7 @@ def clutter(
         ValueError: If the robots do not fit.
     """
     problem = make_problem("random", num_robots=num_robots, size=size, **settings)
-    fixed = np.random.default_rng(places)
+    fixed = np.random.default_rng(positions)
     circles = np.column_stack(
         [fixed.uniform(-0.4 * size, 0.4 * size, (obstacles, 2)), fixed.uniform(0.1, 0.3, obstacles)]
     )

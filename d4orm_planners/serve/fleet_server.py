@@ -25,7 +25,7 @@ from d4orm_planners.serve.wire import (
     diagnostics,
     full_state,
     heading_of,
-    place_of,
+    position_of,
     state_from,
     time_of,
     turned,
@@ -72,12 +72,12 @@ class FleetRobot:
 
     def take_pose(self, stamped: Any, base: float) -> None:
         """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by ``base`` seconds at least."""
-        now, place = time_of(stamped.header), place_of(stamped.pose.position)
+        now, position = time_of(stamped.header), position_of(stamped.pose.position)
         passed = np.inf if self.posed is None else now - self.posed[0]
         if passed < base and passed >= 0:
             return
-        self.velocity = (place - self.posed[1]) / passed if self.posed and 0 < passed < np.inf else np.zeros(3)
-        self.posed = now, place
+        self.velocity = (position - self.posed[1]) / passed if self.posed and 0 < passed < np.inf else np.zeros(3)
+        self.posed = now, position
 
 
 class FleetServer:
@@ -193,10 +193,10 @@ class FleetServer:
 
     def _read(self, now: float) -> None:
         for topic, message in self._odometry.take():
-            self._hear(topic, message.pose.pose, place_of(message.twist.twist.linear), now)
+            self._hear(topic, message.pose.pose, position_of(message.twist.twist.linear), now)
         for topic, message in self._poses.take():
             number = self._by_name.get(topic.partition("/")[0])
-            if number is not None and np.isfinite(place_of(message.pose.position)).all():
+            if number is not None and np.isfinite(position_of(message.pose.position)).all():
                 robot = self._robots[number]
                 robot.take_pose(message, BASE * self._problem.dt)
                 own = turned(robot.velocity, -heading_of(message.pose.orientation))
@@ -224,9 +224,9 @@ class FleetServer:
         if np.isfinite(state).all():
             robot.state, robot.heading, robot.heard = state, heading_of(pose.orientation), now
 
-    def _take_goal(self, number: int, place: Any) -> None:
+    def _take_goal(self, number: int, position: Any) -> None:
         goals = self._problem.goal.copy()
-        goals[number] = [place.x, place.y, place.z][: self._problem.dimension]
+        goals[number] = [position.x, position.y, position.z][: self._problem.dimension]
         try:
             self._problem, self._replan = self._problem.replace(goal=goals), True
         except ValueError as error:
@@ -263,12 +263,12 @@ class FleetServer:
         self._pace = max(before - self._braking, 0.0)
         for number, robot in enumerate(self._robots):
             own, turn_rate = robot.command.linear, robot.command.angular.z
-            velocity = turned(place_of(own), robot.heading)[: self._problem.dimension]
+            velocity = turned(position_of(own), robot.heading)[: self._problem.dimension]
             stand = last.position[number] if robot.stand is None else robot.stand
             robot.stand = stand + self._pace * dt * velocity
             point = (robot.stand, self._pace * velocity, (self._pace - before) / dt * velocity, robot.heading)
             self._setpoints[number].publish(full_state(robot.name, *point))
-            self._commands[number].publish(ros.twist(self._pace * place_of(own), self._pace * turn_rate))
+            self._commands[number].publish(ros.twist(self._pace * position_of(own), self._pace * turn_rate))
 
     def _stand(self) -> None:
         """Have everybody stand where it was when that began."""

@@ -175,7 +175,7 @@ def state_from(problem: Problem, robot: int, pose: Any, velocity: Floats) -> Flo
     """``(n,)`` the state of a robot, from its ``geometry_msgs/Pose`` and its velocity ``(3,)`` in its own frame."""
     model, d, heading = problem.team.robot_models[robot], problem.dimension, heading_of(pose.orientation)
     state: FloatArray = np.zeros(problem.state_size, np.float32)
-    state[:d] = place_of(pose.position)[:d]
+    state[:d] = position_of(pose.position)[:d]
     if model.heading_index is not None:
         state[model.heading_index] = heading
         state[list(model.speed_indices)] = velocity[0]
@@ -184,7 +184,7 @@ def state_from(problem: Problem, robot: int, pose: Any, velocity: Floats) -> Flo
     return state
 
 
-def place_of(point: Any) -> Floats:
+def position_of(point: Any) -> Floats:
     """``(3,)`` of a ``geometry_msgs/Point`` or ``Vector3``."""
     return np.array([point.x, point.y, point.z])
 

@@ -228,13 +228,13 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
     )
 
 
-def _least_overhead(problem: Problem, places: Floats) -> float:
-    """See :attr:`ExportReport.min_overhead`; ``places`` are ``(T, K, d)`` [m]."""
+def _least_overhead(problem: Problem, positions: Floats) -> float:
+    """See :attr:`ExportReport.min_overhead`; ``positions`` are ``(T, K, d)`` [m]."""
     least, reach = np.inf, problem.team.radius.astype(np.float64)
     if problem.dimension == 2:
         return least
     for robot in range(1, problem.num_robots):
-        apart = np.abs(places[:, :robot] - places[:, robot, None])
+        apart = np.abs(positions[:, :robot] - positions[:, robot, None])
         beside = np.hypot(apart[..., 0], apart[..., 1]) <= reach[:robot] + reach[robot] + problem.margin
         least = min(least, float(apart[..., 2][beside].min(initial=np.inf)))
     return least

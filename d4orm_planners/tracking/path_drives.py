@@ -74,13 +74,13 @@ class Corners(NamedTuple):
     """Corners of paths, one robot's after another's, each from its start on.
 
     Attributes:
-        places: ``(C, 3)`` float64 [m].
+        positions: ``(C, 3)`` float64 [m].
         begin: ``(K + 1,)`` int64 where each robot's begin.
         departs: ``(C,)`` float64 when it sets out for each from the one before.
         arrives: ``(C,)`` float64 when it gets there.
     """
 
-    places: Floats
+    positions: Floats
     begin: IntArray
     departs: Floats
     arrives: Floats
@@ -198,8 +198,8 @@ def fill_paces(arcs: Floats, dt: float, corner: Floats, speed: float, braking: f
 def route_kernel(name: str) -> RouteStep:
     """One compiled step of the robots of the model with this name that drive to where they are directed.
 
-    Args of the kernel: the team, the numbers ``(B,)`` of these robots, the whole team's :class:`Progress`, ``docked``
-    ``(K,)`` and ``states`` ``(2, K, n)`` before the step and after it, changed in place, and ``controls`` ``(1, K,
+    Args of the kernel: the team, the numbers ``(B,)`` of these robots, the whole team's :class:`Progress`, ``arrived``
+    ``(K,)`` and ``states`` ``(2, K, n)`` before the step and after it, changed in position, and ``controls`` ``(1, K,
     m)``, output.
     """
     model = MODELS[name]
@@ -216,12 +216,12 @@ def route_kernel(name: str) -> RouteStep:
 
     @cached_kernel(variant=name, key=models_key((name,)), **OPTIONS)
     def drive_step(
-        arrays: ProblemArrays, robots: IntArray, progress: Progress, docked: BoolArray, states: FloatArray,
+        arrays: ProblemArrays, robots: IntArray, progress: Progress, arrived: BoolArray, states: FloatArray,
         controls: FloatArray,
     ) -> None:  # fmt: skip
         for k in robots:
             state = to_fixed_tuple(states[0, k], n)
-            docked[k] = drive(arrays, k, progress, k, 0, state, docked[k], controls[:, k], states[:, k]) <= 1
+            arrived[k] = drive(arrays, k, progress, k, 0, state, arrived[k], controls[:, k], states[:, k]) <= 1
 
     return drive_step
 
@@ -235,7 +235,7 @@ def drive_routes(problem: Problem, routes: Routes, most_steps: int) -> tuple[Flo
         most_steps: ``T``, if it does not end sooner.
 
     Returns:
-        Controls ``(T, K, m)``, places ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
+        Controls ``(T, K, m)``, positions ``(T + 1, K, 3)`` float64 [m] and ``(K,)`` the step of each arrival; ``T + 1``
         for one that has not arrived.
     """
     d, num_robots = problem.dimension, problem.num_robots
@@ -243,22 +243,22 @@ def drive_routes(problem: Problem, routes: Routes, most_steps: int) -> tuple[Flo
         [paces_along(problem, robot, routes.arcs[own], routes.bends[own]) for robot, own in enumerate(routes.each())]
     )
     controls = np.zeros((most_steps, num_robots, problem.control_size), np.float32)
-    states, docked = np.stack([problem.start, problem.start]), np.zeros(num_robots, bool)
-    places, progress = np.zeros((most_steps + 1, num_robots, 3)), Progress.of(routes)
+    states, arrived = np.stack([problem.start, problem.start]), np.zeros(num_robots, bool)
+    positions, progress = np.zeros((most_steps + 1, num_robots, 3)), Progress.of(routes)
     arrivals = np.full(num_robots, most_steps + 1, np.int64)
     sights, beyond, size = lookaheads(problem), beyond_goal(problem), problem.team.largest_radius
     parts = [(route_kernel(model.name), np.array(robots)) for model, robots in by_model(problem)]
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
-        places[steps, :, :d] = states[0, :, :d]
-        direct(routes, paces, sights, problem.dt, beyond, size, places[steps], docked & problem.docks, progress)
+        positions[steps, :, :d] = states[0, :, :d]
+        direct(routes, paces, sights, problem.dt, beyond, size, positions[steps], arrived & problem.docks, progress)
         # Without docking a robot may come through its goal before it has made way for others.
-        there = docked & (problem.docks | (progress.at == ends))
-        arrivals[:] = np.where(there, np.minimum(arrivals, steps), most_steps + 1)
-        if steps == most_steps or there.all():
-            return controls[:steps], places[: steps + 1], arrivals
+        done = arrived & (problem.docks | (progress.at == ends))
+        arrivals[:] = np.where(done, np.minimum(arrivals, steps), most_steps + 1)
+        if steps == most_steps or done.all():
+            return controls[:steps], positions[: steps + 1], arrivals
         for drive, robots in parts:
-            drive(problem.arrays, robots, progress, docked, states, controls[steps : steps + 1])
+            drive(problem.arrays, robots, progress, arrived, states, controls[steps : steps + 1])
         states[0] = states[1]
         steps += 1
 

@@ -57,17 +57,17 @@ def lookaheads(problem: Problem) -> Floats:
 
 
 @compiled
-def square_to(points: Floats, i: int, place: Floats | Row) -> float:
+def square_to(points: Floats, i: int, position: Floats | Row) -> float:
     """Squared distance of a point from a place, which may be the beginning of a state."""
     square = 0.0
     for axis in range(points.shape[1]):
-        gap = points[i, axis] - place[axis]
+        gap = points[i, axis] - position[axis]
         square += gap * gap
     return square
 
 
 @compiled
-def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Floats | Row, size: float) -> int:
+def point_reached(points: Floats, arcs: Floats, at: int, last: int, position: Floats | Row, size: float) -> int:
     """The point that a robot has come to that was at ``at``: as far on as each next one is nearer, or reached.
 
     ``size`` is the radius of the largest robot [m].
@@ -77,8 +77,8 @@ def point_reached(points: Floats, arcs: Floats, at: int, last: int, place: Float
         following += 1
         # Where two arcs join, points coincide but for rounding.
         if arcs[following] - arcs[at] > COINCIDING * size or following == last:
-            gap = square_to(points, following, place)
-            if gap > square_to(points, at, place) and gap > reached * reached:
+            gap = square_to(points, following, position)
+            if gap > square_to(points, at, position) and gap > reached * reached:
                 break
             at = following
     return at
@@ -92,7 +92,7 @@ def point_ahead(
     last: int,
     stop: float,
     lookahead: tuple[float, float | np.float32],
-    place: Floats | Row,
+    position: Floats | Row,
     size: float,
 ) -> int:
     """The point that a robot at point ``at`` heads for.
@@ -107,7 +107,7 @@ def point_ahead(
         last: The last point that it may head for.
         stop: Length of the route from which on it heads for no further point [m].
         lookahead: Its least look-ahead [m], and the time step [s].
-        place: Where it really is [m].
+        position: Where it really is [m].
         size: The radius of the largest robot [m].
     """
     target, slowest, reached = min(at + 1, last), paces[at], REACHED * size
@@ -119,7 +119,7 @@ def point_ahead(
                 route.arcs[target] - route.arcs[at] < lookahead[0] + 1.5 * lookahead[1] * slowest
                 and route.bends[target] > 0.0
             )
-            or square_to(route.points, target, place) < reached * reached
+            or square_to(route.points, target, position) < reached * reached
         )
     ):
         target += 1

@@ -85,8 +85,8 @@ def path_of(setpoints: Setpoints, robot: int, height: float) -> Any:
     """The ``nav_msgs/Path`` of a robot, with the times as stamps."""
     rows = zip(setpoints.time, setpoints.position[:, robot], setpoints.heading[:, robot], strict=True)
     poses = [
-        make("geometry_msgs/msg/PoseStamped", header(_nanoseconds(time)), pose(place, heading, height))
-        for time, place, heading in rows
+        make("geometry_msgs/msg/PoseStamped", header(_nanoseconds(time)), pose(position, heading, height))
+        for time, position, heading in rows
     ]
     return make("nav_msgs/msg/Path", header(0), poses)
 

@@ -225,9 +225,9 @@ def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> Smoo
     for robot, model in enumerate(problem.team.robot_models):
         if model.heading_index is not None:
             headings[:, robot] = np.unwrap(trajectory.states[rows, robot, model.heading_index].astype(np.float64))
-    places = trajectory.positions[rows].astype(np.float64)
-    curves = fit_spline(places, velocity, problem.dt, smoothness)
-    offset = curves(np.linspace(0, (last - first) * problem.dt, len(rows))) - places
+    positions = trajectory.positions[rows].astype(np.float64)
+    curves = fit_spline(positions, velocity, problem.dt, smoothness)
+    offset = curves(np.linspace(0, (last - first) * problem.dt, len(rows))) - positions
     deviation = float(np.linalg.norm(offset, axis=2).max())
     return SmoothMotion(problem, curves, fit_spline(headings, no_turn, problem.dt, smoothness), deviation)
 

@@ -59,19 +59,19 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
     return np.where(turning[:, None], creep, wanted)
 
 
-def goals_along_paths(problem: Problem, places: FloatArray | Floats, goals: FloatArray) -> FloatArray:
-    """``(K, d)`` where robots without a plan should head from ``places`` ``(K, d)``: along their shortest paths, as far
-    off as those are long [m].
+def goals_along_paths(problem: Problem, positions: FloatArray | Floats, goals: FloatArray) -> FloatArray:
+    """``(K, d)`` where robots without a plan should head from ``positions`` ``(K, d)``: along their shortest paths, as
+    far off as those are long [m].
 
     It is their present ``goals`` ``(K, d)`` where the world is empty, for robots with other goals than the problem's,
     to which the paths lead, and for those without a path.
     """
     if not problem.world.num_obstacles:
         return goals
-    direction, length = problem.shortest_paths.ahead(places)
+    direction, length = problem.shortest_paths.ahead(positions)
     first = (goals == problem.goal).all(axis=1)
     ahead, known = along_paths(direction, np.where(first, length, np.inf))
-    return np.where(known[:, None], places + ahead, goals).astype(np.float32)
+    return np.where(known[:, None], positions + ahead, goals).astype(np.float32)
 
 
 def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArray) -> FloatArray:

@@ -136,7 +136,7 @@ def drive_by_clock(
     hurrying: bool = False,
     backs_up: bool = False,
 ) -> tuple[FloatArray, Floats, int]:
-    """``(controls (T, m), places (T + 1, 3), arrival)`` of one robot along its route.
+    """``(controls (T, m), positions (T + 1, 3), arrival)`` of one robot along its route.
 
     Args:
         problem: The team.
@@ -163,8 +163,8 @@ def drive_by_clock(
         problem.arrays.time_step[0], backs_up,
     )  # fmt: skip
     controls = np.zeros((steps, problem.control_size), np.float32)
-    states, places = np.empty((steps + 1, problem.state_size), np.float32), np.zeros((steps + 1, 3))
+    states, positions = np.empty((steps + 1, problem.state_size), np.float32), np.zeros((steps + 1, 3))
     states[0] = problem.start[robot]
     arrival = timed_kernel(problem.team.models[robot])(problem.arrays, robot, timed, controls, states)
-    places[:, :d] = states[:, :d]
-    return controls, places, int(arrival)
+    positions[:, :d] = states[:, :d]
+    return controls, positions, int(arrival)

@@ -100,7 +100,7 @@ def tracker(model: Model, guide: Guide) -> Tracker:
         horizon = controls.shape[0]
         arrival = first if arrived else horizon + 1
         for step in range(first, horizon):
-            if transition.stands(arrived, arrays.docks):
+            if transition.absorbed(arrived, arrays.docks):
                 for i in range(m):
                     controls[step:, i] = ZERO
                 for i in range(n):

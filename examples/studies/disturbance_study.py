@@ -137,10 +137,10 @@ def draw(cells: Cells, path: Path) -> None:
     scenarios = list(dict.fromkeys(scenario for scenario, _, _ in cells))
     figure, axes = plt.subplots(len(scenarios), 1, figsize=(9, 1.2 + 1.7 * len(scenarios)), sharex=True, squeeze=False)
     for axis, scenario in zip(axes[:, 0], scenarios, strict=True):
-        policies = list(dict.fromkeys(policy for place, policy, _ in cells if place == scenario))
+        policies = list(dict.fromkeys(policy for position, policy, _ in cells if position == scenario))
         shares = np.full((len(policies), len(COLUMNS)), np.nan)
-        for (place, policy, disturbance), trials in cells.items():
-            if place == scenario:
+        for (position, policy, disturbance), trials in cells.items():
+            if position == scenario:
                 shares[policies.index(policy), COLUMNS.index(disturbance)] = np.mean([one.success for one in trials])
         axis.imshow(shares, vmin=0, vmax=1, cmap="viridis", aspect="auto")
         for (row, column), share in np.ndenumerate(shares):

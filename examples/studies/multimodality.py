@@ -91,10 +91,10 @@ def solve(problem: Problem, seeds: int, **limits: Any) -> list[dict[str, Any]]:
             plan = planner.solve(problem, seed=seed, **limits)
             solved = plan.solved and verify(problem, plan.controls).ok
             # To the millimetre, which compresses well.
-            places = np.round(plan.trajectory.positions.astype(np.float64), 3).ravel().tolist() if solved else []
+            positions = np.round(plan.trajectory.positions.astype(np.float64), 3).ravel().tolist() if solved else []
             rows.append(
                 {"planner": label, "seed": seed, "solved": solved, "robots": problem.num_robots,
-                 "travel_time": plan.metrics["travel_time"] if solved else None, "positions": places}
+                 "travel_time": plan.metrics["travel_time"] if solved else None, "positions": positions}
             )  # fmt: skip
         print(f"{label}: {sum(row['solved'] for row in rows[-seeds:])} of {seeds} seeds solved", flush=True)
     return rows
@@ -154,9 +154,9 @@ def draw_plan(panel: Any, problem: Problem, positions: np.ndarray, colour: str) 
     for robot, style in enumerate(("-", "--")):
         path = positions[:, robot]
         panel.plot(*path.T, style, color=colour, linewidth=1.4)
-        place, reach = path[nearest], float(problem.team.radius[robot])
-        panel.add_patch(plt.Circle(place, reach, facecolor="white", edgecolor=colour, zorder=3))
-        panel.text(*place, str(robot), ha="center", va="center", fontsize=6.5, zorder=4)
+        position, reach = path[nearest], float(problem.team.radius[robot])
+        panel.add_patch(plt.Circle(position, reach, facecolor="white", edgecolor=colour, zorder=3))
+        panel.text(*position, str(robot), ha="center", va="center", fontsize=6.5, zorder=4)
     panel.set(xlim=(-2.8, 2.8), ylim=(-1.4, 1.4), aspect="equal")
     panel.set_axis_off()
 

@@ -122,9 +122,9 @@ def watch(session: Session, seconds: float) -> Watched:
 def drop(session: Session, random: np.random.Generator) -> float:
     """Seconds from a goal's being dropped to the first frame with the new plan; nan if there was no room for it."""
     goal, refused = session.frame.goals[0], session.frame.status.refused
-    place = random.uniform(-1.2, 1.2, session.frame.problem.dimension)
+    position = random.uniform(-1.2, 1.2, session.frame.problem.dimension)
     begin = time.perf_counter()
-    session.edit(lambda scene: edits.move_goal(scene, 0, place))
+    session.edit(lambda scene: edits.move_goal(scene, 0, position))
     while np.array_equal(session.frame.goals[0], goal):
         if session.frame.status.refused > refused:
             return float("nan")

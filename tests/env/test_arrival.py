@@ -40,9 +40,9 @@ def test_who_stays_may_be_moved_on(engine: str) -> None:
     assert trajectory_metrics(problem, trajectory)["success"] == 1.0
     np.testing.assert_array_equal(trajectory.controls, controls)
     # Under the paper's rule the same controls end where they first arrive.
-    docked = rollout(problem.replace(arrival="dock"), controls, engine=engine)
-    np.testing.assert_allclose(docked.positions[10:, 0, 0], 1.0, atol=1e-5)
-    np.testing.assert_array_equal(arrival_times(docked.arrived, problem.dt), [1.0])
+    arrived = rollout(problem.replace(arrival="dock"), controls, engine=engine)
+    np.testing.assert_allclose(arrived.positions[10:, 0, 0], 1.0, atol=1e-5)
+    np.testing.assert_array_equal(arrival_times(arrived.arrived, problem.dt), [1.0])
 
 
 def test_verify_wants_everyone_at_the_goal_at_the_end() -> None:

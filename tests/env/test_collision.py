@@ -40,8 +40,8 @@ def test_axis_gap() -> None:
 
 
 def test_leaves() -> None:
-    places = (-0.75, -0.74, 0.0, 0.74, 0.75, 2.0)
-    assert [bool(leaves(x, 0.25, -1.0, 1.0)) for x in places] == [True, False, False, False, True, True]
+    positions = (-0.75, -0.74, 0.0, 0.74, 0.75, 2.0)
+    assert [bool(leaves(x, 0.25, -1.0, 1.0)) for x in positions] == [True, False, False, False, True, True]
 
 
 CIRCLE = World(2, circles=[[0, 0, 0.5]])
@@ -105,11 +105,11 @@ PLACES: list[tuple[World, Any, Any]] = [
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize(("world", "place", "expected"), PLACES)
-def test_obstacles(engine: str, world: World, place: Any, expected: tuple[bool, bool]) -> None:
+@pytest.mark.parametrize(("world", "position", "expected"), PLACES)
+def test_obstacles(engine: str, world: World, position: Any, expected: tuple[bool, bool]) -> None:
     problem = open_problem(1, world.dimension, None, RADIUS, margin=MARGIN)
     problem = problem.replace(world=world, start=_inside(world, problem), goal=_goal(world))
-    result = stand(get_engine(engine), problem, [place])
+    result = stand(get_engine(engine), problem, [position])
     assert (bool(result.collided[0]), bool(result.margin_violated[0])) == expected
 
 
@@ -180,9 +180,9 @@ GRID = arrays.arrays(np.int64, (5, 2), elements=st.integers(-30, 30))
 @given(grid=GRID, order=st.permutations(range(5)))
 def test_flags_and_rewards_follow_a_permutation_of_the_robots(engine: str, grid: np.ndarray, order: list[int]) -> None:
     # Off the grid of exact contacts, so that no rounding decides.
-    places = grid / 16 + 0.001
-    result = stand(ENGINES[engine], PAIRS, places)
-    permuted = stand(ENGINES[engine], PAIRS.select(order), places[order])
+    positions = grid / 16 + 0.001
+    result = stand(ENGINES[engine], PAIRS, positions)
+    permuted = stand(ENGINES[engine], PAIRS.select(order), positions[order])
     np.testing.assert_array_equal(permuted.collided, result.collided[order])
     np.testing.assert_array_equal(permuted.margin_violated, result.margin_violated[order])
     np.testing.assert_allclose(permuted.rewards, result.rewards[order], rtol=1e-6)
@@ -191,12 +191,12 @@ def test_flags_and_rewards_follow_a_permutation_of_the_robots(engine: str, grid:
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
 @given(grid=GRID)
 def test_flags_are_those_of_all_distances(engine: str, grid: np.ndarray) -> None:
-    places = grid / 16 + 0.001
-    gaps = np.linalg.norm(places[:, None] - places[None], axis=-1) - RADII[:, None] - RADII[None]
+    positions = grid / 16 + 0.001
+    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) - RADII[:, None] - RADII[None]
     np.fill_diagonal(gaps, np.inf)
     # A contact belongs to both robots: the matrix is symmetric, and so is what follows from it.
-    nearest = np.minimum(gaps.min(axis=1), PAIRS.world.clearance(places) - RADII)
-    result = stand(ENGINES[engine], PAIRS, places)
+    nearest = np.minimum(gaps.min(axis=1), PAIRS.world.clearance(positions) - RADII)
+    result = stand(ENGINES[engine], PAIRS, positions)
     for flags, extra in ((result.collided, 0.0), (result.margin_violated, 0.1)):
         decided = np.abs(nearest - extra) > 1e-5
         np.testing.assert_array_equal(flags[decided], nearest[decided] <= extra)
@@ -206,9 +206,9 @@ def test_flags_are_those_of_all_distances(engine: str, grid: np.ndarray) -> None
 @given(grid=GRID)
 def test_a_mirrored_team_has_the_same_contacts(engine: str, grid: np.ndarray) -> None:
     problem = open_problem(5, radius=RADII, margin=0.1)
-    places = grid / 16
-    result = stand(ENGINES[engine], problem, places)
-    for mirrored in (-places, places[:, ::-1], places + 2):
+    positions = grid / 16
+    result = stand(ENGINES[engine], problem, positions)
+    for mirrored in (-positions, positions[:, ::-1], positions + 2):
         other = stand(ENGINES[engine], problem, mirrored)
         np.testing.assert_array_equal(other.collided, result.collided)
         np.testing.assert_array_equal(other.margin_violated, result.margin_violated)

@@ -734,12 +734,12 @@ def test_an_episode_records_the_truth_and_where_it_was_disturbed(tmp_path: Any) 
     )
     # A policy that looks at nothing moves the same whatever is seen.
     np.testing.assert_array_equal(quiet.trajectory.states, noisy.trajectory.states)
-    marks = noisy.marks
-    assert marks.pushed.shape == (len(marks.stalled), 3, 2)
-    assert len(marks.pushed) == len(noisy.trajectory.states)
-    assert marks.pushed.any()
-    assert not marks.pushed[0].any()
-    assert run_episode(navigation_v0.parallel_env(problem=EARLY), "random").marks is None
+    events = noisy.events
+    assert events.pushed.shape == (len(events.stalled), 3, 2)
+    assert len(events.pushed) == len(noisy.trajectory.states)
+    assert events.pushed.any()
+    assert not events.pushed[0].any()
+    assert run_episode(navigation_v0.parallel_env(problem=EARLY), "random").events is None
 
 
 @pytest.mark.parametrize("scenario", ["circle", "sphere"])
@@ -748,14 +748,14 @@ def test_pictures_show_where_it_was_disturbed(scenario: str, tmp_path: Any) -> N
     episode = run_episode(
         navigation_v0.parallel_env(scenario, 3, disturbances=disturbances, max_cycles=30), "go-to-goal"
     )
-    problem, trajectory, marks = episode.problem, episode.trajectory, episode.marks
-    figure = plot_trajectory(problem, trajectory, marks=marks)
+    problem, trajectory, events = episode.problem, episode.trajectory, episode.events
+    figure = plot_trajectory(problem, trajectory, events=events)
     told = {text.get_text() for text in figure.legends[0].get_texts()}
     assert told >= {"push", "moving obstacle"}
-    assert ("stalls" in told) == marks.stalled.any()
+    assert ("stalls" in told) == events.stalled.any()
     assert not {text.get_text() for text in plot_trajectory(problem, trajectory).legends[0].get_texts()} & {"push"}
     save_animation(problem, trajectory, tmp_path / "plain.gif", max_frames=4)
-    save_animation(problem, trajectory, tmp_path / "marked.gif", max_frames=4, marks=marks)
+    save_animation(problem, trajectory, tmp_path / "marked.gif", max_frames=4, events=events)
     assert (tmp_path / "plain.gif").read_bytes() != (tmp_path / "marked.gif").read_bytes()
 
 

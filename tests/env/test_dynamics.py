@@ -164,7 +164,7 @@ def test_speed_limits(name: str, x: Any, limited: Any) -> None:
         ("holonomic2d_jerk", (1, 2, 3, 4, 5, 6), (1, 2, 0, 0, 0, 0)),
     ],
 )
-def test_rest_keeps_place_and_heading(name: str, x: Any, rest: Any) -> None:
+def test_rest_keeps_position_and_heading(name: str, x: Any, rest: Any) -> None:
     assert MODELS[name].functions.rest(x, 0) == rest
 
 

@@ -124,10 +124,10 @@ def test_engines_step_alike_from_anywhere(name: str) -> None:
         states = (problem.start + generator.uniform(-1, 1, problem.start.shape)).astype(np.float32)
         for robot, model in enumerate(problem.team.robot_models):
             states[robot, model.state_size :] = 0
-        docked = generator.random(problem.num_robots) < 0.3
-        first, second = (engine.step(problem.arrays, states, docked, controls) for engine in (CPU, JAX))
+        arrived = generator.random(problem.num_robots) < 0.3
+        first, second = (engine.step(problem.arrays, states, arrived, controls) for engine in (CPU, JAX))
         assert_same_step(first, second)
-        assert (first.arrived >= docked).all()
+        assert (first.arrived >= arrived).all()
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)

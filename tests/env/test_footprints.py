@@ -140,15 +140,15 @@ def test_ellipsoids_among_obstacles() -> None:
     world = World(3, **obstacles, lower=[-9, -9, 0], upper=[9, 9, 9])
     team = Team(("holonomic3d",), footprint=Ellipsoid(0.1, 0.1, 0.3))
     problem = Problem(team, [[-3, 0, 1, 0, 0, 0]], [[-3, 0, 2]], world, horizon=1, margin=0.05)
-    for place in ([-0.3, 0, 1], [0, 0, 1.5], [2.7, 0, 4], [4.9, 0, 1], [-3, 0, 0.3]):
-        away = np.sign(np.array(place) - [{-0.3: 0, 0: 0, 2.7: 3, 4.9: 5.5, -3: -3}[place[0]], 0, 1]) * 0.01
-        if place[0] in (2.7, 4.9, -3):
-            away[2] = 0.01 if place[0] == -3 else 0
+    for position in ([-0.3, 0, 1], [0, 0, 1.5], [2.7, 0, 4], [4.9, 0, 1], [-3, 0, 0.3]):
+        away = np.sign(np.array(position) - [{-0.3: 0, 0: 0, 2.7: 3, 4.9: 5.5, -3: -3}[position[0]], 0, 1]) * 0.01
+        if position[0] in (2.7, 4.9, -3):
+            away[2] = 0.01 if position[0] == -3 else 0
         for sign, collides in ((1, False), (-1, True)):
-            states = np.array([[*(np.array(place) + sign * away), 0, 0, 0]], np.float32)
+            states = np.array([[*(np.array(position) + sign * away), 0, 0, 0]], np.float32)
             for engine in ENGINE_NAMES:
                 after = get_engine(engine).step(problem.arrays, states, np.zeros(1, bool), np.zeros((1, 3), np.float32))
-                assert bool(after.collided[0]) == collides, (place, sign, engine)
+                assert bool(after.collided[0]) == collides, (position, sign, engine)
                 assert after.margin_violated[0]
             report = verify(problem.with_state(states, problem.goal), np.zeros((1, 1, 3), np.float32))
             assert (report.min_clearance <= 0) == collides
@@ -246,7 +246,7 @@ def test_discs_and_balls_round_bodies_hide_no_gap_from_the_judge(
     plans = np.repeat(held, 10, axis=1)
     reports = [verify(problem, plan) for plan in plans]
     for watch in (TurningPairs, Obstacles, Sides):
-        monkeypatch.setattr(watch, "outer_gap", lambda self, pairs, *places: np.full(len(pairs), -np.inf))
+        monkeypatch.setattr(watch, "outer_gap", lambda self, pairs, *positions: np.full(len(pairs), -np.inf))
     for plan, report in zip(plans, reports, strict=True):
         everything = verify(problem, plan)
         contacts |= {violation.kind for violation in report.violations}

@@ -56,10 +56,10 @@ def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
 def drawn_worlds(problem: Problem) -> tuple[Worlds, Any]:
     random = np.random.default_rng(3)
     num_robots, size = problem.num_robots, problem.control_size
-    docked = random.random((num_robots, SAMPLES)) < 0.2
+    arrived = random.random((num_robots, SAMPLES)) < 0.2
     state = np.broadcast_to(problem.start[..., None], (*problem.start.shape, SAMPLES))
     controls = 2 * random.standard_normal((HORIZON, num_robots, size, SAMPLES))
-    begin = Worlds(jnp.asarray(state), jnp.asarray(docked), jnp.zeros((num_robots, size, SAMPLES), jnp.float32))
+    begin = Worlds(jnp.asarray(state), jnp.asarray(arrived), jnp.zeros((num_robots, size, SAMPLES), jnp.float32))
     return begin, jnp.asarray(controls, jnp.float32)
 
 
@@ -72,7 +72,7 @@ def test_the_kernel_rolls_out_as_the_steps_do(name: str) -> None:
     by_kernel, in_steps = jax_motion._roll_out_by_kernel(*given), jax_motion._roll_out_in_steps(*given)
     for one, other in zip(by_kernel, in_steps, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)
-    assert by_kernel.docked.any()
+    assert by_kernel.arrived.any()
 
 
 @pytest.mark.parametrize("name", ["mixed", "more than a program's robots", "in space"])

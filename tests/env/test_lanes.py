@@ -65,11 +65,11 @@ def bits(mask):
 
 @pytest.mark.parametrize(("dimension", "within"), [(2, _within_2), (3, _within_3)])
 @pytest.mark.parametrize("seed", range(3))
-def test_two_places_are_within_reach_where_their_distance_is(dimension, within, seed):
+def test_two_positions_are_within_reach_where_their_distance_is(dimension, within, seed):
     w = np.random.default_rng(seed).normal(size=3 + 2 * dimension * TILE).astype(np.float32)
     a, b = 3, 3 + dimension * TILE
-    places = w[3:].reshape(2, dimension, TILE).astype(np.float64)
-    distance2 = ((places[0] - places[1]) ** 2).sum(axis=0)
+    positions = w[3:].reshape(2, dimension, TILE).astype(np.float64)
+    distance2 = ((positions[0] - positions[1]) ** 2).sum(axis=0)
     reach2 = np.float32(np.median(distance2) + 1e-3)
     np.testing.assert_array_equal(bits(within(w, a, b, reach2)), distance2 <= reach2)
 

@@ -292,7 +292,7 @@ class TestOccupancyImage:
 
 
 class TestMapScenario:
-    def test_places_are_free_and_connected(self, tmp_path: Path) -> None:
+    def test_positions_are_free_and_connected(self, tmp_path: Path) -> None:
         # Two halves, of which the right one is larger, and a passage too narrow for anyone.
         blocked = np.zeros((20, 30), int)
         blocked[:, 10] = 1

@@ -90,7 +90,7 @@ def test_planners_evade_it_and_pictures_show_it() -> None:
     crossing = MovingObstacle([0, 8], [middle + 2 * side, middle - 2 * side], 0.3)
     episode = run_episode(navigation_v0.parallel_env(problem=problem, disturbances=[crossing]), "d4orm-c2f", seed=0)
     assert episode.metrics["success"]
-    assert plot_trajectory(problem, episode.trajectory, marks=episode.marks).get_axes()
+    assert plot_trajectory(problem, episode.trajectory, events=episode.events).get_axes()
     assert ACROSS.replayable
 
 

@@ -212,8 +212,8 @@ def test_who_has_docked_is_at_rest_and_cannot_be_pushed_away(model: str) -> None
     assert terminations["robot_0"]
     for _ in range(30):
         env.step(act(env, ahead))
-    docked, other = split_state(problem, env.state()).states
-    assert docked == pytest.approx(start[0], abs=1e-4)
+    arrived, other = split_state(problem, env.state()).states
+    assert arrived == pytest.approx(start[0], abs=1e-4)
     assert other[0] == pytest.approx(-0.3, abs=0.03)
     assert env.metrics()["collided"] == 2
     bodies = env._simulation.bodies
@@ -259,13 +259,13 @@ def test_every_disturbance_works_there(name: str) -> None:
 
 def test_a_disturbance_slows_the_bodies_themselves() -> None:
     problem = Problem(Team(("differential_drive",)), [[0, 0, 0, 1.0]], [[5.0, 0]])
-    places = []
+    positions = []
     for disturbances in ([], [Drag(2.0)]):
         env = mujoco.parallel_env(problem=problem, disturbances=disturbances)
         env.reset(seed=0)
-        places.append(driven(env, [0.0, 0.0], 10)[0])
-    assert places[0] == pytest.approx(1.0, abs=0.03)
-    assert places[1] < 0.6
+        positions.append(driven(env, [0.0, 0.0], 10)[0])
+    assert positions[0] == pytest.approx(1.0, abs=0.03)
+    assert positions[1] < 0.6
 
 
 @pytest.mark.parametrize(

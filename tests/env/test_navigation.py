@@ -101,11 +101,11 @@ def test_an_agent_that_arrives_leaves_and_its_body_stays() -> None:
     assert set(observations) == set(rewards) == set(infos) == {"robot_0", "robot_1"}
     assert infos["robot_0"]["arrived"] is True
     assert env.agents == ["robot_1"]
-    docked = split_state(problem, env.state()).states[0]
+    arrived = split_state(problem, env.state()).states[0]
     # An action for the one that left is ignored, whatever it is.
     result = env.step({"robot_0": np.array([-1, np.nan]), "robot_1": controls[1]})
     assert all(set(part) == {"robot_1"} for part in result)
-    np.testing.assert_array_equal(split_state(problem, env.state()).states[0], docked)
+    np.testing.assert_array_equal(split_state(problem, env.state()).states[0], arrived)
     assert split_state(problem, env.state()).controls[0].tolist() == [0, 0]
 
 
@@ -652,6 +652,6 @@ def test_metrics_of_a_success() -> None:
     assert metrics["makespan"] == pytest.approx(0.6)
     assert metrics["steps"] == 6
     # Distances after each step over the first distance, with robot_0 docked: the mean of 1 - d / d0.
-    docked = 1 - np.array([0.2, 0.1, 0, 0, 0, 0]) / 0.3
+    arrived = 1 - np.array([0.2, 0.1, 0, 0, 0, 0]) / 0.3
     driving = 1 - np.array([0.5, 0.4, 0.3, 0.2, 0.1, 0]) / 0.6
-    assert metrics["reward"] == pytest.approx((docked.mean() + driving.mean()) / 2, abs=1e-5)
+    assert metrics["reward"] == pytest.approx((arrived.mean() + driving.mean()) / 2, abs=1e-5)

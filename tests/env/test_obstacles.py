@@ -37,16 +37,17 @@ def star(random: np.random.Generator, corners: int, size: float) -> Any:
 def random_world(seed: int, dimension: int, count: int) -> World:
     """About ``4 count`` obstacles of all kinds, small and large, in a cube of 8 m."""
     random = np.random.default_rng(seed)
-    place = random.uniform(-4, 4, (4, count, dimension))
+    position = random.uniform(-4, 4, (4, count, dimension))
     size = random.uniform(0.01, 1.0, (4, count, 1)) * 4 / count ** (1 / dimension)
-    boxes = np.hstack([place[0], place[0] + size[0] * random.uniform(0.1, 1, (count, dimension))])
-    balls = np.hstack([place[1], size[1] / 2])
+    boxes = np.hstack([position[0], position[0] + size[0] * random.uniform(0.1, 1, (count, dimension))])
+    balls = np.hstack([position[1], size[1] / 2])
     bounds: dict[str, Any] = {} if seed % 3 else {"lower": [-5] * dimension, "upper": [4.5] * dimension}
     if dimension == 3:
-        cylinders = np.hstack([place[2, :, :2], size[2] / 4])
+        cylinders = np.hstack([position[2, :, :2], size[2] / 4])
         return World(dimension=3, boxes=boxes, spheres=balls, cylinders=cylinders, **bounds)
     polygons = [
-        at + star(random, random.integers(3, 9), float(extent[0])) for at, extent in zip(place[2], size[2], strict=True)
+        at + star(random, random.integers(3, 9), float(extent[0]))
+        for at, extent in zip(position[2], size[2], strict=True)
     ]
     return World(boxes=boxes, circles=balls, polygons=polygons, **bounds)
 
@@ -187,8 +188,8 @@ def test_verify_sees_how_near_a_way_comes_to_a_polygon(seed: int, corners: int) 
     distance, fraction = polygon_approach(start, end, outline)
     expected = [shapely.LineString(pair).distance(polygon) for pair in zip(start, end, strict=True)]
     np.testing.assert_allclose(np.maximum(distance, 0), expected, atol=1e-9)
-    places = start + fraction[:, None] * (end - start)
-    apart = shapely.distance(polygon, shapely.points(places))
+    positions = start + fraction[:, None] * (end - start)
+    apart = shapely.distance(polygon, shapely.points(positions))
     np.testing.assert_allclose(apart, expected, atol=1e-9)
 
 

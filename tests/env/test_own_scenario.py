@@ -33,9 +33,9 @@ def still(seed: int = 0, num_robots: int = 2, **settings: Any) -> Problem:
 
 def poles(seed: int, num_robots: int) -> Problem:
     """One obstacle, where the seed puts it, or two."""
-    places = np.random.default_rng(seed).uniform(-0.5, 0.5, (1 + seed % 2, 2))
+    positions = np.random.default_rng(seed).uniform(-0.5, 0.5, (1 + seed % 2, 2))
     return lanes(0, num_robots).replace(
-        world=World(2, circles=np.column_stack([places - [1, 0], places[:, :1] * 0 + 0.1]))
+        world=World(2, circles=np.column_stack([positions - [1, 0], positions[:, :1] * 0 + 0.1]))
     )
 
 

@@ -39,23 +39,23 @@ def team_steps(problem: Problem, actions: np.ndarray, **options: Any) -> tuple[n
     """Rewards ``(T, K)``, positions ``(T + 1, K, d)`` and observations ``(T, K, D)`` of the PettingZoo environment."""
     env = navigation_v0.parallel_env(problem=problem, **options)
     env.reset(seed=0)
-    rewards, places, seen = [], [problem.start[:, : problem.dimension]], []
+    rewards, positions, seen = [], [problem.start[:, : problem.dimension]], []
     for action in actions:
         observations, given, _, _, _ = env.step(dict(zip(env.agents, action, strict=True)))
         rewards.append(list(given.values()))
         seen.append(list(observations.values()))
         k, n = problem.num_robots, problem.state_size
-        places.append(env.state()[: k * n].reshape(k, n)[:, : problem.dimension])
-    return np.array(rewards), np.array(places), np.array(seen)
+        positions.append(env.state()[: k * n].reshape(k, n)[:, : problem.dimension])
+    return np.array(rewards), np.array(positions), np.array(seen)
 
 
 @pytest.mark.parametrize("spatial", [False, True])
 def test_the_papers_reward_along_the_way(spatial: bool) -> None:
     problem = walled(spatial)
     actions = random_actions(problem, 8)  # too few to come near to anything
-    rewards, places, _ = team_steps(problem, actions, progress="path")
+    rewards, positions, _ = team_steps(problem, actions, progress="path")
     np.testing.assert_allclose(
-        rewards, 1 - problem.shortest_paths.distance(places[1:]) / problem.shortest_paths.length, atol=1e-5
+        rewards, 1 - problem.shortest_paths.distance(positions[1:]) / problem.shortest_paths.length, atol=1e-5
     )
     straight, _, _ = team_steps(problem, actions)
     assert (np.abs(rewards - straight) > 1e-3).any()
@@ -64,8 +64,8 @@ def test_the_papers_reward_along_the_way(spatial: bool) -> None:
 def test_a_reward_to_learn_from_along_the_way() -> None:
     problem = walled()
     reward = TrainingReward(progress=1.0, arrival=0, margin=0, contact=0, time=0)
-    rewards, places, _ = team_steps(problem, random_actions(problem, 12), progress="path", reward=reward)
-    lengths = problem.shortest_paths.distance(places)
+    rewards, positions, _ = team_steps(problem, random_actions(problem, 12), progress="path", reward=reward)
+    lengths = problem.shortest_paths.distance(positions)
     longest = problem.team.max_speed * problem.dt
     np.testing.assert_allclose(rewards, (lengths[:-1] - lengths[1:]) / longest, atol=1e-4)
 
@@ -107,14 +107,14 @@ def test_an_open_world_has_the_same_rewards_to_the_bit() -> None:
 def test_the_way_is_observed_at_the_end(spatial: bool, closed: bool) -> None:
     problem = walled(spatial) if closed else walled(spatial).replace(world=World(3 if spatial else 2))
     d, actions = problem.dimension, random_actions(walled(spatial), 6)
-    _, places, seen = team_steps(problem, actions, observed_path=True)
+    _, positions, seen = team_steps(problem, actions, observed_path=True)
     _, _, plain = team_steps(problem, actions)
     layout = ObservationLayout.for_problem(problem, observed_path=True)
     np.testing.assert_array_equal(seen[..., : -d - 1], plain)
     np.testing.assert_allclose(
-        layout.paths(seen)[..., layout.path.direction], problem.shortest_paths.direction(places[1:]), atol=1e-6
+        layout.paths(seen)[..., layout.path.direction], problem.shortest_paths.direction(positions[1:]), atol=1e-6
     )
-    np.testing.assert_allclose(layout.paths(seen)[..., d], problem.shortest_paths.distance(places[1:]), rtol=1e-6)
+    np.testing.assert_allclose(layout.paths(seen)[..., d], problem.shortest_paths.distance(positions[1:]), rtol=1e-6)
     assert layout.obstacles(seen).shape[-2:] == (4, d + 2)
     assert layout.names[-d - 1 :] == (*(f"path.direction_{axis}" for axis in "xyz"[:d]), "path.length")
     assert layout.names[: -d - 1] == ObservationLayout.for_problem(problem).names

@@ -181,15 +181,15 @@ def test_bad_problems_are_refused(changes: dict[str, Any], message: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("changes", "place"),
+    ("changes", "position"),
     [
         ({"start": [[0.1, 0, 0.5, 0, 0, 0]]}, "start of robot_0"),  # in the sphere
         ({"goal": [[0.1, 3, 70]]}, "goal of robot_0"),  # in the cylinder, however high
         ({"goal": [[5.5, 5.5, 6.1]]}, "goal of robot_0"),  # in the box
     ],
 )
-def test_places_in_spatial_obstacles_are_refused(changes: dict[str, Any], place: str) -> None:
-    with pytest.raises(ValueError, match=f"{place} .* inside an obstacle"):
+def test_positions_in_spatial_obstacles_are_refused(changes: dict[str, Any], position: str) -> None:
+    with pytest.raises(ValueError, match=f"{position} .* inside an obstacle"):
         spatial(**changes)
 
 

@@ -28,9 +28,9 @@ def test_step_reward() -> None:
 
 
 def test_start_distance_counts_from_the_goal_radius() -> None:
-    places, goals = [[0, 0], [1, 1], [1, 1]], [[3, 4], [1, 1], [1, 1.05]]
+    positions, goals = [[0, 0], [1, 1], [1, 1]], [[3, 4], [1, 1], [1, 1.05]]
     np.testing.assert_allclose(
-        inverse_initial_distance(np.float32(places), np.float32(goals), 0.1), [0.2, 10, 10], rtol=1e-6
+        inverse_initial_distance(np.float32(positions), np.float32(goals), 0.1), [0.2, 10, 10], rtol=1e-6
     )
 
 
@@ -112,9 +112,9 @@ def test_mean_squared_jerk_counts_steps_before_arrival() -> None:
     never = np.zeros((5, 1), bool)
     assert mean_squared_jerk(controls, never, 0.5) == pytest.approx((4 + 16 + 20) / 3)
     # Docked from step 3 on: the change to the third step's zero control is none of its doing.
-    docked = never.copy()
-    docked[3:] = True
-    assert mean_squared_jerk(controls, docked, 0.5) == pytest.approx((4 + 16) / 2)
+    arrived = never.copy()
+    arrived[3:] = True
+    assert mean_squared_jerk(controls, arrived, 0.5) == pytest.approx((4 + 16) / 2)
     assert mean_squared_jerk(controls, np.ones((5, 1), bool), 0.5) == 0.0
     # Two robots, the second docked from the first step on.
     both = np.concatenate([controls, 9 * controls], axis=1)

@@ -56,8 +56,8 @@ def test_a_robot_that_nobody_knows_is_refused() -> None:
 def test_spatial_scenarios_stand_above_the_floor(scenario: str) -> None:
     settings = {"num_robots": 4, "model": "holonomic3d", "num_obstacles": 1}
     low, high = make_problem(scenario, **settings), make_problem(scenario, height=2.0, **settings)
-    places = np.concatenate([high.start[:, :3], high.goal])
-    assert places[:, 2].min() == pytest.approx(2.0)
+    positions = np.concatenate([high.start[:, :3], high.goal])
+    assert positions[:, 2].min() == pytest.approx(2.0)
     lift = high.goal[0] - low.goal[0]
     np.testing.assert_allclose(lift[:2], 0, atol=1e-6)
     np.testing.assert_allclose(high.start[:, :3] - low.start[:, :3], np.broadcast_to(lift, (4, 3)), atol=1e-6)

@@ -24,10 +24,10 @@ OPEN = [case for case in scenario_models() if case[0] not in BOUNDED]
 @pytest.mark.parametrize(("name", "model"), OPEN)
 def test_a_margin_lies_around_where_robots_start_and_end(name: str, model: str | None) -> None:
     first, other = (make_problem(name, model=model, seed=seed, bounds=0.75) for seed in (0, 1))
-    places = np.vstack([first.start[:, : first.dimension], first.goal])
+    positions = np.vstack([first.start[:, : first.dimension], first.goal])
     lower, upper = first.world.bounds
-    assert (lower <= places.min(axis=0) - 0.7499).all()
-    assert (upper >= places.max(axis=0) + 0.7499).all()
+    assert (lower <= positions.min(axis=0) - 0.7499).all()
+    assert (upper >= positions.max(axis=0) + 0.7499).all()
     # Worlds that differ in their seed alone are stepped as one batch only if they have the same bounds.
     np.testing.assert_array_equal(other.world.bounds, first.world.bounds)
     np.testing.assert_array_equal(make_problem(name, model=model, seed=0).start, first.start)
@@ -86,8 +86,10 @@ def test_either_everybody_keeps_the_margin_or_somebody_is_named(
 ) -> None:
     lower, upper = corners[:2], corners[2:]
     plain = make_problem(name, num_robots, seed)
-    places = np.vstack([plain.start[:, :2], plain.goal]).astype(np.float64)
-    room = np.minimum(places - lower, np.subtract(upper, places)).min() - float(plain.team.radius[0]) - plain.margin
+    positions = np.vstack([plain.start[:, :2], plain.goal]).astype(np.float64)
+    room = (
+        np.minimum(positions - lower, np.subtract(upper, positions)).min() - float(plain.team.radius[0]) - plain.margin
+    )
     assume(abs(room) > 1e-5)
     if room > 0:
         problem = make_problem(name, num_robots, seed, bounds=(lower, upper))

@@ -103,10 +103,10 @@ def problems(draw: st.DrawFn) -> Problem:
     # A car as long as it drives in a second turns no faster than the others.
     own = {"wheelbase": speed} if "car" in models else {}
     team = Team(models, array(st.floats(2**-20, 0.5, width=32), count), speed, *others, own_limits=own)
-    places = array(offsets, 2, count, dimension)
-    places[:, :, 0] += 2 * np.arange(count)
+    positions = array(offsets, 2, count, dimension)
+    positions[:, :, 0] += 2 * np.arange(count)
     start = np.zeros((count, team.state_size), np.float32)
-    start[:, :dimension] = places[0]
+    start[:, :dimension] = positions[0]
     speeds = st.floats(0, 1e6)
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is not None:
@@ -117,7 +117,7 @@ def problems(draw: st.DrawFn) -> Problem:
     return Problem(
         team=team,
         start=start,
-        goal=places[1],
+        goal=positions[1],
         world=draw(worlds(dimension, 2.0 * count)),
         dt=draw(st.floats(0.05, 0.1)),
         horizon=draw(st.integers(1, 10**6)),

@@ -25,10 +25,10 @@ AMSWARM = tuple(f"amswarm_{index}" for index in range(1, 6))
 CASES = scenario_models()
 
 
-def gaps(problem: Problem, places: Any) -> list[float]:
+def gaps(problem: Problem, positions: Any) -> list[float]:
     """Between the surfaces of any two robots, and of robots and obstacles; written apart from the code under test."""
     radius = [float(value) for value in np.asarray(problem.team.radius)]
-    points = np.asarray(places, np.float64).tolist()
+    points = np.asarray(positions, np.float64).tolist()
     found = [math.dist(points[i], points[j]) - radius[i] - radius[j] for i, j in combinations(range(len(points)), 2)]
     for point, own in zip(points, radius, strict=True):
         for *centre, size in problem.world.balls.tolist() + problem.world.cylinders.tolist():
@@ -58,8 +58,8 @@ def test_starts_and_goals_keep_the_margin(name: str, model: str | None, num_obst
     )
     assert problem.name == name
     assert problem.world.num_obstacles - plain.world.num_obstacles == num_obstacles
-    for places in (starts(problem), problem.goal):
-        assert min(gaps(problem, places)) > problem.margin
+    for positions in (starts(problem), problem.goal):
+        assert min(gaps(problem, positions)) > problem.margin
     assert (np.linalg.norm(problem.goal - starts(problem), axis=1) > problem.goal_radius).all()
     speeds = [problem.start[k, list(robot.speed_indices)] for k, robot in enumerate(problem.team.robot_models)]
     assert not np.concatenate(speeds).any()
@@ -81,8 +81,8 @@ def test_the_same_arguments_give_the_same_problem(name: str, model: str | None) 
 def test_any_number_of_robots(name: str, num_robots: int) -> None:
     problem = make_problem(name, num_robots, **needed(name))
     assert problem.num_robots == num_robots
-    for places in (starts(problem), problem.goal):
-        assert min(gaps(problem, places)) > problem.margin
+    for positions in (starts(problem), problem.goal):
+        assert min(gaps(problem, positions)) > problem.margin
 
 
 def test_defaults_are_the_papers() -> None:
@@ -158,16 +158,16 @@ class TestRandom:
     @pytest.mark.parametrize(("model", "size"), [("holonomic2d", 7.0), ("holonomic3d", 4.0)])
     def test_fills_the_square_evenly(self, model: str, size: float) -> None:
         problems = [make_problem("random", 20, seed, size=size, model=model) for seed in range(30)]
-        places = np.concatenate([np.concatenate([starts(problem), problem.goal]) for problem in problems])
-        assert np.abs(places).max() <= size / 2
-        assert np.abs(places).max(axis=0) == pytest.approx(size / 2, rel=0.02)
+        positions = np.concatenate([np.concatenate([starts(problem), problem.goal]) for problem in problems])
+        assert np.abs(positions).max() <= size / 2
+        assert np.abs(positions).max(axis=0) == pytest.approx(size / 2, rel=0.02)
         # 1200 uniform numbers: the mean has a standard deviation of size / 120.
-        np.testing.assert_allclose(places.mean(axis=0), 0, atol=5 * size / 120)
+        np.testing.assert_allclose(positions.mean(axis=0), 0, atol=5 * size / 120)
 
     def test_default_size_keeps_the_density_of_large_teams(self) -> None:
         for num_robots, size in ((4, 5), (16, 5), (64, 10)):
-            places = starts(make_problem("random", num_robots))
-            assert 0.6 * size / 2 < np.abs(places).max() <= size / 2
+            positions = starts(make_problem("random", num_robots))
+            assert 0.6 * size / 2 < np.abs(positions).max() <= size / 2
 
 
 def test_four_obstacles_congest_the_centre() -> None:
@@ -198,8 +198,8 @@ def test_heterogeneous_mixes_models_and_limits() -> None:
 def test_swap_exchanges_two_rows(num_robots: int) -> None:
     problem = make_problem("swap", num_robots=num_robots, distance=4.0, spacing=1.0)
     np.testing.assert_array_equal(problem.goal, starts(problem) * [-1, 1])
-    places = {tuple(place) for place in starts(problem).tolist()}
-    occupied = [tuple(goal) in places for goal in problem.goal.tolist()]
+    positions = {tuple(position) for position in starts(problem).tolist()}
+    occupied = [tuple(goal) in positions for goal in problem.goal.tolist()]
     assert occupied.count(False) == num_robots % 2
     assert set(starts(problem)[:, 0].tolist()) == {-2.0, 2.0}
 
@@ -446,7 +446,7 @@ def test_scenarios_take_footprints_and_goal_headings(footprint: Any) -> None:
     assert problem.goal_heading_tolerance.tolist() == [np.float32(0.2)] * 3
 
 
-def test_a_footprint_takes_the_place_of_a_scenarios_own_radius() -> None:
+def test_a_footprint_takes_the_position_of_a_scenarios_own_radius() -> None:
     problem = make_problem("amswarm_2", footprint=Ellipsoid(0.1, 0.1, 0.25))
     assert problem.team.radius.tolist() == [0.25] * 10
 

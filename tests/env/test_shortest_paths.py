@@ -19,11 +19,11 @@ REACH = RADIUS + MARGIN
 
 
 def problem_in(world: World, start: object, goal: object, radius: float = RADIUS) -> Problem:
-    places = np.atleast_2d(np.asarray(start, np.float64))
+    positions = np.atleast_2d(np.asarray(start, np.float64))
     model = "velocity2d" if world.dimension == 2 else "holonomic3d"
-    team = Team((model,) * len(places), radius=radius)
-    states = np.zeros((len(places), team.state_size))
-    states[:, : world.dimension] = places
+    team = Team((model,) * len(positions), radius=radius)
+    states = np.zeros((len(positions), team.state_size))
+    states[:, : world.dimension] = positions
     return Problem(team, states, np.atleast_2d(goal), world, margin=MARGIN)
 
 
@@ -54,10 +54,10 @@ def test_lengths_are_those_of_visibility_graphs_to_two_percent(seed: int) -> Non
     radius = float(random.choice([0.1, 0.15, 0.2, 0.22]))
     problem = problem_in(world, [0.3, 0.3], [5.1, 5.1], radius)
     reach = problem.team.radius[0] + MARGIN
-    places = random.uniform(-0.2, 5.6, (150, 2))
-    places = np.concatenate([[[0.3, 0.3]], places[world.clearance(places) > reach + 1e-3]])
-    expected = visible_lengths(world, reach, problem.goal[0].astype(np.float64), places)
-    lengths = problem.shortest_paths.distance(places[:, None])[:, 0]
+    positions = random.uniform(-0.2, 5.6, (150, 2))
+    positions = np.concatenate([[[0.3, 0.3]], positions[world.clearance(positions) > reach + 1e-3]])
+    expected = visible_lengths(world, reach, problem.goal[0].astype(np.float64), positions)
+    lengths = problem.shortest_paths.distance(positions[:, None])[:, 0]
     assert lengths[0] == pytest.approx(problem.shortest_paths.length[0])
     np.testing.assert_array_equal(np.isfinite(lengths), np.isfinite(expected))
     ratio = lengths[np.isfinite(expected)] / expected[np.isfinite(expected)]
@@ -81,11 +81,11 @@ def test_paths_are_as_long_as_they_say_and_free(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_who_follows_the_direction_gets_there(seed: int) -> None:
     problem = problem_in(cells_world(np.random.default_rng(seed + 30), 0.2), [0.3, 0.3], [5.1, 5.1])
-    place, travelled, step = problem.start[:, :2].astype(np.float64), 0.0, 0.02
-    while np.linalg.norm(place - problem.goal) > 0.05:
-        direction = problem.shortest_paths.direction(place)
+    position, travelled, step = problem.start[:, :2].astype(np.float64), 0.0, 0.02
+    while np.linalg.norm(position - problem.goal) > 0.05:
+        direction = problem.shortest_paths.direction(position)
         np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1.0)
-        place, travelled = place + step * direction, travelled + step
+        position, travelled = position + step * direction, travelled + step
         assert travelled < 1.1 * problem.shortest_paths.length[0]
 
 
@@ -145,12 +145,12 @@ def test_open_worlds_have_straight_ways(scenario: str) -> None:
 
 def test_lengths_and_directions_take_batches() -> None:
     problem = make_problem("four_obstacles")
-    places = problem.start[:, :2] + np.linspace(0, 0.2, 3)[:, None, None]
-    lengths, directions = problem.shortest_paths.distance(places), problem.shortest_paths.direction(places)
+    positions = problem.start[:, :2] + np.linspace(0, 0.2, 3)[:, None, None]
+    lengths, directions = problem.shortest_paths.distance(positions), problem.shortest_paths.direction(positions)
     assert lengths.shape == (3, problem.num_robots)
     assert directions.shape == (3, problem.num_robots, 2)
     np.testing.assert_array_equal(lengths[0], problem.shortest_paths.length)
-    np.testing.assert_array_equal(lengths[2], problem.shortest_paths.distance(places[2]))
+    np.testing.assert_array_equal(lengths[2], problem.shortest_paths.distance(positions[2]))
 
 
 def test_robots_without_a_way_are_named() -> None:
@@ -180,7 +180,7 @@ def test_a_gap_is_passed_if_it_is_wide_enough(slack: float, passable: bool, turn
         assert problem.shortest_paths.length[0] < 1.02 * (2 * math.hypot(1.4, 0.3) + 0.2)
 
 
-def test_places_within_the_margin_are_left_and_reached() -> None:
+def test_positions_within_the_margin_are_left_and_reached() -> None:
     world = World(boxes=[[-1, -1, 1, 0]])
     problem = problem_in(world, [-0.9, RADIUS + 0.01], [0.9, RADIUS + 0.02])
     problem.check_reachable()

@@ -82,7 +82,7 @@ def test_the_speed_limit_comes_after_the_integration() -> None:
     assert x == pytest.approx((0.105, 0.0, 1.0, 0.0), abs=1e-14)
 
 
-def test_arrival_needs_both_place_and_speed() -> None:
+def test_arrival_needs_both_position_and_speed() -> None:
     assert arrives(0.25, 0.04, 0.25, 0.04)
     assert not arrives(0.2501, 0.04, 0.25, 0.04)
     assert not arrives(0.25, 0.0401, 0.25, 0.04)
@@ -123,7 +123,7 @@ def test_a_robot_docks_at_no_more_than_the_goal_speed(engine: str, goal_speed: f
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
 @pytest.mark.parametrize(
-    ("model", "state", "control", "docked"),
+    ("model", "state", "control", "arrived"),
     [
         ("holonomic2d", [1.7, 0, 1, 0], [0, 0], [1.8, 0, 0, 0]),
         ("holonomic3d", [1.7, 0, 0, 1, 0, 0], [0, 0, 0], [1.8, 0, 0, 0, 0, 0]),
@@ -134,14 +134,14 @@ def test_a_robot_docks_at_no_more_than_the_goal_speed(engine: str, goal_speed: f
     ],
 )
 def test_a_docked_robot_stays_at_rest_whatever_it_is_told(
-    engine: str, model: str, state: Any, control: Any, docked: Any
+    engine: str, model: str, state: Any, control: Any, arrived: Any
 ) -> None:
     problem = one_robot(model)
     first = step(engine, problem, state, control)
     assert first.arrived[0]
     # The step that docks is still driven; the velocity is gone after it.
     np.testing.assert_allclose(first.controls[0], control, atol=1e-6)
-    np.testing.assert_allclose(first.states[0], docked, atol=2e-5)
+    np.testing.assert_allclose(first.states[0], arrived, atol=2e-5)
     full_throttle = np.full(problem.control_size, 5.0)
     later = step(engine, problem, first.states[0], full_throttle, arrived=True)
     assert later.arrived[0]

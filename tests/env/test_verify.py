@@ -520,12 +520,12 @@ def random_case(seed, num_robots=4, horizon=6, dt=0.3):
     limits = {"radius": rng.uniform(0.05, 0.2, num_robots), "max_speed": rng.uniform(0.5, 3, num_robots)}
     limits["max_acceleration"] = rng.uniform(1, 6, num_robots)
     corners = np.array([(x, y) for x in (0.3, 0.9, 1.5) for y in (0.3, 0.9, 1.5)])
-    places = corners[rng.permutation(9)[:num_robots]] + rng.uniform(-0.05, 0.05, (num_robots, 2))
+    positions = corners[rng.permutation(9)[:num_robots]] + rng.uniform(-0.05, 0.05, (num_robots, 2))
     goal = corners[rng.permutation(9)[:num_robots]]
     start = []
-    for model, place in zip(models, places, strict=True):
+    for model, position in zip(models, positions, strict=True):
         motion = {"holonomic2d": rng.uniform(-0.3, 0.3, 2), "differential_drive": (rng.uniform(-4, 4), 0.3)}
-        start.append([*place, *motion.get(model, ())])
+        start.append([*position, *motion.get(model, ())])
     world = World(circles=[[2.5, 1, 0.2]], boxes=[[-1, 2, 1.2, 2.3]], lower=(-1.5, -1.5), upper=(3.5, 3.5))
     problem = make(models, start, goal, world=world, limits=limits, dt=dt, horizon=horizon, goal_radius=0.2)
     return problem, rng.normal(size=(horizon, num_robots, 2)) * 3
@@ -620,10 +620,10 @@ def test_a_large_team_is_judged_pair_by_pair():
 @pytest.mark.parametrize("seed", range(3))
 def test_looking_at_many_steps_at_once_misses_nothing(seed, monkeypatch):
     random = np.random.default_rng(seed)
-    places = random.uniform(-4, 4, (120, 2))
+    positions = random.uniform(-4, 4, (120, 2))
     world = World(
-        circles=np.column_stack([places[:60], np.full(60, 0.1)]),
-        boxes=np.hstack([places[60:] - 0.1, places[60:] + 0.1]),
+        circles=np.column_stack([positions[:60], np.full(60, 0.1)]),
+        boxes=np.hstack([positions[60:] - 0.1, positions[60:] + 0.1]),
     )
     start = [(x, y, 0, 0) for x, y in random.uniform(6, 30, (6, 2)) * random.choice([-1, 1], (6, 2))]
     problem = make(["holonomic2d"] * 6, start, [(40, k) for k in range(6)], world=world, horizon=300)

@@ -24,8 +24,8 @@ def blocked_by(problem: Problem, points: Any, robot: int, standing: Any, clear: 
     """Which of ``(..., d)`` points bring a robot too near to obstacles, bounds or those that stand there."""
     radius = float(np.asarray(problem.team.radius)[robot])
     found = problem.world.clearance(points) < radius + problem.margin + clear
-    for place in standing:
-        found |= np.linalg.norm(points - place, axis=-1) < 2 * radius + problem.margin + clear
+    for position in standing:
+        found |= np.linalg.norm(points - position, axis=-1) < 2 * radius + problem.margin + clear
     return found
 
 
@@ -37,8 +37,8 @@ def lattice_path(problem: Problem, robot: int, standing: Any, clear: float) -> l
     points = low + step * np.moveaxis(np.indices(shape), 0, -1)
     blocked = blocked_by(problem, points, robot, standing, clear)
     start, goal = (
-        tuple(np.unravel_index(np.argmin(np.where(blocked, np.inf, np.linalg.norm(points - place, axis=-1))), shape))
-        for place in (problem.start[robot, : problem.dimension], problem.goal[robot])
+        tuple(np.unravel_index(np.argmin(np.where(blocked, np.inf, np.linalg.norm(points - position, axis=-1))), shape))
+        for position in (problem.start[robot, : problem.dimension], problem.goal[robot])
     )
     before: dict[Any, Any] = {start: start}
     queue = deque([start])
@@ -59,30 +59,30 @@ def lattice_path(problem: Problem, robot: int, standing: Any, clear: float) -> l
 
 def ways_past_everybody(problem: Problem) -> list[list[Any]]:
     """The path of each robot clear of all other starts and goals, and of all places where others may dock."""
-    places = np.concatenate([problem.start[:, : problem.dimension], problem.goal]).astype(np.float64)
+    positions = np.concatenate([problem.start[:, : problem.dimension], problem.goal]).astype(np.float64)
     around = problem.goal_radius * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     paths = []
     for robot in range(problem.num_robots):
-        others = np.delete(places, [robot, problem.num_robots + robot], axis=0)
+        others = np.delete(positions, [robot, problem.num_robots + robot], axis=0)
         paths.append(lattice_path(problem, robot, (others[:, None] + around).reshape(-1, 2), clear=5e-4))
     return paths
 
 
 def one_after_another(problem: Problem, order: Any) -> tuple[Problem, Any]:
     """Controls of velocity2d robots that drive alone, each in its turn, and the problem with the time that takes."""
-    places = np.asarray(problem.start, np.float64)
+    positions = np.asarray(problem.start, np.float64)
     turns = []
     for robot in order:
-        driven = lattice_path(problem, robot, np.delete(places, robot, axis=0), clear=5e-3)
+        driven = lattice_path(problem, robot, np.delete(positions, robot, axis=0), clear=5e-3)
         path = np.array([problem.start[robot], *driven, problem.goal[robot]])
         moves = np.diff(path, axis=0)
         parts = np.maximum(np.ceil(np.linalg.norm(moves, axis=1) / (0.9 * problem.dt)), 1).astype(int)
         turn = np.zeros((parts.sum(), problem.num_robots, 2), np.float32)
         turn[:, robot] = np.repeat(moves / parts[:, None], parts, axis=0) / problem.dt
         turns.append(turn)
-        path = places[robot] + np.cumsum(turn[:, robot], axis=0) * problem.dt
+        path = positions[robot] + np.cumsum(turn[:, robot], axis=0) * problem.dt
         # There it docks, and executes no more of its controls.
-        places[robot] = path[np.argmax(np.linalg.norm(path - problem.goal[robot], axis=1) < problem.goal_radius)]
+        positions[robot] = path[np.argmax(np.linalg.norm(path - problem.goal[robot], axis=1) < problem.goal_radius)]
     controls = np.concatenate(turns)
     return problem.replace(horizon=len(controls)), controls
 

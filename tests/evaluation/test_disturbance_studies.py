@@ -177,7 +177,7 @@ def test_the_level_at_which_success_falls_below_90_percent_of_the_undisturbed() 
          group("b", 1, good), group("c", 0, bad), group("c", 1, bad), group("c", None, bad, ""),
          group("d", 0, "-" * 10), group("d", 1, "-" * 10), group("e", 0, bad), group("e", 1, "+" * 7 + "-" * 3)]
     )  # fmt: skip
-    assert [(one.label, one.stands, one.fails, one.text) for one in tolerances(rates)] == [
+    assert [(one.label, one.passes, one.fails, one.text) for one in tolerances(rates)] == [
         ("a", 1, 2, "2"), ("b", 1, None, "over 1"), ("c", 1, None, "over 1"), ("d", None, None, "-"), ("e", 0, 1, "1")
     ]  # fmt: skip
 
@@ -188,24 +188,24 @@ def test_the_undisturbed_success_is_that_without_effect_in_any_order() -> None:
               group("a", 5, bad, "push.speed")]  # fmt: skip
     for order in (groups, groups[::-1]):
         found = {one.disturbance: one for one in tolerances(success_rates(order))}
-        assert (found["delay"].text, found["delay"].stands, found["delay"].undisturbed) == ("2", 1, 1.0)
+        assert (found["delay"].text, found["delay"].passes, found["delay"].undisturbed) == ("2", 1, 1.0)
         assert found["push.speed"].undisturbed == 1.0
     ranges = [group("a", level, wins, "occlusion.range", disturbances="[]" if level == inf else "[[1]]")
               for level, wins in ((1.0, bad), (2.0, good), (inf, good))]  # fmt: skip
-    assert [(one.stands, one.fails) for one in tolerances(success_rates(ranges))] == [(2.0, 1.0)]
+    assert [(one.passes, one.fails) for one in tolerances(success_rates(ranges))] == [(2.0, 1.0)]
 
 
 def test_without_a_level_without_effect_no_tolerance_is_named(tmp_path: Path) -> None:
     groups = [group("a", level, "+++", control_noise_std=0.0) for level in (1, 2)]
     (one,) = tolerances(success_rates(groups))
-    assert (one.undisturbed, one.threshold, one.stands, one.fails, one.text) == (None, None, None, None, "-")
+    assert (one.undisturbed, one.threshold, one.passes, one.fails, one.text) == (None, None, None, None, "-")
     write_disturbances(tmp_path, groups)
     text = (tmp_path / "disturbances.md").read_text()
     assert "| undisturbed success | not run |" in text
     assert "give one a level without effect" in text
     with (tmp_path / "tolerance.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
-    assert row["undisturbed"] == row["threshold"] == row["stands"] == row["fails"] == ""
+    assert row["undisturbed"] == row["threshold"] == row["passes"] == row["fails"] == ""
 
 
 def test_pairs_are_compared_by_seed() -> None:

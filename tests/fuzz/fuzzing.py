@@ -120,12 +120,12 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
     """Bytes with some overwritten, cut off at the end or doubled."""
     data = bytearray(content)
     for _ in range(draw(st.integers(1, 3))):
-        place = draw(st.integers(0, max(len(data) - 1, 0)))
+        position = draw(st.integers(0, max(len(data) - 1, 0)))
         kind = draw(st.integers(0, 5))
         if kind == 0:
-            del data[place:]
+            del data[position:]
         elif kind == 1:
-            data[place:place] = data[place : place + draw(st.integers(1, 40))]
+            data[position:position] = data[position : position + draw(st.integers(1, 40))]
         else:
-            data[place : place + 1] = draw(st.binary(min_size=1, max_size=4))
+            data[position : position + 1] = draw(st.binary(min_size=1, max_size=4))
     return bytes(data)

@@ -208,8 +208,8 @@ def test_a_damaged_store_is_read_or_refused(tmp_path: Path, store: Path, data: s
     content = bytearray(store.read_bytes())
     # Places and bytes rather than damaged(): a failure then shows these, and not the whole store.
     change = st.tuples(st.integers(0, len(content) - 1), st.integers(0, 255))
-    for place, byte in data.draw(st.lists(change, max_size=4), label="changes"):
-        content[place] = byte
+    for position, byte in data.draw(st.lists(change, max_size=4), label="changes"):
+        content[position] = byte
     length = data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))), label="length")
     path.write_bytes(content[:length])
     read_store(path)

@@ -24,7 +24,7 @@ from d4orm_planners.baselines.amswarm.planner import AMSwarmConfig, make_method
 
 
 @given(st.integers(5, 15), st.integers(4, 40), st.floats(0.02, 0.5))
-def test_the_derivatives_are_those_of_the_places(degree: int, steps: int, dt: float) -> None:
+def test_the_derivatives_are_those_of_the_positions(degree: int, steps: int, dt: float) -> None:
     duration = steps * dt
     cubic = np.polynomial.Polynomial([1.0, -2.0, 3.0, 0.5])
     # The coefficients of t^k in the Bernstein basis are products of k factors (i - j) / (n - j).
@@ -39,11 +39,11 @@ def test_the_derivatives_are_those_of_the_places(degree: int, steps: int, dt: fl
 
 def test_the_first_coefficients_are_the_present_state() -> None:
     degree, duration = 8, 2.0
-    place, velocity, acceleration = np.array([1.0, 2.0]), np.array([0.3, -0.5]), np.array([-0.7, 0.1])
+    position, velocity, acceleration = np.array([1.0, 2.0]), np.array([0.3, -0.5]), np.array([-0.7, 0.1])
     motion = np.random.default_rng(0).normal(size=(degree + 1, 2))
-    motion[:3] = first_coefficients(degree, duration, place, velocity, acceleration)
+    motion[:3] = first_coefficients(degree, duration, position, velocity, acceleration)
     basis = sample_basis(degree, 10**5, duration / 10**5)
-    for samples, expected in zip(basis[:3], (place, velocity, acceleration), strict=True):
+    for samples, expected in zip(basis[:3], (position, velocity, acceleration), strict=True):
         np.testing.assert_allclose(samples[0] @ motion, expected, atol=0.01)
 
 
@@ -55,19 +55,19 @@ def plainly(
 ) -> Any:
     """The coefficients of robot 0 among discs, with all constraints as rows of one matrix, one axis at a time."""
     basis = sample_basis(config.degree, config.lookahead, dt)
-    late = basis.place[-config.goal_steps :]
+    late = basis.position[-config.goal_steps :]
     hessian = config.goal_weight * late.T @ late + config.smoothness * basis.jerk.T @ basis.jerk
     linear = config.goal_weight * late.sum(axis=0)[:, None] * goal
     centres = [*bodies.paths[1:], *(np.tile(box[:2], (config.lookahead, 1)) for box in bodies.boxes)]
     reach = [bodies.radius[0] + r + bodies.margin for r in (*bodies.radius[1:], *bodies.boxes[:, 4])]
-    rows = np.concatenate([basis.place] * (1 + len(centres)) + [basis.velocity, basis.acceleration])
+    rows = np.concatenate([basis.position] * (1 + len(centres)) + [basis.velocity, basis.acceleration])
 
-    def projected(place: Any, velocity: Any, acceleration: Any) -> Any:
-        parts = [place]
+    def projected(position: Any, velocity: Any, acceleration: Any) -> Any:
+        parts = [position]
         for centre, least in zip(centres, reach, strict=True):
             before = np.linalg.norm(begin[0] - centre[0])
             part = []
-            for now, middle in zip(place, centre, strict=True):
+            for now, middle in zip(position, centre, strict=True):
                 distance = np.linalg.norm(now - middle)
                 bound = least + (1 - config.barrier) * max(before - least, 0)
                 part.append(middle + (now - middle) / distance * max(distance, bound))
@@ -109,8 +109,8 @@ def test_the_alternation_is_the_publications() -> None:
     for samples, values in zip(basis[:3], guess, strict=True):
         np.testing.assert_allclose(values, samples @ motion, atol=1e-10)
     gaps = [
-        np.linalg.norm(guess.place - others, axis=1) - 0.55,
-        np.linalg.norm(guess.place - boxes[0, :2], axis=1) - 0.5,
+        np.linalg.norm(guess.position - others, axis=1) - 0.55,
+        np.linalg.norm(guess.position - boxes[0, :2], axis=1) - 0.5,
     ]
     speeds = [np.linalg.norm(part, axis=1) - 1 for part in (guess.velocity, guess.acceleration)]
     assert violation == pytest.approx(max(0, *(-gap.min() for gap in gaps), *(speed.max() for speed in speeds)))

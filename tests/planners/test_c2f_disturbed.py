@@ -23,7 +23,15 @@ from d4orm_planners import make_policy, run_episode
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
 from d4orm_planners.d4orm_c2f.deviation import StateFilter
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
-from d4orm_planners.d4orm_c2f.estimators import AFTER, BRAKING_AFTER, LATEST, Lateness, Losses, Standing, Weakness
+from d4orm_planners.d4orm_c2f.estimators import (
+    AFTER,
+    BRAKING_AFTER,
+    LATEST,
+    ActuatorGainEstimator,
+    LatencyEstimator,
+    PacketLossEstimator,
+    StallEstimator,
+)
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import track_velocities
@@ -46,25 +54,25 @@ def joint(problem: Any, states: Any, **parts: Any) -> JointState:
 @given(late=st.integers(0, LATEST), noise=st.floats(0, 0.3), seed=st.integers(0, 1000))
 @settings(max_examples=25, deadline=None)
 def test_how_late_commands_are_is_found_out(late: int, noise: float, seed: int) -> None:
-    random, lateness = np.random.default_rng(seed), Lateness(Team(("holonomic2d",) * 3), None)
+    random, latency = np.random.default_rng(seed), LatencyEstimator(Team(("holonomic2d",) * 3), None)
     sent = [np.zeros((3, 2), np.float32)] * (late + 1)
     for _ in range(60):
         executed = sent[-1 - late] + random.normal(0, noise, (3, 2)) * (len(sent) > late + 1)
-        lateness.observe(executed.astype(np.float32), ALL)
+        latency.observe(executed.astype(np.float32), ALL)
         sent.append(random.normal(size=(3, 2)).astype(np.float32))
-        np.testing.assert_array_equal(lateness.send(sent[-1]), sent[-1 - lateness.steps])
-    assert lateness.steps == late
-    assert len(lateness.under_way) == late
-    under_way = np.reshape(lateness.under_way, (late, 3, 2))
+        np.testing.assert_array_equal(latency.send(sent[-1]), sent[-1 - latency.steps])
+    assert latency.steps == late
+    assert len(latency.under_way) == late
+    under_way = np.reshape(latency.under_way, (late, 3, 2))
     np.testing.assert_array_equal(under_way, np.reshape(sent[len(sent) - late :], (late, 3, 2)))
 
 
 def test_a_lateness_that_is_known_stays() -> None:
-    lateness = Lateness(Team(("holonomic2d",) * 3), 2)
+    latency = LatencyEstimator(Team(("holonomic2d",) * 3), 2)
     for number in range(5):
-        lateness.observe(np.full((3, 2), number - 1, np.float32), ALL)
-        lateness.send(np.full((3, 2), number, np.float32))
-    assert lateness.steps == 2
+        latency.observe(np.full((3, 2), number - 1, np.float32), ALL)
+        latency.send(np.full((3, 2), number, np.float32))
+    assert latency.steps == 2
 
 
 def drifting(walk: float, noise: float, steps: int = 300) -> tuple[Any, Any, StateFilter]:
@@ -102,57 +110,59 @@ def test_states_that_are_known_are_taken_as_they_are() -> None:
 def test_robots_that_do_less_than_asked_are_believed_to_be_weaker(share: float, capped: bool) -> None:
     """By that share, and not once more by what they do less: at the limit as they go, and below it."""
     problem, random = hop_problem(3), np.random.default_rng(0)
-    weakness = Weakness(problem)
+    actuator_gain = ActuatorGainEstimator(problem)
     for step in range(60):
         angle, size = random.uniform(0, 2 * np.pi, 3), 1.0 if step < 30 else 0.6
         told = size * np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
-        weakness.observe(told, min(1, share / size) * told if capped else share * told, ALL)
+        actuator_gain.observe(told, min(1, share / size) * told if capped else share * told, ALL)
     for name in ("max_speed", "max_acceleration", "max_turn_rate"):
-        believed = getattr(weakness.problem.team, name) / getattr(problem.team, name)
+        believed = getattr(actuator_gain.problem.team, name) / getattr(problem.team, name)
         np.testing.assert_allclose(believed, share, rtol=1e-5)
 
 
 def test_what_is_added_to_commands_is_kept_back() -> None:
     problem, random = hop_problem(3), np.random.default_rng(0)
-    weakness = Weakness(problem)
+    actuator_gain = ActuatorGainEstimator(problem)
     for _ in range(60):
         told = random.uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
-        weakness.observe(told, told + np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32), ALL)
-    np.testing.assert_allclose(weakness.problem.team.max_acceleration, [1, 0.9, 0.8], rtol=1e-5)
+        actuator_gain.observe(told, told + np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32), ALL)
+    np.testing.assert_allclose(actuator_gain.problem.team.max_acceleration, [1, 0.9, 0.8], rtol=1e-5)
 
 
 @pytest.mark.parametrize(("bias", "believed"), [(0.0, 1.0), (0.3, 0.7)])
 def test_noise_that_is_added_to_commands_is_not_kept_back(bias: float, believed: float) -> None:
     problem, random, shares = hop_problem(3), np.random.default_rng(0), []
-    weakness = Weakness(problem)
+    actuator_gain = ActuatorGainEstimator(problem)
     for _ in range(400):
         told = random.uniform(-0.3, 0.3, (3, 2)).astype(np.float32)
-        weakness.observe(told, told + np.float32([bias, 0]) + random.normal(0, 0.15, (3, 2)).astype(np.float32), ALL)
-        shares.append(weakness.problem.team.max_acceleration / problem.team.max_acceleration)
+        actuator_gain.observe(
+            told, told + np.float32([bias, 0]) + random.normal(0, 0.15, (3, 2)).astype(np.float32), ALL
+        )
+        shares.append(actuator_gain.problem.team.max_acceleration / problem.team.max_acceleration)
     assert np.mean(shares[50:]) == pytest.approx(believed, abs=0.05 if bias else 0.005)
 
 
 @pytest.mark.parametrize(("share", "runs"), [(0.0, {0}), (0.1, {4, 5}), (0.3, {7, 8, 9}), (0.7, {10})])
 def test_how_many_commands_may_get_lost_in_a_row_is_found_out(share: float, runs: set[int]) -> None:
     """So many that 0.1, 0.3 to that power are about one in ten thousand; ten at most."""
-    random, losses = np.random.default_rng(1), Losses(hop_problem(3))
+    random, packet_loss = np.random.default_rng(1), PacketLossEstimator(hop_problem(3))
     executed = np.zeros((3, 2), np.float32)
     for _ in range(300):
         told = random.uniform(-0.7, 0.7, (3, 2)).astype(np.float32)
         lost = random.uniform(size=3) < share
         executed = np.where(lost[:, None], executed, told)
-        np.testing.assert_array_equal(losses.observe(told, executed, ALL), lost)
-    assert losses.run in runs
+        np.testing.assert_array_equal(packet_loss.observe(told, executed, ALL), lost)
+    assert packet_loss.run in runs
 
 
 def test_noise_and_robots_that_stand_tell_of_no_losses() -> None:
-    random, losses = np.random.default_rng(1), Losses(hop_problem(3))
+    random, packet_loss = np.random.default_rng(1), PacketLossEstimator(hop_problem(3))
     for _ in range(100):
         told = random.uniform(-0.7, 0.7, (3, 2)).astype(np.float32)
         noisy = told + random.normal(0, 0.1, (3, 2)).astype(np.float32)
         noisy[0] = 0
-        assert losses.observe(told, noisy, ALL).tolist() == [True, False, False]
-    assert losses.run == 0
+        assert packet_loss.observe(told, noisy, ALL).tolist() == [True, False, False]
+    assert packet_loss.run == 0
 
 
 def test_who_goes_on_with_its_last_command_is_not_weak() -> None:
@@ -163,8 +173,8 @@ def test_who_goes_on_with_its_last_command_is_not_weak() -> None:
     for _ in range(30):
         observations, *_ = env.step(policy.act(observations, env.state()))
         np.testing.assert_array_equal(policy._deviation.problem.team.limits, problem.team.limits)
-    assert policy._deviation.losses is not None
-    assert policy._deviation.losses.run > 5
+    assert policy._deviation.packet_loss is not None
+    assert policy._deviation.packet_loss.run > 5
 
 
 @pytest.mark.parametrize(("steps", "holds"), [(1, False), (6, True)])
@@ -191,7 +201,7 @@ def test_noise_on_measurements_sends_nobody_off_again() -> None:
     policy, env = controller(), navigation_v0.parallel_env(problem=problem)
     env.reset(seed=0)
     policy.reset(env, seed=0)
-    for away, goals, docked in [
+    for away, goals, arrived in [
         (2.0, problem.goal, False),
         (0.5, problem.goal, True),
         (2.0, problem.goal, True),
@@ -200,7 +210,7 @@ def test_noise_on_measurements_sends_nobody_off_again() -> None:
         states = problem.start.copy()
         states[:, :2] = problem.goal + np.float32([away * problem.goal_radius, 0])
         policy._see_docked(joint(problem, states, goals=goals, arrived=np.array([True, False])))
-        assert policy._docked.tolist() == [docked, False]
+        assert policy._docked.tolist() == [arrived, False]
 
 
 def test_who_is_nearly_there_drives_straight_home() -> None:
@@ -236,12 +246,12 @@ def parked_cars(*, beside: float) -> Problem:
 @pytest.mark.parametrize("beside", [0.1, 0.3, 0.6])
 def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> None:
     """Within its turning circle there is no path home that does not lead away first."""
-    problem, docked = parked_cars(beside=beside), np.array([False, True])
+    problem, arrived = parked_cars(beside=beside), np.array([False, True])
     window, still = problem.replace(horizon=20), np.zeros((20, 2, 2), np.float32)
-    controls, home = direct_final_approach(window, get_sampling_engine("cpu"), still, np.zeros(2, bool), docked)
+    controls, home = direct_final_approach(window, get_sampling_engine("cpu"), still, np.zeros(2, bool), arrived)
     assert home.tolist() == [True, False]
-    places = get_sampling_engine("cpu").rollout(window, controls).positions[:, 0]
-    assert np.linalg.norm(places - problem.goal[0], axis=1).max() > beside + 0.05
+    positions = get_sampling_engine("cpu").rollout(window, controls).positions[:, 0]
+    assert np.linalg.norm(positions - problem.goal[0], axis=1).max() > beside + 0.05
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=0.2)
     assert run_episode(env, controller(), seed=0).metrics["success"]
 
@@ -253,8 +263,8 @@ def test_no_manoeuvre_leads_through_what_stands() -> None:
     goal = start[:, :2].copy()
     goal[0] = [0, 1]
     problem = Problem(Team(("car",) * 7), start, goal, horizon=30)
-    controls, docked = np.zeros((problem.horizon, 7, 2), np.float32), np.arange(7) > 0
-    chosen, home = direct_final_approach(problem, get_sampling_engine("cpu"), controls, ~docked, docked)
+    controls, arrived = np.zeros((problem.horizon, 7, 2), np.float32), np.arange(7) > 0
+    chosen, home = direct_final_approach(problem, get_sampling_engine("cpu"), controls, ~arrived, arrived)
     assert not home.any()
     np.testing.assert_array_equal(chosen, controls)
 
@@ -270,7 +280,7 @@ def test_robots_of_first_order_stray_until_their_next_command_only(model: str, w
 
 def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
     problem = hop_problem(3)
-    standing, states = Standing(problem), problem.start.copy()
+    standing, states = StallEstimator(problem), problem.start.copy()
     told = np.array([[0.8, 0], [0.8, 0], [0.0, 0]], np.float32)
     executed = np.array([[0.8, 0], [0.0, 0], [0.0, 0]], np.float32)
     for step in range(AFTER + 1):
@@ -285,7 +295,7 @@ def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> 
 
 def test_who_brakes_whatever_it_is_told_is_taken_for_docked_where_it_will_come_to_rest() -> None:
     problem, engine = hop_problem(2), get_sampling_engine("cpu")
-    standing, states = Standing(problem), problem.start.copy()
+    standing, states = StallEstimator(problem), problem.start.copy()
     states[:, 2] = 0.9
     told = np.array([[0.0, 0.9], [0.0, -0.9]], np.float32)
     executed = np.zeros_like(told)
@@ -416,7 +426,7 @@ def test_an_episode_tells_how_late_commands_are(disturbance: Any, late: int) -> 
     env = navigation_v0.parallel_env(problem=make_problem("circle", num_robots=4), disturbances=[disturbance])
     executed = run_episode(env, policy, seed=0)
     assert executed.metrics["success"], executed.metrics
-    assert policy._deviation.lateness.steps == late
+    assert policy._deviation.latency.steps == late
 
 
 @pytest.mark.parametrize("scenario", ["circle", "random"])

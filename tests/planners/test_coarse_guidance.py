@@ -101,13 +101,13 @@ def test_who_meets_whom_is_looked_for_at_intervals_too(interval: int, meets: boo
     """Two robots that are near each other at steps 2 and 4 to 5 of ten; the third keeps away."""
     problem = hop_problem(3, horizon=10)
     apart = np.array([[0, 0], [0, 5], [0, 10]], np.float32)
-    places = np.repeat(apart[None], 11, axis=0)
-    places[[2, 4, 5], 1] = places[[2, 4, 5], 0] + [0.1, 0]
+    positions = np.repeat(apart[None], 11, axis=0)
+    positions[[2, 4, 5], 1] = positions[[2, 4, 5], 0] + [0.1, 0]
     search = SolveRun(D4ormD(D4ormDConfig(engine="cpu")), problem, 0, check_interval=interval)
-    states = np.concatenate([places, np.zeros_like(places)], axis=2)
+    states = np.concatenate([positions, np.zeros_like(positions)], axis=2)
     home = np.ones((11, 3), bool)
     here = search.current.trajectory
-    team = WorkingPlan(search, replace(here, states=states, positions=places, arrived=home))
+    team = WorkingPlan(search, replace(here, states=states, positions=positions, arrived=home))
     faults, first = team.faults(np.arange(3))
     np.testing.assert_array_equal(faults, [meets, meets, 0])
     assert team.conflicts() == ((frozenset({1}), frozenset({0}), frozenset()) if meets else (frozenset(),) * 3)
@@ -178,10 +178,10 @@ def test_a_subgoal_behind_a_corner_is_exchanged_for_one_in_sight(walls: bool) ->
 
 def test_who_stands_in_the_way_of_a_subgoal_hides_it() -> None:
     problem = hop_problem(2)
-    path, places = right_angle(2), np.array([[0, 0], [0.5, 0.5]], np.float32)
+    path, positions = right_angle(2), np.array([[0, 0], [0.5, 0.5]], np.float32)
     indices, targets = np.zeros(2, int), np.full(2, 40)
     for standing in (False, True):
-        nearer = visible_subgoals(problem, places, path, indices, targets, np.array([False, standing]), walls=False)
+        nearer = visible_subgoals(problem, positions, path, indices, targets, np.array([False, standing]), walls=False)
         assert (nearer[0] == 40) != standing
         assert nearer[0] > LEAST
         assert nearer[1] == 40
@@ -211,10 +211,10 @@ def test_a_path_is_followed() -> None:
     problem, engine, path = hop_problem(1, horizon=100), get_sampling_engine("cpu"), right_angle(1)
     present = problem.with_state(problem.start, path[-1])
     controls = keep_time(problem, joint(present, problem.start), path, np.zeros(1, int), 100)
-    places = engine.rollout(present, controls).positions[:, 0]
-    off = np.linalg.norm(places[:, None] - path[:, 0], axis=2).min(axis=1)
+    positions = engine.rollout(present, controls).positions[:, 0]
+    off = np.linalg.norm(positions[:, None] - path[:, 0], axis=2).min(axis=1)
     assert off.max() < 0.25
-    assert np.linalg.norm(places[-1] - path[-1, 0]) < 0.1
+    assert np.linalg.norm(positions[-1] - path[-1, 0]) < 0.1
 
 
 @pytest.mark.parametrize("model", COMMON)

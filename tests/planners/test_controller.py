@@ -49,18 +49,18 @@ def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> 
     plant, said = driven(Controller(policy, mode=mode, reserve=0.0, **same), problem)
     episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy(policy, **same), seed=0)
     assert plant.metrics()["success"] == episode.metrics["success"] == 1
-    places = np.stack([s.position for s in said])
+    positions = np.stack([s.position for s in said])
     states = episode.trajectory.positions[1:]
-    steps = min(len(places), len(states))
-    assert abs(len(places) - len(states)) <= (mode == "measured")
+    steps = min(len(positions), len(states))
+    assert abs(len(positions) - len(states)) <= (mode == "measured")
     # What float32 leaves of a measured velocity is a push, but a small one. At the speed limit a model gains half of
     # dt^2 times the control a step, which the controller does not ask of a robot.
     gained = 0.2 if model.startswith("holonomic") else 0.02
-    np.testing.assert_allclose(places[:steps], states[:steps], atol=2e-5 if mode == "nominal" else gained)
+    np.testing.assert_allclose(positions[:steps], states[:steps], atol=2e-5 if mode == "nominal" else gained)
     speeds = np.linalg.norm([s.velocity for s in said], axis=2)
     at_limit = (speeds >= 0.999 * problem.team.max_speed).any(axis=1)
     before = int(at_limit.argmax()) if at_limit.any() else steps
-    np.testing.assert_allclose(places[:before], states[:before], atol=0.02)
+    np.testing.assert_allclose(positions[:before], states[:before], atol=0.02)
     np.testing.assert_array_equal(said[-1].arrived, True)
     assert not any(s.held for s in said)
     assert speeds.max() <= problem.team.max_speed.max() * (1 + 1e-5)
@@ -127,8 +127,8 @@ def test_robots_with_trackers_lead_and_are_led() -> None:
         for step in range(problem.horizon):
             s = controller.step(states, step * problem.dt)
             for part in np.arange(1, 11) / 10:  # as a drone: feed-forward, and a feedback that a wind deflects
-                place = s.position + (part - 1) * problem.dt * s.velocity
-                push = s.acceleration + 8 * (place - states[:, :2]) + 5 * (s.velocity - states[:, 2:]) + wind
+                position = s.position + (part - 1) * problem.dt * s.velocity
+                push = s.acceleration + 8 * (position - states[:, :2]) + 5 * (s.velocity - states[:, 2:]) + wind
                 states[:, 2:] += problem.dt / 10 * push
                 states[:, :2] += problem.dt / 10 * states[:, 2:]
             gaps = np.linalg.norm(states[:, None, :2] - states[:, :2], axis=2)[np.triu_indices(4, 1)]

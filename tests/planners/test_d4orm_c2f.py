@@ -312,9 +312,9 @@ def test_refined_guidance_is_one_plan_from_beginning_to_end() -> None:
     guidance = policy.guidance
     plan = get_sampling_engine("cpu").rollout(guidance.problem, guidance.controls)
     # Who has docked by the waypoint from which the rest is refined may drive on a little.
-    places = guidance.states[..., : problem.dimension]
-    np.testing.assert_allclose(places, plan.positions, atol=problem.goal_radius)
-    np.testing.assert_array_equal(guidance.path[:: policy.config.coarse_factor], places)
+    positions = guidance.states[..., : problem.dimension]
+    np.testing.assert_allclose(positions, plan.positions, atol=problem.goal_radius)
+    np.testing.assert_array_equal(guidance.path[:: policy.config.coarse_factor], positions)
 
 
 def test_a_job_in_the_background_is_one_at_a_time_and_gives_its_result_once() -> None:
@@ -363,12 +363,12 @@ def replanned(
     plan = CoarsePlanning.plan
 
     def coarse_plan(
-        self: CoarsePlanning, problem: Problem, joint: JointState, docked: Any, initial: Any, iterations: int,
+        self: CoarsePlanning, problem: Problem, joint: JointState, arrived: Any, initial: Any, iterations: int,
         *more: Any,
     ) -> Any:  # fmt: skip
         if initial is not None:
             calls.append((joint, initial.copy(), iterations, policy._guide.guidance, policy._guide.index))
-        return plan(self, problem, joint, docked, initial, iterations, *more)
+        return plan(self, problem, joint, arrived, initial, iterations, *more)
 
     monkeypatch.setattr(CoarsePlanning, "plan", coarse_plan)
     world = navigation_v0.parallel_env(**env)
@@ -395,10 +395,10 @@ def test_undisturbed_robots_are_where_they_are_expected() -> None:
     policy = controller()
     assert episode(policy, circle(3)).metrics["success"]
     assert policy._deviation.speed.max() < 1e-4
-    assert policy._deviation.caution == 0
+    assert policy._deviation.speed_slack == 0
     episode(policy, circle(3), disturbances=[Push(1.0, 0.3)])
     assert 0.1 < policy._deviation.speed.max() < 0.7
-    assert 0.1 < policy._deviation.caution <= 0.4
+    assert 0.1 < policy._deviation.speed_slack <= 0.4
 
 
 def test_commands_under_way_are_counted() -> None:
@@ -440,7 +440,7 @@ def test_who_lost_the_guidance_begins_anew_straight_to_the_goals(monkeypatch: py
         (initial == straight(problem, joint, policy.config.coarse_factor)).all(axis=(0, 2))
         for joint, initial, *_ in calls
     ]
-    assert all(anew.any() for anew in begun)
+    assert all(rerouted.any() for rerouted in begun)
 
 
 def test_the_first_coarse_plan_may_begin_with_what_a_policy_does() -> None:
@@ -515,16 +515,16 @@ def test_who_is_behind_robots_that_have_docked_is_barred() -> None:
     policy, env = controller(), navigation_v0.parallel_env(problem=problem)
     env.reset(seed=0)
     policy.reset(env, seed=0)
-    joint, docked = split_state(problem, env.state()), np.array([True, False, False, False])
+    joint, arrived = split_state(problem, env.state()), np.array([True, False, False, False])
     states = joint.states.copy()
     states[0, :2] = policy.guidance.path[10, 2]
-    barred = policy._guide._barred(joint._replace(states=states), docked, np.ones(4, bool))
+    barred = policy._guide._barred(joint._replace(states=states), arrived, np.ones(4, bool))
     assert barred[2]
     assert not barred[0]
-    assert not policy._guide._barred(joint._replace(states=states), docked, np.arange(4) == 1)[2]
+    assert not policy._guide._barred(joint._replace(states=states), arrived, np.arange(4) == 1)[2]
     far = joint.states.copy()
     far[0, :2] = 50
-    assert not policy._guide._barred(joint._replace(states=far), docked, np.ones(4, bool)).any()
+    assert not policy._guide._barred(joint._replace(states=far), arrived, np.ones(4, bool)).any()
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -533,17 +533,17 @@ def test_who_docked_at_the_rim_of_its_goal_stays_there_in_new_plans(seed: int) -
     policy, env = controller(coarse_iterations=1), navigation_v0.parallel_env(problem=problem)
     env.reset(seed=0)
     policy.reset(env, seed=0)
-    joint, docked = split_state(problem, env.state()), np.arange(20) % 2 == 0
+    joint, arrived = split_state(problem, env.state()), np.arange(20) % 2 == 0
     away = np.random.default_rng(seed).normal(size=(20, 2))
     states = joint.states.copy()
-    states[docked] = 0
+    states[arrived] = 0
     rim = problem.goal + 0.99 * problem.goal_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
-    states[docked, :2] = rim[docked]
+    states[arrived, :2] = rim[arrived]
     guide = policy._guide
     plan = guide._planning.plan(
-        guide.problem, joint._replace(states=states, arrived=docked), docked, None, 20, thorough=True
+        guide.problem, joint._replace(states=states, arrived=arrived), arrived, None, 20, thorough=True
     )
-    assert np.linalg.norm(plan.path[:, docked] - states[docked, :2], axis=2).max() <= problem.goal_radius
+    assert np.linalg.norm(plan.path[:, arrived] - states[arrived, :2], axis=2).max() <= problem.goal_radius
 
 
 @pytest.mark.slow

@@ -458,7 +458,7 @@ def test_nodes_search_by_themselves_and_then_go_on_from_a_common_base(clip: bool
     planner = distributed(nodes=3, selection="max", clip_between_iterations=clip, final_approach=False)
     search = SolveRun(planner, walled_in_problem(), 0, None)
     search.advance()
-    nodes = search.state.crew.alive
+    nodes = search.state.pool.alive
     made = [one.candidate for one in nodes]
     best = max(made, key=lambda candidate: candidate.trajectory.rewards.mean())
     assert len({candidate.controls.tobytes() for candidate in made}) == 3
@@ -684,7 +684,7 @@ def test_an_asynchronous_node_waits_once_for_one_that_is_silent(monkeypatch: pyt
     search = SolveRun(planner, walled_in_problem(), 5, None)
     try:
         search.advance()
-        fast, silent = search.state.crew.alive
+        fast, silent = search.state.pool.alive
         # Waiting every time, the other node would not get so far in that time.
         while fast.search.iteration <= enough and search.watch.elapsed < enough * timeout:
             search.advance()
@@ -748,6 +748,6 @@ def test_the_paper_preset_is_algorithm_5_with_a_node_per_robot() -> None:
     assert inner.clip_between_iterations is False
     search = SolveRun(make_planner("d-d4orm", preset="paper", engine="cpu", num_steps=2), hop_problem(3), 0, None)
     search.advance()
-    assert [one.search.planner.config.num_samples for one in search.state.crew.alive] == [683, 683, 682]
+    assert [one.search.planner.config.num_samples for one in search.state.pool.alive] == [683, 683, 682]
     with pytest.raises(ValueError, match="num_samples is 5 for 3 nodes together"):
         make_planner("d-d4orm", engine="cpu", nodes=None, num_samples=5).solve(hop_problem(3))

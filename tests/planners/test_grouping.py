@@ -61,9 +61,9 @@ def teams(draw: Any) -> tuple[np.ndarray, Graph, Graph]:
     return draw(arrays(bool, num_robots)) | np.array([bool(others) for others in now]), now, before
 
 
-def standing(*places: tuple[float, ...], steps: int = 1) -> np.ndarray:
+def standing(*positions: tuple[float, ...], steps: int = 1) -> np.ndarray:
     """``(T+1, K, d)`` robots that stay where they are."""
-    return np.repeat(np.array([places], np.float32), steps + 1, axis=0)
+    return np.repeat(np.array([positions], np.float32), steps + 1, axis=0)
 
 
 # Conflicts. Two robots of radius 0.25 and a margin of 0.5 are in conflict up to a distance of 1 m.
@@ -81,8 +81,8 @@ def test_distance_in_conflicts_is_euclidean() -> None:
 
 
 def test_each_pair_has_the_sum_of_its_own_radii() -> None:
-    places = standing((0, 0), (2, 0), (4, 0))
-    assert edges(conflicts(places, [1.5, 0.25, 0.25], 0.25)) == [(0, 1)]
+    positions = standing((0, 0), (2, 0), (4, 0))
+    assert edges(conflicts(positions, [1.5, 0.25, 0.25], 0.25)) == [(0, 1)]
 
 
 @pytest.mark.parametrize("step", [1, 8, 9, 40])
@@ -93,7 +93,7 @@ def test_one_step_of_contact_in_many_is_a_conflict(step: int) -> None:
     assert edges(conflicts(positions, [0.25] * 3, 0.5)) == [(0, 2)]
 
 
-def test_places_crossed_at_different_steps_are_no_conflict() -> None:
+def test_positions_crossed_at_different_steps_are_no_conflict() -> None:
     positions = np.array([[[0, 0], [5, 0]], [[5, 0], [0, 0]]], np.float32)
     assert edges(conflicts(positions, [0.25, 0.25], 0.5)) == []
 
@@ -115,8 +115,8 @@ def test_at_the_start_nobody_is_in_conflict() -> None:
 @given(arrays(np.float32, (20, 4, 2), elements=st.floats(-2, 2, width=32)), st.floats(0, 1, width=32))
 def test_conflicts_are_what_every_distance_of_every_step_says(positions: np.ndarray, margin: float) -> None:
     radius = np.array([0.125, 0.25, 0.5, 0.0])
-    place = positions[1:].astype(np.float64)
-    gap2 = ((place[:, :, None] - place[:, None]) ** 2).sum(axis=3)
+    position = positions[1:].astype(np.float64)
+    gap2 = ((position[:, :, None] - position[:, None]) ** 2).sum(axis=3)
     reach2 = (radius[:, None] + radius + margin) ** 2
     expected = [(i, j) for i in range(4) for j in range(i + 1, 4) if (gap2[:, i, j] <= reach2[i, j]).any()]
     assert edges(conflicts(positions, radius, margin)) == expected
@@ -274,6 +274,6 @@ def test_independent_robots_are_as_many_as_the_order_allows(case: Any, data: st.
     assert list(taken) == sorted(taken)
     assert set(taken) <= set(candidates)
     assert all(matrix[robot].isdisjoint(taken) for robot in taken)
-    for place, robot in enumerate(candidates):
-        sooner = [other for other in candidates[:place] if other in taken]
+    for position, robot in enumerate(candidates):
+        sooner = [other for other in candidates[:position] if other in taken]
         assert (robot in taken) == matrix[robot].isdisjoint(sooner)

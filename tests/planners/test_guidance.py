@@ -60,9 +60,9 @@ def assert_moves_keep_clear(problem: Problem, roadmap: Roadmap, moves: TeamMoves
         assert roadmap.first[at[robot]] <= edge < roadmap.first[at[robot] + 1], "moves go from where a robot is"
         tail, head = roadmap.nodes[at[robot]], roadmap.nodes[roadmap.heads[edge]]
         others = np.arange(problem.num_robots) != robot
-        step, places = head - tail, roadmap.nodes[at[others]]
-        share = np.clip((places - tail) @ step / (step @ step), 0, 1)
-        gaps = np.linalg.norm(places - tail - share[:, None] * step, axis=1)
+        step, positions = head - tail, roadmap.nodes[at[others]]
+        share = np.clip((positions - tail) @ step / (step @ step), 0, 1)
+        gaps = np.linalg.norm(positions - tail - share[:, None] * step, axis=1)
         assert (gaps > radius[others] + radius[robot] + problem.margin - 1e-6).all()
         at[robot] = roadmap.heads[edge]
     np.testing.assert_array_equal(at == roadmap.goals, moves.arrived)
@@ -76,12 +76,12 @@ def test_edges_of_the_roadmap_keep_clear_of_walls_on_all_their_length() -> None:
     roadmap = lay_roadmap(problem, 1.6)
     tails = np.repeat(np.arange(len(roadmap.nodes)), np.diff(roadmap.first))
     for share in np.linspace(0, 1, 21):
-        places = roadmap.nodes[tails] * (1 - share) + roadmap.nodes[roadmap.heads] * share
+        positions = roadmap.nodes[tails] * (1 - share) + roadmap.nodes[roadmap.heads] * share
         # Starts and goals may be nearer than other places.
         own = np.minimum(
             *(problem.world.clearance(roadmap.nodes[ends][:, :2]) for ends in (tails, roadmap.heads.astype(int)))
         )
-        room = problem.world.clearance(places[:, :2])
+        room = problem.world.clearance(positions[:, :2])
         assert (room > np.minimum(0.2, own) - 0.2 / 100).all()
 
 
@@ -108,7 +108,7 @@ def test_what_is_near_an_edge_is_what_brute_force_finds() -> None:
 # Path finding.
 
 
-def test_two_robots_exchange_places_in_a_corridor_by_its_bay() -> None:
+def test_two_robots_exchange_positions_in_a_corridor_by_its_bay() -> None:
     problem = corridor_with_bay()
     roadmap, moves = found(problem)
     assert moves.arrived.all()
@@ -200,7 +200,7 @@ def test_a_drive_along_found_moves_is_what_the_engine_makes_of_its_controls(mode
     trajectory = get_sampling_engine("cpu").rollout(problem, driven.until(problem.horizon))
     steps = len(driven.controls)
     # A control inside the limits is clipped once more, which may round it.
-    np.testing.assert_allclose(trajectory.positions[: steps + 1], driven.places[:, :, :2], atol=1e-4)
+    np.testing.assert_allclose(trajectory.positions[: steps + 1], driven.positions[:, :, :2], atol=1e-4)
     np.testing.assert_array_equal(trajectory.arrived.argmax(axis=0), driven.arrivals)
     assert verify(problem, driven.until(problem.horizon)).ok
 
@@ -240,10 +240,10 @@ def test_a_car_follows_a_route_from_every_heading(path: Any, heading: float) -> 
     turning = problem.team.turning_radius[0]
     assert (route.bends > turning - 1e-6).all()
     for backs_up in (False, True):
-        controls, places, arrival = drive_by_clock(problem, 0, route, stops, 400, hurrying=True, backs_up=backs_up)
+        controls, positions, arrival = drive_by_clock(problem, 0, route, stops, 400, hurrying=True, backs_up=backs_up)
         assert arrival <= 400
         assert verify(problem, controls[:, None]).ok
-        gaps = np.linalg.norm(places[: arrival + 1, None] - route.points, axis=2).min(axis=1)
+        gaps = np.linalg.norm(positions[: arrival + 1, None] - route.points, axis=2).min(axis=1)
         # It leaves the route no farther than turning round takes, and is on it in the end.
         assert gaps.max() < 4 * turning
         assert gaps[arrival - 5 :].max() < 0.1
@@ -266,14 +266,14 @@ def test_a_path_in_space_and_time_lets_others_pass(fault: str) -> None:
     problem = walled([[-2, 0], [3, 3]], [[2, 0], [3, 2]], boxes)
     roadmap = lay_roadmap(problem, 1.25)
     replanning = Replanning(problem, roadmap)
-    places = np.full((401, 2, 3), 1e9)
+    positions = np.full((401, 2, 3), 1e9)
     if fault != "nobody":
         # It stands in the door until step 100, and then is gone.
-        places[:100, 1] = [0.0, 0.0, 0.0]
+        positions[:100, 1] = [0.0, 0.0, 0.0]
     if fault == "ahead":
-        places[100:200, 1] = np.linspace([0, 0, 0], [3, 3, 0], 100)
-        places[200:, 1] = [3, 3, 0]
-    others = Occupancy(replanning.cells, places).around(np.array([0.0, 0.41]))
+        positions[100:200, 1] = np.linspace([0, 0, 0], [3, 3, 0], 100)
+        positions[200:, 1] = [3, 3, 0]
+    others = Occupancy(replanning.cells, positions).around(np.array([0.0, 0.41]))
     bodies = replanning.bodies
     path = find_path(roadmap, bodies, others, 0, Trip(0.09, 4, 400, -1))
     assert path[0].tolist() == [roadmap.starts[0], 0, 0]
@@ -283,8 +283,8 @@ def test_a_path_in_space_and_time_lets_others_pass(fault: str) -> None:
     for (tail, _, _), (head, depart, arrive) in pairwise(path):
         for step in range(depart, arrive + 1):
             share = (step - depart) / (arrive - depart)
-            place = roadmap.nodes[tail] * (1 - share) + roadmap.nodes[head] * share
-            assert np.linalg.norm(place - places[step, 1]) >= 0.41 - 1e-9
+            position = roadmap.nodes[tail] * (1 - share) + roadmap.nodes[head] * share
+            assert np.linalg.norm(position - positions[step, 1]) >= 0.41 - 1e-9
 
 
 def test_what_is_replanned_is_better_for_all_together_or_left() -> None:

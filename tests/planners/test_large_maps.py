@@ -86,9 +86,9 @@ def joined(problem: Problem, fineness: float) -> np.ndarray:
 def test_a_lattice_says_how_far_apart_its_points_are() -> None:
     problem = alone(World(lower=[0, 0], upper=[100, 100]), (1, 1), (99, 99))
     lattice = lay_lattice(problem, None, 0.2, 0.5, 1000)
-    assert len(lattice.places) <= 1000
+    assert len(lattice.positions) <= 1000
     assert 3.0 < lattice.step < 3.5
-    assert np.diff(np.unique(lattice.places[:, 0])) == pytest.approx(lattice.step)
+    assert np.diff(np.unique(lattice.positions[:, 0])) == pytest.approx(lattice.step)
 
 
 def test_blocked_points_do_not_make_a_lattice_coarse() -> None:
@@ -98,16 +98,16 @@ def test_blocked_points_do_not_make_a_lattice_coarse() -> None:
     lattice = lay_lattice(problem, make_space(problem), 0.2, 0.1, 10_000)
     assert lattice.step == 0.1
     assert len(lattice.nodes) > 900_000
-    assert 5000 < len(lattice.places) < 10_000
+    assert 5000 < len(lattice.positions) < 10_000
     np.testing.assert_array_equal(lattice.nodes[lattice.points], np.arange(len(lattice.points)))
-    assert np.count_nonzero(lattice.nodes >= 0) == len(lattice.places)
-    assert problem.world.clearance(lattice.places[:, :2]).min() > 0.2
+    assert np.count_nonzero(lattice.nodes >= 0) == len(lattice.positions)
+    assert problem.world.clearance(lattice.positions[:, :2]).min() > 0.2
 
 
 def test_a_lattice_gets_as_coarse_as_its_free_points_require() -> None:
     problem = alone(World(boxes=[[40, 40, 60, 60]], lower=[0, 0], upper=[100, 100]), (1, 1), (99, 99))
     lattice = lay_lattice(problem, make_space(problem), 0.2, 0.1, 10_000)
-    assert 8000 < len(lattice.places) <= 10_000
+    assert 8000 < len(lattice.positions) <= 10_000
     assert 0.95 < lattice.step < 1.1
 
 

@@ -121,18 +121,18 @@ def test_robots_head_round_docked_ones_that_are_in_the_way_and_straight_otherwis
     row = [[0, 0], [0, 0.5], [0, -0.5]]
     start = np.pad([[-2, 0], [-2, 2], *row], ((0, 0), (0, 2)))
     problem = make_problem("circle", num_robots=5).replace(start=start, goal=[[3, 0], [3, 2], *row])
-    places = problem.start[:, :2].copy()
+    positions = problem.start[:, :2].copy()
     joint = JointState(problem.start, problem.goal, np.zeros((5, 2), np.float32), np.arange(5) >= 2, 1)
     detours = Detours(problem)
-    none = detours.goals(joint._replace(arrived=np.zeros(5, bool)), places)
+    none = detours.goals(joint._replace(arrived=np.zeros(5, bool)), positions)
     np.testing.assert_array_equal(none, problem.goal)
-    heads = detours.goals(joint, places)
+    heads = detours.goals(joint, positions)
     np.testing.assert_array_equal(heads[1:], problem.goal[1:])
-    beside, length = np.abs(heads[0, 1]), np.linalg.norm(heads[0] - places[0])
+    beside, length = np.abs(heads[0, 1]), np.linalg.norm(heads[0] - positions[0])
     assert beside > 0.5, "past the end of the row"
     assert 5 < length < 6, "the length of the way, on its first stretch"
-    parts = places + 0.1 * (heads - places)
-    np.testing.assert_allclose(detours.goals(joint, parts)[0] - places[0], heads[0] - places[0], rtol=0.02)
+    parts = positions + 0.1 * (heads - positions)
+    np.testing.assert_allclose(detours.goals(joint, parts)[0] - positions[0], heads[0] - positions[0], rtol=0.02)
 
 
 def test_a_learned_policy_takes_no_detours_where_it_is_told_or_robots_are_hidden() -> None:

@@ -181,7 +181,7 @@ def test_a_drive_is_what_its_controls_lead_to(model: str) -> None:
     for b in range(4):
         trajectory = rollout(problem, driven.controls[b][:, None], engine="cpu")
         expected = trajectory.positions[:, 0]
-        np.testing.assert_allclose(driven.places[b, :, : problem.dimension], expected, atol=1e-4)
+        np.testing.assert_allclose(driven.positions[b, :, : problem.dimension], expected, atol=1e-4)
         assert trajectory.arrived[driven.arrivals[b], 0]
         assert not trajectory.arrived[driven.arrivals[b] - 1, 0]
 
@@ -206,10 +206,10 @@ def test_plans_are_learned_as_they_are_driven() -> None:
     frame, sines = frame_of(problem), sine_table()
     shape = np.zeros((2, MODES))
     shape[0, 0], shape[1, 1] = 0.03, 0.05
-    places = np.array(frame.reference)
-    places[:, 0] += 4 * (sines @ shape[0])
-    places[:, 1] += 4 * (sines @ shape[1])
-    np.testing.assert_allclose(modes_of(frame, places), shape, atol=2e-3)
+    positions = np.array(frame.reference)
+    positions[:, 0] += 4 * (sines @ shape[0])
+    positions[:, 1] += 4 * (sines @ shape[1])
+    np.testing.assert_allclose(modes_of(frame, positions), shape, atol=2e-3)
 
 
 # Guidance.
@@ -230,7 +230,7 @@ def surroundings(problem: Problem, **changes: Any) -> PathSurroundings:
     return nothing._replace(**changes)
 
 
-def guided_places(problem: Problem, steps: int = 10, **changes: Any) -> np.ndarray:
+def guided_positions(problem: Problem, steps: int = 10, **changes: Any) -> np.ndarray:
     arguments = still(problem)
     motions = arguments["motions"]
     guide(
@@ -242,28 +242,30 @@ def guided_places(problem: Problem, steps: int = 10, **changes: Any) -> np.ndarr
         steps,
         motions,
     )
-    places: np.ndarray = drive_motions(problem, 0, **arguments).places[0]
-    return places
+    positions: np.ndarray = drive_motions(problem, 0, **arguments).positions[0]
+    return positions
 
 
 def test_constraints_are_kept_clear_of_at_their_time() -> None:
     problem = lone_problem()
-    at = guided_places(problem)[25]
+    at = guided_positions(problem)[25]
     sphere, span = np.array([[at[0], 0.05, 0, 0.4]]), np.array([[20, 30]])
     assert abs(at[1]) < 1e-6
-    gap = np.linalg.norm(guided_places(problem, spheres=sphere, spans=span)[23:28] - sphere[0, :3], axis=1)
+    gap = np.linalg.norm(guided_positions(problem, spheres=sphere, spans=span)[23:28] - sphere[0, :3], axis=1)
     assert gap.min() > 0.35
-    untouched = guided_places(problem, spheres=sphere, spans=np.array([[80, 90]]))
-    np.testing.assert_array_equal(untouched, guided_places(problem))
+    untouched = guided_positions(problem, spheres=sphere, spans=np.array([[80, 90]]))
+    np.testing.assert_array_equal(untouched, guided_positions(problem))
 
 
 def test_other_robots_pull_as_much_as_they_are_told_to() -> None:
     problem = lone_problem()
-    other = np.tile(guided_places(problem)[None] + np.array([0, 0.05, 0]), (1, 1, 1))
+    other = np.tile(guided_positions(problem)[None] + np.array([0, 0.05, 0]), (1, 1, 1))
     radii = np.array([0.4])
-    np.testing.assert_array_equal(guided_places(problem, others=other, radii=radii, pull=0.0), guided_places(problem))
+    np.testing.assert_array_equal(
+        guided_positions(problem, others=other, radii=radii, pull=0.0), guided_positions(problem)
+    )
     gaps = [
-        np.linalg.norm(guided_places(problem, 3, others=other, radii=radii, pull=pull)[25] - other[0, 25])
+        np.linalg.norm(guided_positions(problem, 3, others=other, radii=radii, pull=pull)[25] - other[0, 25])
         for pull in (0.0, 0.1, 1.0)
     ]
     assert gaps[0] < gaps[1] < gaps[2]
@@ -318,7 +320,7 @@ def test_a_conflict_has_two_children_with_a_constraint_each() -> None:
     for robot, child in enumerate(children):
         (constraint,) = child.constraints[robot]
         assert isinstance(constraint, Constraint)
-        middle = (root.motions[0].places[30] + root.motions[1].places[30]) / 2
+        middle = (root.motions[0].positions[30] + root.motions[1].positions[30]) / 2
         assert constraint.sphere == pytest.approx((*middle, 1.2 * 0.35), abs=5e-3)
         assert constraint.span[0] < 30 < constraint.span[1]
         assert child.constraints[1 - robot] == ()
@@ -345,7 +347,7 @@ def test_planning_again_begins_with_what_was_planned() -> None:
     for reuse in (3, None):
         denoiser = Denoiser(problem, MMDConfig(num_samples=8, reuse_steps=reuse), lambda: False)
         batch = denoiser.denoise(0, frame, surroundings(problem), 2, before if reuse else None)
-        found[batch.steps] = batch.driven.places[:, 25, 1]
+        found[batch.steps] = batch.driven.positions[:, 25, 1]
     # Every second motion is its neighbour's mirror image.
     assert abs(found[3][::2]).min() > 3 * abs(found[25]).mean()
 

@@ -163,7 +163,7 @@ def test_a_missing_folder_is_reported_and_not_made(plan: Plan, tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_in_place_of_the_folder_is_reported_and_left_alone(plan: Plan, tmp_path: Path) -> None:
+def test_a_file_in_position_of_the_folder_is_reported_and_left_alone(plan: Plan, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OSError, match="file"):
         plan.save(tmp_path / "file" / "plan.npz")
@@ -224,9 +224,9 @@ def test_a_file_with_one_wrong_byte_is_refused_or_is_the_same_plan(plan: Plan, s
     content = saved.read_bytes()
     random = np.random.default_rng(0)
     refused: list[str] = []
-    for place in random.choice(len(content), 400, replace=False):
+    for position in random.choice(len(content), 400, replace=False):
         damaged = bytearray(content)
-        damaged[place] ^= int(random.integers(1, 256))
+        damaged[position] ^= int(random.integers(1, 256))
         saved.write_bytes(damaged)
         try:
             loaded = Plan.load(saved)

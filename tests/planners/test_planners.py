@@ -124,10 +124,10 @@ def test_controls_keep_the_limits(name: str, model: str) -> None:
 @ALL
 def test_controls_are_zero_after_docking(name: str) -> None:
     plan = cheap_planner(name).solve(hop_problem(), seed=0, max_iterations=6)
-    docked = plan.trajectory.arrived[:-1]
-    assert docked.any()
-    assert (plan.controls[docked] == 0).all()
-    assert (plan.controls[~docked] != 0).any(axis=-1).mean() > 0.9
+    arrived = plan.trajectory.arrived[:-1]
+    assert arrived.any()
+    assert (plan.controls[arrived] == 0).all()
+    assert (plan.controls[~arrived] != 0).any(axis=-1).mean() > 0.9
 
 
 # Determinism.
@@ -274,8 +274,8 @@ def test_a_solution_given_is_returned_at_once(name: str) -> None:
     assert plan.status == "solved"
     assert plan.solved
     assert plan.iterations == plan.denoising_steps == len(plan.history) == len(recorder.records) == 0
-    docked = plan.trajectory.arrived[:-1]
-    np.testing.assert_array_equal(plan.controls, np.where(docked[..., None], 0, given))
+    arrived = plan.trajectory.arrived[:-1]
+    np.testing.assert_array_equal(plan.controls, np.where(arrived[..., None], 0, given))
 
 
 @ALL
@@ -482,13 +482,13 @@ def test_the_paper_preset_has_the_papers_parameters(name: str) -> None:
         "short_paths": False,
         "final_approach": False,
     }
-    without = {
+    exclude = {
         "mppi": {"beta_start", "beta_end"},
         "cem": {"temperature", "weight_cutoff", "beta_start", "beta_end"},
         "mbd": {"clip_between_iterations"},
     }
     config = make_planner(name, preset="paper").config.keywords()
-    assert parameters.keys() - config.keys() == without.get(name, set())
+    assert parameters.keys() - config.keys() == exclude.get(name, set())
     assert {name: config[name] for name in parameters if name in config}.items() <= parameters.items()
 
 

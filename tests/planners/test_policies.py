@@ -365,13 +365,15 @@ def test_orca_finds_its_way_through_rooms(shortest_paths: bool) -> None:
 
 def test_goals_lie_along_the_ways_of_those_that_have_one() -> None:
     problem = make_problem("rooms", num_robots=4, seed=0)
-    places, goals = problem.start[:, :2], problem.goal.copy()
+    positions, goals = problem.start[:, :2], problem.goal.copy()
     goals[3] += 0.1
-    ahead = goals_along_paths(problem, places, goals)
+    ahead = goals_along_paths(problem, positions, goals)
     np.testing.assert_array_equal(ahead[3], goals[3])
-    np.testing.assert_allclose(np.linalg.norm(ahead - places, axis=1)[:3], problem.shortest_paths.length[:3], rtol=1e-5)
-    directions = (ahead - places)[:3] / problem.shortest_paths.length[:3, None]
-    np.testing.assert_allclose(directions, problem.shortest_paths.direction(places)[:3], atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(ahead - positions, axis=1)[:3], problem.shortest_paths.length[:3], rtol=1e-5
+    )
+    directions = (ahead - positions)[:3] / problem.shortest_paths.length[:3, None]
+    np.testing.assert_allclose(directions, problem.shortest_paths.direction(positions)[:3], atol=1e-5)
     np.testing.assert_array_equal(goals_along_paths(problem, problem.goal, problem.goal), problem.goal)
     empty = make_problem("random", num_robots=4)
     assert goals_along_paths(empty, empty.start[:, :2], empty.goal) is empty.goal

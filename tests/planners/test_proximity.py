@@ -18,14 +18,14 @@ PROBLEMS = {2: make_problem("circle", num_robots=2), 3: make_problem("sphere", n
 
 
 @numba.njit
-def _enclose(radius, margin, dimension, places, scratch):
+def _enclose(radius, margin, dimension, table, scratch):
     for k in range(radius.shape[0]):
-        proximity.enclose(k, radius[k] + np.float32(0.5) * margin, dimension, places, scratch.boxes)
+        proximity.enclose(k, radius[k] + np.float32(0.5) * margin, dimension, table, scratch.boxes)
 
 
 @numba.njit
-def _mark(arrays, bodies, digits, first, count, places, turns, scratch):
-    proximity.mark_robots(arrays, bodies, digits, first, count, places, turns, scratch)
+def _mark(arrays, bodies, digits, first, count, table, turns, scratch):
+    proximity.mark_robots(arrays, bodies, digits, first, count, table, turns, scratch)
 
 
 @numba.njit
@@ -33,12 +33,12 @@ def _near_static(arrays, k, bounds, scratch):
     return proximity.near_static(arrays, k, bounds, scratch.boxes, scratch.buffer)
 
 
-def places_of(positions):
+def table_of(positions):
     """Positions ``(K, BLOCK, TILE, d)`` in the kernel's rows."""
     rows = positions.transpose(0, 1, 3, 2).ravel()
-    places = aligned_zeros(rows.size)
-    places[:] = rows
-    return places
+    table = aligned_zeros(rows.size)
+    table[:] = rows
+    return table
 
 
 def walk(random, num_robots, dimension, spread, samples):
@@ -71,12 +71,12 @@ def test_whatever_is_within_the_margin_is_counted_and_nothing_else(
     first = BLOCK
     moving = random.uniform(-1.5, 1.5, (first + count, num_bodies, dimension)).astype(np.float32)
     moving_radius = random.uniform(0.05, 0.3, num_bodies).astype(np.float32)
-    scratch, places = make_scratch(num_robots, dimension), places_of(positions)
-    _enclose(radius, margin, dimension, places, scratch)
+    scratch, table = make_scratch(num_robots, dimension), table_of(positions)
+    _enclose(radius, margin, dimension, table, scratch)
     goal = np.zeros((num_robots, dimension), np.float32)
     arrays = PROBLEMS[dimension].arrays._replace(radius=radius, margin=margin, goal=goal)
     bodies = make_bodies(MovingObstacles(moving, moving_radius), margin)
-    _mark(arrays, bodies, digits, first, count, places, aligned_zeros(0), scratch)
+    _mark(arrays, bodies, digits, first, count, table, aligned_zeros(0), scratch)
 
     steps = np.minimum(first + np.arange(BLOCK), first + count - 1)
     bodies = moving[steps].astype(np.float64).transpose(1, 0, 2)[:, :, None]
@@ -113,15 +113,15 @@ def test_obstacles_and_bounds_are_looked_at_where_a_sample_is_near(dimension, se
     problem = make_problem("circle", num_robots=2, model=model).replace(world=world)
     arrays = problem.arrays
     scratch, bounds = make_scratch(2, dimension), bound_boxes(arrays)
-    place = random.uniform(-8, 10, (2, 1, 1, dimension)) + 0.1 * random.normal(size=(2, BLOCK, TILE, dimension))
-    _enclose(arrays.radius, arrays.margin, dimension, places_of(place.astype(np.float32)), scratch)
+    position = random.uniform(-8, 10, (2, 1, 1, dimension)) + 0.1 * random.normal(size=(2, BLOCK, TILE, dimension))
+    _enclose(arrays.radius, arrays.margin, dimension, table_of(position.astype(np.float32)), scratch)
     for k in range(2):
         reach = problem.team.radius[k] + problem.margin
-        gaps = [np.linalg.norm(place[k] - far[0], axis=-1) - 0.5]
-        outside = np.maximum(np.maximum(far[1] - 0.2 - place[k], place[k] - far[1] - 0.3), 0)
-        gaps += [np.linalg.norm(outside, axis=-1), (place[k] + 7).min(axis=-1), (9 - place[k]).min(axis=-1)]
+        gaps = [np.linalg.norm(position[k] - far[0], axis=-1) - 0.5]
+        outside = np.maximum(np.maximum(far[1] - 0.2 - position[k], position[k] - far[1] - 0.3), 0)
+        gaps += [np.linalg.norm(outside, axis=-1), (position[k] + 7).min(axis=-1), (9 - position[k]).min(axis=-1)]
         if dimension == 3:
-            gaps.append(np.linalg.norm(place[k][..., :2] - far[2, :2], axis=-1) - 0.4)
+            gaps.append(np.linalg.norm(position[k][..., :2] - far[2, :2], axis=-1) - 0.4)
         if min(gap.min() for gap in gaps) < reach - 1e-5:
             assert _near_static(arrays, k, bounds, scratch)
         if min(gap.min() for gap in gaps) > 1.5 + reach + 2 * arrays.grid.slack:

@@ -52,7 +52,7 @@ def test_nodes_hear_each_other_within_the_range() -> None:
     search = SolveRun(planner, problem, 0, None)
     try:
         search.advance()
-        heard = [sorted(node.inbox.newest) for node in search.state.crew.alive]
+        heard = [sorted(node.inbox.newest) for node in search.state.pool.alive]
     finally:
         search.close()
     assert heard == [[1, 3], [0, 2], [1, 3], [0, 2]]

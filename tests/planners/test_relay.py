@@ -90,9 +90,9 @@ def test_a_goal_without_a_way_has_no_ways() -> None:
     assert relay_paths(closed, standing(closed), everybody(closed), 0) is None
 
 
-def ring(place: FloatArray) -> list[list[float]]:
+def ring(position: FloatArray) -> list[list[float]]:
     """Four boxes round a place."""
-    x, y = map(float, place)
+    x, y = map(float, position)
     return [
         [x - 0.5, y + 0.3, x + 0.5, y + 0.4], [x - 0.5, y - 0.4, x + 0.5, y - 0.3],
         [x - 0.5, y - 0.4, x - 0.4, y + 0.4], [x + 0.4, y - 0.4, x + 0.5, y + 0.4],

@@ -108,11 +108,11 @@ def test_a_big_team_is_solved_without_sampling(num_robots: int) -> None:
 @pytest.mark.slow
 def test_eight_pass_a_window_in_space() -> None:
     """A wall of four boxes leaves a window of half a metre, wide enough for two at a time."""
-    places = np.array([[-1.5, y, z] for y in (-0.75, -0.25, 0.25, 0.75) for z in (-0.4, 0.4)])
+    positions = np.array([[-1.5, y, z] for y in (-0.75, -0.25, 0.25, 0.75) for z in (-0.4, 0.4)])
     wall = [(-3.0, -3.0, -0.25, 3.0), (0.25, -3.0, 3.0, 3.0), (-0.25, -3.0, 0.25, -0.25), (-0.25, 0.25, 0.25, 3.0)]
     boxes = [[-0.1, left, low, 0.1, right, high] for left, low, right, high in wall]
     world = World(3, boxes=boxes, lower=(-3.0,) * 3, upper=(3.0,) * 3)
-    start, goal = np.pad(places, ((0, 0), (0, 3))), places[::-1] * (-1, 1, 1)
+    start, goal = np.pad(positions, ((0, 0), (0, 3))), positions[::-1] * (-1, 1, 1)
     problem = Problem(Team(("holonomic3d",) * 8, radius=0.08), start, goal, world, horizon=250, margin=0.03)
     plan = make_planner("hybrid", engine="cpu").solve(problem, seed=0)
     assert plan.solved

@@ -97,7 +97,7 @@ def with_moving(task: SamplingTask) -> SamplingTask:
     return replace(task, moving=through(task.problem))
 
 
-def with_docked(task: SamplingTask, *robots: int) -> SamplingTask:
+def with_arrived(task: SamplingTask, *robots: int) -> SamplingTask:
     arrived = np.zeros(task.problem.num_robots, bool)
     arrived[list(robots)] = True
     return replace(task, arrived=arrived)
@@ -132,10 +132,10 @@ TASKS: dict[str, Callable[[], SamplingTask]] = {
     "moving in space": lambda: with_moving(in_space()),
     "harder": lambda: harder(with_moving(crowd())),
     "harder, obstacles": lambda: harder(among_obstacles()),
-    "docked": lambda: with_docked(among_obstacles(), 1),
-    "docked, moving": lambda: with_moving(with_docked(crowd(), 0, 3)),
-    "all docked": lambda: with_docked(crowd(), 0, 1, 2, 3, 4),
-    "all docked, moving": lambda: with_moving(with_docked(crowd(), 0, 1, 2, 3, 4)),
+    "arrived": lambda: with_arrived(among_obstacles(), 1),
+    "docked, moving": lambda: with_moving(with_arrived(crowd(), 0, 3)),
+    "all docked": lambda: with_arrived(crowd(), 0, 1, 2, 3, 4),
+    "all docked, moving": lambda: with_moving(with_arrived(crowd(), 0, 1, 2, 3, 4)),
 }
 
 
@@ -224,7 +224,7 @@ ENGINES = {"cpu": CPU, "jax": JAX}
         ("harder", "team"),
         ("harder", "robot"),
         ("harder, obstacles", "team"),
-        ("docked", "robot"),
+        ("arrived", "robot"),
         ("docked, moving", "team"),
         ("all docked", "team"),
         ("all docked, moving", "robot"),
@@ -448,12 +448,12 @@ class Burst:
     """Noise of one, but for one control of one robot, whose noise is so large that some samples overflow."""
 
     shape: tuple[int, ...]
-    place: tuple[int, ...]
+    position: tuple[int, ...]
     size: float
 
     def __call__(self, deviation2: Any, xp: Any) -> Any:
         factor = np.ones(self.shape, np.float32)
-        factor[self.place] = self.size
+        factor[self.position] = self.size
         return xp.asarray(factor)
 
 

@@ -42,13 +42,13 @@ STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 DT, DEADLINE = 0.05, 0.3
 
 
-def pose_stamped(*place: float) -> Any:
-    return ros.make(POSE, ros.header(0), ros.pose(np.array(place or (0.0, 0.0)), 0.0))
+def pose_stamped(*position: float) -> Any:
+    return ros.make(POSE, ros.header(0), ros.pose(np.array(position or (0.0, 0.0)), 0.0))
 
 
-def odometry_of(place: np.ndarray, told: Any = None) -> Any:
+def odometry_of(position: np.ndarray, told: Any = None) -> Any:
     told, zeros = ros.twist(np.zeros(3)) if told is None else told, np.zeros(36)
-    pose = ros.make("geometry_msgs/msg/PoseWithCovariance", ros.pose(place, 0.0), zeros)
+    pose = ros.make("geometry_msgs/msg/PoseWithCovariance", ros.pose(position, 0.0), zeros)
     return ros.make(ODOMETRY, ros.header(0), "", pose, ros.make("geometry_msgs/msg/TwistWithCovariance", told, zeros))
 
 
@@ -96,8 +96,8 @@ class Fleet:
     def e_stop(self, wanted: bool) -> None:
         self.say("e_stop", "std_msgs/msg/Bool", STORE.types["std_msgs/msg/Bool"](wanted))
 
-    def goal(self, robot: int, place: list[float]) -> None:
-        self.say(f"robot_{robot}/goal", "geometry_msgs/msg/PoseStamped", pose_stamped(*place))
+    def goal(self, robot: int, position: list[float]) -> None:
+        self.say(f"robot_{robot}/goal", "geometry_msgs/msg/PoseStamped", pose_stamped(*position))
 
     def _command(self, sample: Any) -> None:
         number, sequence = int(str(sample.key_expr).split("/")[1][-1]), sample.attachment.to_bytes()
@@ -252,8 +252,8 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
 
         def live(until_told: Callable[[], bool]) -> None:
             while not until_told():
-                for name, place, told in zip(names, position, commands, strict=True):
-                    odometry = odometry_of(place, told[-1] if told else None)
+                for name, at, told in zip(names, position, commands, strict=True):
+                    odometry = odometry_of(at, told[-1] if told else None)
                     session.inbox["*/odom"].append((f"{name}/odom", odometry))
                 server.tick(DT * len(states))
                 states.append(server.state)
@@ -286,8 +286,8 @@ def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
         def tick() -> None:
             nonlocal period
             period += 1
-            for number, place in enumerate(problem().start[:, :2].astype(float)):
-                session.inbox["*/odom"].append((f"robot_{number}/odom", odometry_of(place)))
+            for number, position in enumerate(problem().start[:, :2].astype(float)):
+                session.inbox["*/odom"].append((f"robot_{number}/odom", odometry_of(position)))
             server.tick(DT * period)
 
         while not (command and command[-1].linear.x > 0):

@@ -229,9 +229,9 @@ def test_polynomials_are_close_to_the_motion(plans: dict[str, Plan], name: str, 
             piece = int(np.searchsorted(ends, time, side="right"))
             own = time - (ends[piece] - table[piece, 0])
             x, y, z, yaw = (polyval(own, table[piece, 1 + 8 * k : 9 + 8 * k]) for k in range(4))
-            place = s.position[i * 20, robot]
-            np.testing.assert_allclose([x, y], place[:2], atol=0.004)
-            assert z == pytest.approx(place[2] if len(place) == 3 else height, abs=0.004)
+            position = s.position[i * 20, robot]
+            np.testing.assert_allclose([x, y], position[:2], atol=0.004)
+            assert z == pytest.approx(position[2] if len(position) == 3 else height, abs=0.004)
             assert yaw == pytest.approx(s.heading[i * 20, robot], abs=0.05)
         # Pieces meet in value and velocity.
         for before, after in pairwise(table):
@@ -258,18 +258,20 @@ def test_a_bag_is_read_by_its_database(plans: dict[str, Plan], tmp_path: Path) -
             robot = int(connection.topic.split("/")[1].removeprefix("robot_"))
             message: Any = store.deserialize_cdr(raw, connection.msgtype)
             if connection.topic.endswith("path"):
-                places = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in message.poses]
+                positions = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in message.poses]
                 turned = [2 * np.arctan2(p.pose.orientation.z, p.pose.orientation.w) for p in message.poses]
                 np.testing.assert_allclose(np.cos(turned), np.cos(s.heading[:, robot]), atol=1e-6)
             else:
                 assert message.joint_names == [f"robot_{robot}"]
-                places = [[p.transforms[0].translation.x, p.transforms[0].translation.y, 0.3] for p in message.points]
+                positions = [
+                    [p.transforms[0].translation.x, p.transforms[0].translation.y, 0.3] for p in message.points
+                ]
                 speeds = [[p.velocities[0].linear.x, p.velocities[0].linear.y] for p in message.points]
                 np.testing.assert_allclose(speeds, s.velocity[:, robot], atol=1e-9)
                 time = message.points[7].time_from_start
                 assert time.sec + 1e-9 * time.nanosec == pytest.approx(s.time[7])
             expected = np.column_stack([s.position[:, robot], np.full(len(s.time), 0.3)])
-            np.testing.assert_allclose(places, expected, atol=1e-9)
+            np.testing.assert_allclose(positions, expected, atol=1e-9)
 
 
 def test_an_mcap_is_read_by_foxglove_s_reader(plans: dict[str, Plan], tmp_path: Path) -> None:
@@ -284,8 +286,8 @@ def test_an_mcap_is_read_by_foxglove_s_reader(plans: dict[str, Plan], tmp_path: 
         for _, channel, _, message in reader.iter_decoded_messages():
             seen.add(channel.topic)
             if channel.topic == "/robot_1/path":
-                places = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in message.poses]
-                np.testing.assert_allclose(places, s.position[:, 1], atol=1e-9)
+                positions = [[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in message.poses]
+                np.testing.assert_allclose(positions, s.position[:, 1], atol=1e-9)
     assert seen == {f"/robot_{robot}/{topic}" for robot in range(5) for topic in ("path", "trajectory")}
 
 

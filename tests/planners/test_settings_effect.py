@@ -158,10 +158,10 @@ def outcomes(name: str, settings: dict[str, Any]) -> Generator[Any]:
         for _ in range(settings["max_iterations"]):
             record = search.advance()
             yield search.current.planned.tobytes(), record.reward, record.note, record.denoising_steps, record.excluded
-        crew = type(getattr(search.state, "crew", None))
+        pool = type(getattr(search.state, "pool", None))
     finally:
         search.close()
-    yield crew, search.plan("stopped").metrics.get("messages")
+    yield pool, search.plan("stopped").metrics.get("messages")
 
 
 def differ(name: str, settings: dict[str, Any], others: dict[str, Any]) -> bool:

@@ -33,7 +33,7 @@ def looked_at(problem: Problem, iterations: int = 0) -> tuple[SamplingTask, Samp
 
 @pytest.mark.parametrize("planner", ["d4orm", "d4orm-d", "mppi", "cem"])
 @pytest.mark.parametrize("case", CLOSE)
-def test_robots_change_places_close_by(planner: str, case: str) -> None:
+def test_robots_change_positions_close_by(planner: str, case: str) -> None:
     scenario, arguments = CLOSE[case]
     problem = make_problem(scenario, **arguments)
     assert make_planner(planner, engine="cpu").solve(problem, seed=0, max_iterations=10).solved

@@ -97,11 +97,11 @@ def test_robot_that_arrives_before_its_switch_stays_docked(model: str) -> None:
     ahead = np.zeros((60, 1, problem.control_size), np.float32)
     ahead[:, :, 1 if model == "differential_drive" else 0] = 0.8
     trajectory, stretches = closing(problem, ahead, [5, 40, 59])
-    docked = trajectory.arrived[:, 0].argmax()
-    assert 5 < docked < 40
+    arrived = trajectory.arrived[:, 0].argmax()
+    assert 5 < arrived < 40
     for v in (1, 2):
         np.testing.assert_allclose(stretches.positions[:, 0, v], trajectory.positions[:, 0], atol=1e-5)
-        assert (stretches.controls[docked:, 0, v] == 0).all()
+        assert (stretches.controls[arrived:, 0, v] == 0).all()
     assert stretches.arrived.tolist() == [[True, True, True]]
     _, late = closing(problem, ahead, [40, 50])
     np.testing.assert_allclose(late.positions[:, 0, 0], trajectory.positions[:, 0], atol=1e-5)

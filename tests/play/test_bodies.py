@@ -9,7 +9,7 @@ from d4orm_env import Problem, Team, make_problem
 from d4orm_env.footprints import Box, Capsule, Train
 
 pytest.importorskip("trimesh")
-from d4orm_planners.play.meshes import body_groups, body_places, goal_poses, heading_lines, in_space
+from d4orm_planners.play.meshes import body_groups, body_positions, goal_poses, heading_lines, in_space
 
 TRAIN = Train(Box(0.5, 0.25, 0.1), [Box(0.4, 0.2)])
 TEAM = Team(("car_with_1_trailer", "unicycle", "unicycle"), footprint=[TRAIN, Capsule(0.4, 0.1), Capsule(0.4, 0.1)])
@@ -33,9 +33,9 @@ def test_bodies_of_one_shape_are_one_group() -> None:
 
 
 def test_bodies_lie_as_the_states_say() -> None:
-    places = in_space(PROBLEM.start[:, :2]) + np.float32(0.5)
-    shown, turns = body_places(PROBLEM, PROBLEM.start, places)
-    np.testing.assert_allclose(shown[:3], places)
+    positions = in_space(PROBLEM.start[:, :2]) + np.float32(0.5)
+    shown, turns = body_positions(PROBLEM, PROBLEM.start, positions)
+    np.testing.assert_allclose(shown[:3], positions)
     # The trailer lags by 45 degrees, half a metre behind.
     np.testing.assert_allclose(shown[3, :2], 0.5 - 0.5 * np.sqrt(0.5) * np.ones(2), atol=1e-5)
     np.testing.assert_allclose(2 * np.arctan2(turns[:, 3], turns[:, 0]), [np.pi / 2, 0, np.pi, np.pi / 4], atol=1e-5)

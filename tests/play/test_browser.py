@@ -127,12 +127,12 @@ def running(problem: Problem, *arguments: str, **options: str) -> Iterator[Any]:
 viser_leaves_loops = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 
-def pixel(playground: Any, place: Sequence[float]) -> tuple[float, float]:
+def pixel(playground: Any, position: Sequence[float]) -> tuple[float, float]:
     """Where on the page a place of the plane, or of space, is."""
     from viser import transforms
 
     camera = next(iter(playground.clients.values())).camera
-    point = np.array([*place, 0.0])[:3]
+    point = np.array([*position, 0.0])[:3]
     x, y, z = transforms.SO3(np.asarray(camera.wxyz)).inverse() @ (point - camera.position)
     scale = 0.5 * camera.image_height / np.tan(camera.fov / 2)
     return camera.image_width / 2 + scale * x / z, camera.image_height / 2 + scale * y / z
@@ -157,15 +157,15 @@ def beside(label: str, selector: str) -> str:
 
 def click_on(page: Page, part: str) -> None:
     """Click with the mouse on the middle of a part of the page, once it stands still."""
-    place = f"""(() => {{
+    position = f"""(() => {{
       {part}.scrollIntoView({{block: 'center'}});
       const box = {part}.getBoundingClientRect();
       return [box.x + box.width / 2, box.y + box.height / 2];
     }})()"""
-    before, (x, y) = None, page.evaluate(place)
+    before, (x, y) = None, page.evaluate(position)
     while before != (x, y):  # the page is still making itself up
         time.sleep(1.0)
-        before, (x, y) = (x, y), page.evaluate(place)
+        before, (x, y) = (x, y), page.evaluate(position)
     for kind in ("Moved", "Pressed", "Released"):
         page.mouse(kind, x, y)
 

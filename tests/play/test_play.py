@@ -572,7 +572,7 @@ main()
 @pytest.mark.parametrize(
     "options", [("--port", "70000"), ("--host", "203.0.113.1"), ("--host", "\xe4" * 70), ("--host", "")]
 )
-def test_a_place_where_one_cannot_listen_is_said(options: tuple[str, str]) -> None:
+def test_a_position_where_one_cannot_listen_is_said(options: tuple[str, str]) -> None:
     pytest.importorskip("viser")
     code = f"from d4orm_planners.cli.app import main; main(['play', '-k', '2', '-p', 'go-to-goal', *{options!r}])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

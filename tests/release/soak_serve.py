@@ -50,11 +50,14 @@ def new_goals(fleet: Fleet, goals: np.ndarray, rng: np.random.Generator) -> int:
     arrived = np.flatnonzero(np.linalg.norm(fleet.position - goals, axis=1) < 0.1)
     for robot in arrived.tolist():
         others = np.delete(goals, robot, axis=0)
-        place = goals[robot]
-        while np.linalg.norm(others - place, axis=1).min() < 0.4 or np.linalg.norm(place - fleet.position[robot]) < 1:
-            place = rng.uniform(0, SIZE, 2)
-        goals[robot] = place
-        fleet.goal(robot, place.tolist())
+        position = goals[robot]
+        while (
+            np.linalg.norm(others - position, axis=1).min() < 0.4
+            or np.linalg.norm(position - fleet.position[robot]) < 1
+        ):
+            position = rng.uniform(0, SIZE, 2)
+        goals[robot] = position
+        fleet.goal(robot, position.tolist())
     return len(arrived)
 
 

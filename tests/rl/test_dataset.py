@@ -93,8 +93,8 @@ def test_episodes_of_robots_are_those_of_the_team_one_by_one(tmp_path: Path) -> 
     assert robots.total_episodes == 3 * team.total_episodes
     own = list(robots.storage.get_episode_metadata(robots.episode_indices))
     assert [(one["seed"], one["robot"], one["id"]) for one in own] == [(i // 3, i % 3, i) for i in range(12)]
-    for place, episode in enumerate(robots):
-        whole, robot, steps = team[place // 3], place % 3, len(episode.actions)
+    for position, episode in enumerate(robots):
+        whole, robot, steps = team[position // 3], position % 3, len(episode.actions)
         seen = whole.observations.reshape(len(whole.observations), 3, -1)[: steps + 1, robot]
         np.testing.assert_array_equal(episode.observations, seen)
         np.testing.assert_array_equal(episode.actions, whole.actions.reshape(-1, 3, 2)[:steps, robot])

@@ -216,8 +216,8 @@ def test_the_rollout_buffer_hands_out_only_steps_in_which_robots_acted() -> None
     buffer = MaskedRolloutBuffer(4, env.observation_space, env.action_space, n_envs=3)
     buffer.source, buffer.random = Source(), np.random.default_rng(0)  # type: ignore[assignment]
     for step in range(4):
-        marks = np.full((3, env.features.size), step, np.float32) + np.float32([[0], [100], [10]])
-        buffer.add(marks, np.zeros((3, 2)), np.zeros(3), np.zeros(3), torch.zeros(3, 1), torch.zeros(3))
+        events = np.full((3, env.features.size), step, np.float32) + np.float32([[0], [100], [10]])
+        buffer.add(events, np.zeros((3, 2)), np.zeros(3), np.zeros(3), torch.zeros(3, 1), torch.zeros(3))
     buffer.compute_returns_and_advantage(torch.zeros(3), np.zeros(3))
     batches = [batch.observations[:, 0].tolist() for batch in buffer.get(4)]
     assert [len(batch) for batch in batches] == [4, 4]
@@ -230,8 +230,8 @@ def test_the_replay_buffer_likewise() -> None:
     buffer = MaskedReplayBuffer(30, env.observation_space, env.action_space, n_envs=3)
     buffer.source, buffer.random = Source(), np.random.default_rng(0)  # type: ignore[assignment]
     for step in range(5):
-        marks = np.full((3, env.features.size), step, np.float32) + np.float32([[0], [100], [10]])
-        buffer.add(marks, marks, np.zeros((3, 2)), np.zeros(3), np.zeros(3), [{}] * 3)
+        events = np.full((3, env.features.size), step, np.float32) + np.float32([[0], [100], [10]])
+        buffer.add(events, events, np.zeros((3, 2)), np.zeros(3), np.zeros(3), [{}] * 3)
     values = set(buffer.sample(200).observations[:, 0].tolist())
     assert values == {0, 1, 2, 3, 4, 10, 11, 12, 13, 14}
     env.close()
@@ -246,9 +246,9 @@ def test_the_replay_buffer_takes_running_out_of_time_for_no_end() -> None:
     buffer.source, buffer.random = Source(), np.random.default_rng(0)  # type: ignore[assignment]
     cases = [(False, False, 0), (True, False, 1), (True, True, 0)]
     for step, (done, out_of_time, _) in enumerate(cases):
-        marks = np.full((3, env.features.size), step, np.float32)
+        events = np.full((3, env.features.size), step, np.float32)
         infos = [{"TimeLimit.truncated": out_of_time}] * 3
-        buffer.add(marks, marks, np.zeros((3, 2)), np.zeros(3), np.full(3, done), infos)
+        buffer.add(events, events, np.zeros((3, 2)), np.zeros(3), np.full(3, done), infos)
     batch = buffer.sample(200)
     ends = {(int(mark), int(end)) for mark, end in zip(batch.observations[:, 0], batch.dones[:, 0], strict=True)}
     assert ends == {(step, end) for step, (*_, end) in enumerate(cases)}

@@ -140,7 +140,7 @@ def test_malformed_files_of_sets_are_refused(tmp_path: Path, change, message: st
 
 
 @pytest.mark.parametrize("base", ["circle", "four_obstacles", "swap"])
-def test_perturbed_scenarios_differ_from_seed_to_seed_in_places_only(base: str) -> None:
+def test_perturbed_scenarios_differ_from_seed_to_seed_in_positions_only(base: str) -> None:
     one, same, other = (make_problem(perturbed, num_robots=8, seed=seed, base=base) for seed in (0, 0, 1))
     assert one == same
     assert np.abs(one.start - other.start).max() > 0.05
@@ -153,7 +153,7 @@ def test_perturbed_scenarios_differ_from_seed_to_seed_in_places_only(base: str) 
 
 
 def test_clutter_keeps_its_obstacles_and_leaves_room_at_starts_and_goals() -> None:
-    problems = [make_problem(clutter, num_robots=8, seed=seed, places=3, obstacles=5) for seed in range(4)]
+    problems = [make_problem(clutter, num_robots=8, seed=seed, positions=3, obstacles=5) for seed in range(4)]
     assert len({problem.world.circles.tobytes() for problem in problems}) == 1
     assert len(set(problems)) == 4
     for problem in problems:

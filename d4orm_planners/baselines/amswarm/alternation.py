@@ -75,7 +75,7 @@ def alternate(
     Returns:
         The largest violation that is left, in SI units.
     """
-    (steps, size), d = method.place.shape, len(goal)
+    (steps, size), d = method.position.shape, len(goal)
     targets = Targets(np.empty((steps, d)), np.empty((steps, d)), np.empty((steps, d)))
     multiplier, right, matrix = np.zeros((size, d)), np.empty((size, d)), np.empty((size, size))
     minded = np.zeros(len(bodies.radius) + len(bodies.boxes), np.bool_)
@@ -108,21 +108,21 @@ def _mind(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, min
     for body in range(len(minded)):
         if body == robot:
             continue
-        for step in range(len(guess.place)):
+        for step in range(len(guess.position)):
             square = 0.0
             if body < robots:
-                reach = bodies.radius[robot] + bodies.radius[body] + bodies.margin
+                safety_distance = bodies.radius[robot] + bodies.radius[body] + bodies.margin
                 for axis in range(d):
-                    gap = guess.place[step, axis] - bodies.paths[body, step, axis]
+                    gap = guess.position[step, axis] - bodies.paths[body, step, axis]
                     square += gap * gap
             else:
                 box = bodies.boxes[body - robots]
-                reach = bodies.radius[robot] + box[2 * d] + bodies.margin
+                safety_distance = bodies.radius[robot] + box[2 * d] + bodies.margin
                 for axis in range(d):
-                    x = guess.place[step, axis]
+                    x = guess.position[step, axis]
                     gap = max(box[axis] - x, x - box[d + axis], 0.0)
                     square += gap * gap
-            if square < (reach + method.lookout) * (reach + method.lookout):
+            if square < (safety_distance + method.lookout) * (safety_distance + method.lookout):
                 minded[body] = True
                 count += 1
                 break
@@ -143,38 +143,38 @@ def _project(
     """The nearest places, velocities and accelerations that limits and the bodies ``minded`` ``(K + B,)`` allow, summed
     into ``targets``; the largest violation. The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`.
     """
-    robots, (steps, d), radius = len(bodies.radius), guess.place.shape, bodies.radius[robot]
+    robots, (steps, d), radius = len(bodies.radius), guess.position.shape, bodies.radius[robot]
     worst = _stay_within(bodies.bounds, radius, limits, guess, targets)
     for body in range(len(minded)):
         if not minded[body]:
             continue
         if body < robots:
-            reach = radius + bodies.radius[body] + bodies.margin
+            safety_distance = radius + bodies.radius[body] + bodies.margin
             before = _gap(here, bodies.paths[body, 0], bodies.paths[body, 0])
         else:
             box = bodies.boxes[body - robots]
-            reach = radius + box[2 * d] + bodies.margin
+            safety_distance = radius + box[2 * d] + bodies.margin
             before = _gap(here, box[:d], box[d : 2 * d])
         for step in range(steps):
-            least = reach + (1.0 - method.barrier) * max(before - reach, 0.0)
+            least = safety_distance + (1.0 - method.barrier) * max(before - safety_distance, 0.0)
             if body < robots:
                 centre = bodies.paths[body, step]
-                before = _push(guess.place[step], centre, centre, least, targets.place[step])
+                before = _push(guess.position[step], centre, centre, least, targets.position[step])
             else:
-                before = _push(guess.place[step], box[:d], box[d : 2 * d], least, targets.place[step])
-            worst = max(worst, reach - before)
+                before = _push(guess.position[step], box[:d], box[d : 2 * d], least, targets.position[step])
+            worst = max(worst, safety_distance - before)
     return worst
 
 
 @compiled
 def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, targets: Targets) -> float:
     """Write the targets of the bounds and of the limits of speed and acceleration; return the largest violation."""
-    (steps, d), worst = guess.place.shape, 0.0
+    (steps, d), worst = guess.position.shape, 0.0
     for step in range(steps):
         for axis in range(d):
             low, high = bounds[0, axis] + radius, bounds[1, axis] - radius
-            x = guess.place[step, axis]
-            targets.place[step, axis] = min(max(x, low), high)
+            x = guess.position[step, axis]
+            targets.position[step, axis] = min(max(x, low), high)
             worst = max(worst, low - x, x - high)
         worst = max(worst, _shorten(guess.velocity[step], limits[0], targets.velocity[step]))
         worst = max(worst, _shorten(guess.acceleration[step], limits[1], targets.acceleration[step]))
@@ -182,36 +182,36 @@ def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, ta
 
 
 @compiled
-def _gap(place: Floats, low: Floats, high: Floats) -> float:
+def _gap(position: Floats, low: Floats, high: Floats) -> float:
     """Return the distance of a place from a box, zero within."""
     square = 0.0
-    for axis in range(len(place)):
-        gap = max(low[axis] - place[axis], place[axis] - high[axis], 0.0)
+    for axis in range(len(position)):
+        gap = max(low[axis] - position[axis], position[axis] - high[axis], 0.0)
         square += gap * gap
     return math.sqrt(square)
 
 
 @compiled
-def _push(place: Floats, low: Floats, high: Floats, least: float, target: Floats) -> float:
-    """Add to ``target`` the point nearest to ``place`` that is ``least`` from a box, which may be a point.
+def _push(position: Floats, low: Floats, high: Floats, least: float, target: Floats) -> float:
+    """Add to ``target`` the point nearest to ``position`` that is ``least`` from a box, which may be a point.
 
     Returns:
-        How far ``place`` is from the box, negative within.
+        How far ``position`` is from the box, negative within.
     """
-    distance = _gap(place, low, high)
+    distance = _gap(position, low, high)
     if distance > 0.0:
         factor = max(least / distance, 1.0)
-        for axis in range(len(place)):
-            nearest = min(max(place[axis], low[axis]), high[axis])
-            target[axis] += nearest + factor * (place[axis] - nearest)
+        for axis in range(len(position)):
+            nearest = min(max(position[axis], low[axis]), high[axis])
+            target[axis] += nearest + factor * (position[axis] - nearest)
         return distance
     depth, out, side = math.inf, 0, 1.0
-    for axis in range(len(place)):
-        target[axis] += place[axis]
-        if place[axis] - low[axis] < depth:
-            depth, out, side = place[axis] - low[axis], axis, -1.0
-        if high[axis] - place[axis] < depth:
-            depth, out, side = high[axis] - place[axis], axis, 1.0
+    for axis in range(len(position)):
+        target[axis] += position[axis]
+        if position[axis] - low[axis] < depth:
+            depth, out, side = position[axis] - low[axis], axis, -1.0
+        if high[axis] - position[axis] < depth:
+            depth, out, side = high[axis] - position[axis], axis, 1.0
     target[out] += side * (depth + least)
     return -depth
 

@@ -15,16 +15,16 @@ from d4orm_env.engine.compiling import compiled
 
 
 class Basis(NamedTuple):
-    """The basis of degree ``n`` over ``T`` steps: the samples of a motion are ``place @ c``, ``c`` being ``(n+1, d)``.
+    """The basis of degree ``n`` over ``T`` steps: samples of a motion are ``position @ c``, ``c`` being ``(n+1, d)``.
 
     Attributes:
-        place: ``(T, n+1)`` positions at steps 1 to T.
+        position: ``(T, n+1)`` positions at steps 1 to T.
         velocity: ``(T, n+1)`` [1/s].
         acceleration: ``(T, n+1)`` [1/s^2].
         jerk: ``(T, n+1)`` [1/s^3].
     """
 
-    place: Floats
+    position: Floats
     velocity: Floats
     acceleration: Floats
     jerk: Floats
@@ -44,11 +44,13 @@ def sample_basis(degree: int, steps: int, dt: float) -> Basis:
     return Basis(*derivatives)
 
 
-def first_coefficients(degree: int, duration: float, place: Floats, velocity: Floats, acceleration: Floats) -> Floats:
+def first_coefficients(
+    degree: int, duration: float, position: Floats, velocity: Floats, acceleration: Floats
+) -> Floats:
     """``(3, ...)`` the coefficients that a motion of ``duration`` [s] begins with in that state."""
-    second = place + velocity * duration / degree
-    third = 2 * second - place + acceleration * duration**2 / (degree * (degree - 1))
-    return np.stack([place, second, third])
+    second = position + velocity * duration / degree
+    third = 2 * second - position + acceleration * duration**2 / (degree * (degree - 1))
+    return np.stack([position, second, third])
 
 
 def _polynomials(degree: int, times: Floats) -> Floats:
@@ -71,7 +73,7 @@ class Method(NamedTuple):
     """Weights and limits of the alternation, with its basis.
 
     Attributes:
-        place: ``(T, n+1)`` see :class:`Basis`.
+        position: ``(T, n+1)`` see :class:`Basis`.
         velocity: ``(T, n+1)``.
         acceleration: ``(T, n+1)``.
         squares: ``(4, n+1, n+1)`` of the constraints on places, velocities and accelerations the sums of squares over
@@ -85,7 +87,7 @@ class Method(NamedTuple):
         tolerance: Largest violation, and change of a place, at which it ends, in SI units.
     """
 
-    place: Floats
+    position: Floats
     velocity: Floats
     acceleration: Floats
     squares: Floats
@@ -101,7 +103,7 @@ class Method(NamedTuple):
 class Guess(NamedTuple):
     """Samples of a motion at steps 1 to T, each ``(T, d)``: places [m], velocities [m/s], accelerations [m/s^2]."""
 
-    place: Floats
+    position: Floats
     velocity: Floats
     acceleration: Floats
 
@@ -109,7 +111,7 @@ class Guess(NamedTuple):
 class Targets(NamedTuple):
     """Sums over all constraints that directions and lengths make of a :class:`Guess`, each ``(T, d)``."""
 
-    place: Floats
+    position: Floats
     velocity: Floats
     acceleration: Floats
 
@@ -129,12 +131,12 @@ def raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: fl
 @compiled
 def accumulate(method: Method, targets: Targets, bends: float, right: Floats) -> None:
     """Add up the targets' share of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
-    (steps, size), d = method.place.shape, right.shape[1]
+    (steps, size), d = method.position.shape, right.shape[1]
     for i in range(size):
         for axis in range(d):
             total = 0.0
             for step in range(steps):
-                total += method.place[step, i] * targets.place[step, axis]
+                total += method.position[step, i] * targets.position[step, axis]
                 total += method.velocity[step, i] * targets.velocity[step, axis]
                 total += bends * method.acceleration[step, i] * targets.acceleration[step, axis]
             right[i, axis] = total
@@ -167,16 +169,16 @@ def solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
 @compiled
 def sample(method: Method, motion: Floats, guess: Guess) -> float:
     """Make the guess the samples of a motion; return how far a place moved at most along an axis [m]."""
-    (steps, size), d, change = method.place.shape, motion.shape[1], 0.0
+    (steps, size), d, change = method.position.shape, motion.shape[1], 0.0
     for step in range(steps):
         for axis in range(d):
-            place = velocity = acceleration = 0.0
+            position = velocity = acceleration = 0.0
             for i in range(size):
-                place += method.place[step, i] * motion[i, axis]
+                position += method.position[step, i] * motion[i, axis]
                 velocity += method.velocity[step, i] * motion[i, axis]
                 acceleration += method.acceleration[step, i] * motion[i, axis]
-            change = max(change, abs(place - guess.place[step, axis]))
-            guess.place[step, axis] = place
+            change = max(change, abs(position - guess.position[step, axis]))
+            guess.position[step, axis] = position
             guess.velocity[step, axis] = velocity
             guess.acceleration[step, axis] = acceleration
     return change

@@ -46,7 +46,7 @@ class Swarm:
         self._motions = np.zeros((team.num_robots, config.degree + 1, d))
         self._accelerations = np.zeros((team.num_robots, d))
         self._guesses = self._warm_start()
-        self._first = self._guesses.place[:, 0], self._guesses.velocity[:, 0]
+        self._first = self._guesses.position[:, 0], self._guesses.velocity[:, 0]
         self.violation = 0.0
 
     def run(self, engine: Engine, should_stop: Callable[[], bool]) -> FloatArray:
@@ -60,8 +60,8 @@ class Swarm:
         states, arrived = np.asarray(problem.start), np.zeros(problem.num_robots, bool)
         velocities = np.zeros((problem.num_robots, problem.dimension))
         for control in controls:
-            stands = arrived & problem.docks
-            if stands.all() or not self._replan(states, velocities, stands, should_stop):
+            absorbed = arrived & problem.docks
+            if absorbed.all() or not self._replan(states, velocities, absorbed, should_stop):
                 break
             control[:] = track_velocities(problem, states, self._wanted(states))
             step = engine.step(problem.arrays, states, arrived, control)
@@ -70,17 +70,17 @@ class Swarm:
         return controls
 
     def _replan(
-        self, states: FloatArray, velocities: Floats, stands: BoolArray, should_stop: Callable[[], bool]
+        self, states: FloatArray, velocities: Floats, absorbed: BoolArray, should_stop: Callable[[], bool]
     ) -> bool:
         """Every robot's motion from here, around where the others are predicted to be; whether time sufficed."""
         config, problem, method = self._config, self._problem, self._method
-        places, duration = states[:, : problem.dimension].astype(np.float64), config.lookahead * problem.dt
-        moved = self._random.uniform(-self._perturbation, self._perturbation, self._guesses.place.shape)
-        predicted = np.where(stands[:, None, None], places[:, None], self._guesses.place)
+        positions, duration = states[:, : problem.dimension].astype(np.float64), config.lookahead * problem.dt
+        moved = self._random.uniform(-self._perturbation, self._perturbation, self._guesses.position.shape)
+        predicted = np.where(absorbed[:, None, None], positions[:, None], self._guesses.position)
         bodies = Neighbourhood(predicted, self._radius, problem.margin + self._clearance, self._boxes, self._bounds)
-        begins = first_coefficients(config.degree, duration, places, velocities, self._accelerations)
+        begins = first_coefficients(config.degree, duration, positions, velocities, self._accelerations)
         guesses = Guess(predicted + moved, self._guesses.velocity.copy(), self._guesses.acceleration.copy())
-        for robot in np.flatnonzero(~stands):
+        for robot in np.flatnonzero(~absorbed):
             if should_stop():
                 return False
             motion, fixed = self._motions[robot], self._fixed[robot]
@@ -88,33 +88,33 @@ class Swarm:
             own = Guess(*(samples[robot] for samples in guesses))
             violation = alternate(method, bodies, robot, self._limits[robot], self._goals[robot], fixed, motion, own)
             self.violation = max(self.violation, violation)
-        self._first = guesses.place[:, 0], guesses.velocity[:, 0]
+        self._first = guesses.position[:, 0], guesses.velocity[:, 0]
         self._accelerations = _shortened(guesses.acceleration[:, 0], self._limits[:, 1])
         self._guesses = _one_step_on(guesses, problem.dt)
         return True
 
     def _wanted(self, states: FloatArray) -> FloatArray:
         """``(K, d)`` velocities that lead along the motions for a step [m/s]."""
-        places, velocities = self._first
-        mean = (places - states[:, : self._problem.dimension]) / self._problem.dt
+        positions, velocities = self._first
+        mean = (positions - states[:, : self._problem.dimension]) / self._problem.dt
         return np.where(self._fixed[:, None] > 1, velocities, mean).astype(np.float32)
 
     def _warm_start(self) -> Guess:
         """All robots straight to their goals, as fast as allowed."""
         problem = self._problem
-        places = problem.start[:, None, : problem.dimension].astype(np.float64)
-        ahead = self._goals[:, None] - places
+        positions = problem.start[:, None, : problem.dimension].astype(np.float64)
+        ahead = self._goals[:, None] - positions
         distance = np.linalg.norm(ahead, axis=2, keepdims=True)
         times = problem.dt * np.arange(1, self._config.lookahead + 1)[None, :, None]
         share = np.minimum(self._limits[:, 0, None, None] * times / np.maximum(distance, problem.goal_radius), 1.0)
         still = np.zeros((problem.num_robots, self._config.lookahead, problem.dimension))
-        return Guess(places + share * ahead, still, still)
+        return Guess(positions + share * ahead, still, still)
 
 
 def make_method(config: AMSwarmConfig, dt: float, stride: float) -> Method:
     """The settings as the kernel takes them, for steps of ``dt`` [s] in which robots drive ``stride`` [m] at most."""
     basis = sample_basis(config.degree, config.lookahead, dt)
-    late = basis.place[-min(config.goal_steps, config.lookahead) :]
+    late = basis.position[-min(config.goal_steps, config.lookahead) :]
     squares = [_squares(samples) for samples in basis[:3]]
     squares.append(config.goal_weight * _squares(late) + config.smoothness * _squares(basis.jerk))
     return Method(
@@ -145,9 +145,9 @@ def _shortened(vectors: Floats, most: Floats) -> Floats:
 
 def _one_step_on(guess: Guess, dt: float) -> Guess:
     """The same motions seen from the next step, at their last velocity in the end; each ``(K, T, d)``."""
-    place, velocity, acceleration = (np.concatenate([part[:, 1:], part[:, -1:]], axis=1) for part in guess)
-    place[:, -1] += dt * velocity[:, -1]
-    return Guess(place, velocity, acceleration)
+    position, velocity, acceleration = (np.concatenate([part[:, 1:], part[:, -1:]], axis=1) for part in guess)
+    position[:, -1] += dt * velocity[:, -1]
+    return Guess(position, velocity, acceleration)
 
 
 Degree = Annotated[Count, Field(ge=5, le=30)]

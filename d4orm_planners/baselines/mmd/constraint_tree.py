@@ -29,24 +29,24 @@ PADDING = 2
 
 
 @cached_kernel(variant="count", **OPTIONS)
-def count_conflicts(places: Floats, others: Floats, distances: Floats, counts: IntArray) -> None:
+def count_conflicts(positions: Floats, others: Floats, distances: Floats, counts: IntArray) -> None:
     """Fill ``counts`` ``(B, 2)`` int64 with how many others each of some paths conflicts with, and at how many steps.
 
     Args:
-        places: ``(B, T, 3)`` the paths [m].
+        positions: ``(B, T, 3)`` the paths [m].
         others: ``(S, T, 3)`` where the others are [m].
         distances: ``(S,)`` to keep from each [m].
         counts: Output.
     """
     counts[:] = 0
-    for b in range(places.shape[0]):
+    for b in range(positions.shape[0]):
         for other in range(others.shape[0]):
             steps = 0
             square = distances[other] * distances[other]
-            for t in range(places.shape[1]):
-                dx = places[b, t, 0] - others[other, t, 0]
-                dy = places[b, t, 1] - others[other, t, 1]
-                dz = places[b, t, 2] - others[other, t, 2]
+            for t in range(positions.shape[1]):
+                dx = positions[b, t, 0] - others[other, t, 0]
+                dy = positions[b, t, 1] - others[other, t, 1]
+                dz = positions[b, t, 2] - others[other, t, 2]
                 if dx * dx + dy * dy + dz * dz <= square:
                     steps += 1
             if steps > 0:
@@ -55,22 +55,22 @@ def count_conflicts(places: Floats, others: Floats, distances: Floats, counts: I
 
 
 @cached_kernel(variant="first", **OPTIONS)
-def first_conflict(places: Floats, distances: Floats) -> tuple[Whole, Whole, Whole, Whole]:
+def first_conflict(positions: Floats, distances: Floats) -> tuple[Whole, Whole, Whole, Whole]:
     """``(pairs, step, robot, robot)``: how many pairs conflict, and the earliest conflict; robots are -1 if none does.
 
     Args:
-        places: ``(K, T, 3)`` [m].
+        positions: ``(K, T, 3)`` [m].
         distances: ``(K, K)`` to keep [m].
     """
-    robots, steps = places.shape[0], places.shape[1]
+    robots, steps = positions.shape[0], positions.shape[1]
     pairs, earliest, one, another = 0, steps, -1, -1
     for k in range(1, robots):
         for other in range(k):
             square = distances[k, other] * distances[k, other]
             for t in range(steps):
-                dx = places[k, t, 0] - places[other, t, 0]
-                dy = places[k, t, 1] - places[other, t, 1]
-                dz = places[k, t, 2] - places[other, t, 2]
+                dx = positions[k, t, 0] - positions[other, t, 0]
+                dy = positions[k, t, 1] - positions[other, t, 1]
+                dz = positions[k, t, 2] - positions[other, t, 2]
                 if dx * dx + dy * dy + dz * dz <= square:
                     pairs += 1
                     if t < earliest:
@@ -98,14 +98,14 @@ class RobotMotion:
     Attributes:
         motions: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with.
         controls: ``(H, m)``.
-        places: ``(H+1, 3)`` [m].
+        positions: ``(H+1, 3)`` [m].
         cost: Steps until it arrives.
         fails: Whether it comes too near to an obstacle or does not arrive.
     """
 
     motions: FloatArray
     controls: FloatArray
-    places: Floats
+    positions: Floats
     cost: int
     fails: bool
 
@@ -178,8 +178,8 @@ class Planning:
         self, number: int, motions: tuple[RobotMotion, ...], constraints: tuple[tuple[Constraint, ...], ...]
     ) -> TreeNode:
         """A node with its conflicts counted and the first one found."""
-        places = np.stack([motion.places for motion in motions])
-        pairs, step, one, another = first_conflict(places, self._distances)
+        positions = np.stack([motion.positions for motion in motions])
+        pairs, step, one, another = first_conflict(positions, self._distances)
         failing = sum(motion.fails for motion in motions)
         cost = sum(motion.cost for motion in motions)
         return TreeNode(int(pairs) + failing, cost, number, motions, constraints, (int(one), int(another)), int(step))
@@ -212,7 +212,7 @@ class Planning:
 
     def _constraint(self, node: TreeNode, robot: int, other: int) -> Constraint:
         """To keep out of a sphere about the middle between two robots for a while."""
-        middle = (node.motions[robot].places[node.step] + node.motions[other].places[node.step]) / 2
+        middle = (node.motions[robot].positions[node.step] + node.motions[other].positions[node.step]) / 2
         radius = self._config.constraint_radius * self._distances[robot, other]
         motion = self._frames[robot].quickest * self._config.quickest / self._problem.dt
         padding = max(1, round(PADDING * motion / 64))
@@ -230,11 +230,11 @@ class Planning:
     ) -> RobotMotion:
         """The motion of a robot that conflicts least with these others, of those that were denoised together."""
         config, frame = self._config, self._frames[robot]
-        paths = np.stack([motions[other].places for other in others]) if others else np.empty((0, 1, 3))
+        paths = np.stack([motions[other].positions for other in others]) if others else np.empty((0, 1, 3))
         distances = self._distances[robot, others]
         surroundings = PathSurroundings(
             space=self._space,
-            clearance=frame.reach + config.clearance * self._problem.stride,
+            clearance=frame.safety_distance + config.clearance * self._problem.stride,
             size=self._problem.team.largest_radius,
             dt=self._problem.dt,
             spheres=np.array([constraint.sphere for constraint in constraints]).reshape(-1, 4),
@@ -245,14 +245,14 @@ class Planning:
         )
         batch = self._denoiser.denoise(robot, frame, surroundings, seed, before)
         self.steps += batch.steps
-        return self._choose(batch, paths, distances, frame.reach)
+        return self._choose(batch, paths, distances, frame.safety_distance)
 
-    def _choose(self, batch: Batch, paths: Floats, distances: Floats, reach: float) -> RobotMotion:
+    def _choose(self, batch: Batch, paths: Floats, distances: Floats, safety_distance: float) -> RobotMotion:
         driven = batch.driven
         counts: NDArray[np.int64] = np.zeros((len(batch.motions), 2), np.int64)
         if len(paths):
-            count_conflicts(driven.places, paths, distances, counts)
-        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < reach + self._slack)
+            count_conflicts(driven.positions, paths, distances, counts)
+        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < safety_distance + self._slack)
         best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
-        controls, places = driven.controls[best].copy(), driven.places[best].copy()
-        return RobotMotion(batch.motions, controls, places, int(driven.arrivals[best]), bool(fails[best]))
+        controls, positions = driven.controls[best].copy(), driven.positions[best].copy()
+        return RobotMotion(batch.motions, controls, positions, int(driven.arrivals[best]), bool(fails[best]))

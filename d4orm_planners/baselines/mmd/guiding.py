@@ -120,16 +120,16 @@ def guide(
 def _violation(surroundings: PathSurroundings, step: Whole, spot: Floats, push: Floats) -> bool:
     """Fill ``push`` ``(3,)`` with what would end a place's violations at a step [m]; whether there are any."""
     push[:] = 0.0
-    place, aside = spot[0], spot[2]
+    position, aside = spot[0], spot[2]
     violated = False
     for c in range(surroundings.spheres.shape[0]):
         if surroundings.spans[c, 0] <= step <= surroundings.spans[c, 1]:
             sphere = surroundings.spheres[c]
-            violated |= _push_out(sphere, sphere[3], 1.0, aside, place, push)
+            violated |= _push_out(sphere, sphere[3], 1.0, aside, position, push)
     at = min(step, surroundings.others.shape[1] - 1)
     for other in range(surroundings.others.shape[0]):
         centre = surroundings.others[other, at]
-        violated |= _push_out(centre, surroundings.radii[other], surroundings.pull, aside, place, push)
+        violated |= _push_out(centre, surroundings.radii[other], surroundings.pull, aside, position, push)
     return _push_clear(surroundings.space, surroundings.clearance, _PROBE * surroundings.size, spot, push) or violated
 
 
@@ -158,9 +158,9 @@ def _push_clear(space: Space, clearance: float, probe: float, spot: Floats, push
 
 
 @compiled
-def _push_out(centre: Floats, radius: float, share: float, aside: Floats, place: Floats, push: Floats) -> bool:
+def _push_out(centre: Floats, radius: float, share: float, aside: Floats, position: Floats, push: Floats) -> bool:
     """Add to ``push`` that share of what brings a place out of a sphere; whether it is in it."""
-    dx, dy, dz = place[0] - centre[0], place[1] - centre[1], place[2] - centre[2]
+    dx, dy, dz = position[0] - centre[0], position[1] - centre[1], position[2] - centre[2]
     square = dx * dx + dy * dy + dz * dz
     if not square < radius * radius or share == 0.0:
         return False

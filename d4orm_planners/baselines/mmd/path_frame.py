@@ -44,7 +44,7 @@ class PathFrame(NamedTuple):
         axes: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four
             across the line from start to goal in space.
         length: Of the path, at least the goal's radius [m].
-        reach: The distance that the robot's centre keeps from obstacles [m].
+        safety_distance: The distance that the robot's centre keeps from obstacles [m].
         speed: Limit of the robot [m/s].
         acceleration: Limit of the robot; for one without inertia, a very large one [m/s^2].
         quickest: Time that the path takes at full speed from rest [s].
@@ -55,7 +55,7 @@ class PathFrame(NamedTuple):
     tangents: Floats
     axes: Floats
     length: float
-    reach: float
+    safety_distance: float
     speed: float
     acceleration: float
     quickest: float
@@ -110,7 +110,10 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> Path
     path[:, : problem.dimension] = corners
     reference = np.empty((POINTS + 1, 3))
     length = max(resample(path, reference), problem.goal_radius)
-    limits, reach = problem.team.limits[robot].astype(np.float64), float(problem.team.radius[robot]) + problem.margin
+    limits, safety_distance = (
+        problem.team.limits[robot].astype(np.float64),
+        float(problem.team.radius[robot]) + problem.margin,
+    )
     speed = float(limits[SPEED])
     acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY * speed
     tangents = np.empty_like(reference)
@@ -119,10 +122,10 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> Path
     axes = _axes(along, turn, problem.dimension)
     features = np.empty((len(axes), FEATURES), np.float32)
     for own, axis in zip(features, axes, strict=True):
-        describe(space, reference, along, _cross(axis, along), length, reach, own)
-        own[-2:] = min(reach / length, _FAR), min(speed * speed / (acceleration * length), _FAR)
+        describe(space, reference, along, _cross(axis, along), length, safety_distance, own)
+        own[-2:] = min(safety_distance / length, _FAR), min(speed * speed / (acceleration * length), _FAR)
     quickest = length / speed + speed / acceleration / 2
-    return PathFrame(reference, tangents, axes, length, reach, speed, acceleration, quickest, features)
+    return PathFrame(reference, tangents, axes, length, safety_distance, speed, acceleration, quickest, features)
 
 
 def _axes(along: Floats, turn: Floats, dimension: int) -> Floats:
@@ -153,7 +156,7 @@ def _unit(vector: Floats, otherwise: Floats, scale: float = 1.0) -> Floats:
 
 @cached_kernel(variant="resample", **OPTIONS)
 def resample(path: Floats, reference: Floats) -> float:
-    """Fill ``reference`` ``(N + 1, 3)`` with places equally far apart on the path ``(w, 3)``; its length."""
+    """Fill ``reference`` ``(N + 1, 3)`` with positions equally far apart on the path ``(w, 3)``; its length."""
     last = reference.shape[0] - 1
     total = 0.0
     for corner in range(1, path.shape[0]):
@@ -239,7 +242,13 @@ def segment_length(path: Floats, end: int) -> float:
 
 @cached_kernel(variant="describe", **OPTIONS)
 def describe(
-    space: Space, reference: Floats, along: Floats, across: Floats, length: float, reach: float, features: FloatArray
+    space: Space,
+    reference: Floats,
+    along: Floats,
+    across: Floats,
+    length: float,
+    safety_distance: float,
+    features: FloatArray,
 ) -> None:
     """Fill in where the path leads and how much room is on it and on either side of it.
 
@@ -249,7 +258,7 @@ def describe(
         along: ``(3,)`` first axis.
         across: ``(3,)`` second axis.
         length: Of the path [m].
-        reach: Of the robot [m].
+        safety_distance: Of the robot [m].
         features: ``(FEATURES,)``, output: five numbers at every look; in the last two nothing is written.
     """
     last = reference.shape[0] - 1
@@ -269,7 +278,7 @@ def describe(
         ahead, aside = (ahead / norm, aside / norm) if norm > 0.0 else (1.0, 0.0)
         features[5 * look], features[5 * look + 1] = x / length, y / length
         for side in range(-1, 2):
-            far = 2.0 * reach * side
+            far = 2.0 * safety_distance * side
             dx, dy = -far * aside, far * ahead
             room = clearance_at(
                 space,
@@ -277,4 +286,4 @@ def describe(
                 reference[i, 1] + dx * along[1] + dy * across[1],
                 reference[i, 2] + dx * along[2] + dy * across[2],
             )
-            features[5 * look + 3 + side] = max(min(room / reach, _FAR), -_FAR)
+            features[5 * look + 3 + side] = max(min(room / safety_distance, _FAR), -_FAR)

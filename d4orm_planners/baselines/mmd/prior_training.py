@@ -72,28 +72,28 @@ def draw_examples(count: int, seed: int, progress: Callable[[int], object] = lam
     """
     features: list[FloatArray] = []
     modes: list[FloatArray] = []
-    for frame, places in islice(_motions(seed), -(-count // 2)):
-        ahead, aside = modes_of(frame, places).astype(np.float32)
+    for frame, positions in islice(_motions(seed), -(-count // 2)):
+        ahead, aside = modes_of(frame, positions).astype(np.float32)
         features.extend(frame.features)
         modes += [np.stack([ahead, aside]), np.stack([ahead, -aside])]
         progress(len(modes))
     return Examples(np.stack(features), np.stack(modes))
 
 
-def modes_of(frame: PathFrame, places: Floats) -> Floats:
-    """``(2, MODES)`` of planar places ``(POINTS + 1, 3)``: how far ahead on the way they are, and to its left."""
+def modes_of(frame: PathFrame, positions: Floats) -> Floats:
+    """``(2, MODES)`` of planar positions ``(POINTS + 1, 3)``: how far ahead on the way they are, and to its left."""
     fine = np.linspace(0, POINTS, _FINENESS * POINTS + 1)
     path, tangents = (
         np.column_stack([np.interp(fine, np.arange(POINTS + 1), rows[:, axis]) for axis in range(2)])
         for rows in (frame.reference, frame.tangents)
     )
     nearest, at = np.zeros(POINTS + 1, int), 0
-    for i, place in enumerate(places[:, :2]):
+    for i, position in enumerate(positions[:, :2]):
         # Paths may come near to themselves: only what lies next on them counts.
         ahead = path[at : at + _FINENESS * POINTS // 8]
-        at += int(((ahead - place) ** 2).sum(axis=1).argmin())
+        at += int(((ahead - position) ** 2).sum(axis=1).argmin())
         nearest[i] = at
-    offset = places[:, :2] - path[nearest]
+    offset = positions[:, :2] - path[nearest]
     aside = (offset[:, 1] * tangents[nearest, 0] - offset[:, 0] * tangents[nearest, 1]) / frame.length
     differences = np.stack([fine[nearest] / POINTS - np.arange(POINTS + 1) / POINTS, aside])
     # A plan ends within the goal's radius, and a motion at the goal.
@@ -117,9 +117,9 @@ def _motions(seed: int) -> Iterator[tuple[PathFrame, Floats]]:
                 continue
             planner = make_planner(PLANNERS[(number + attempt) % len(PLANNERS)], engine="cpu")
             plan = planner.solve(hindered, seed=number, max_iterations=8)
-            places = _evenly(plan.trajectory.positions[:, 0], int(plan.trajectory.arrived[:, 0].argmax()))
-            if plan.solved and np.linalg.norm(np.diff(places, axis=0), axis=1).sum() < _LONGEST * frame.length:
-                yield frame, places
+            positions = _evenly(plan.trajectory.positions[:, 0], int(plan.trajectory.arrived[:, 0].argmax()))
+            if plan.solved and np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() < _LONGEST * frame.length:
+                yield frame, positions
 
 
 def _with_phantoms(problem: Problem, frame: PathFrame, random: np.random.Generator, number: int) -> Problem | None:
@@ -131,7 +131,7 @@ def _with_phantoms(problem: Problem, frame: PathFrame, random: np.random.Generat
     ).astype(np.float32)
     ends = np.stack([problem.start[0, :2], problem.goal[0]])
     gaps = np.linalg.norm(circles[:, None, :2] - ends, axis=2) - circles[:, 2:]
-    circles = circles[(gaps > frame.reach + problem.goal_radius).all(axis=1)]
+    circles = circles[(gaps > frame.safety_distance + problem.goal_radius).all(axis=1)]
     if len(circles) == 0 < number:
         return None
     world = problem.world
@@ -142,10 +142,10 @@ def _with_phantoms(problem: Problem, frame: PathFrame, random: np.random.Generat
 def _evenly(positions: FloatArray, arrival: int) -> Floats:
     """``(POINTS + 1, 3)`` where a robot was at equal times, interpolated."""
     times = np.linspace(0, arrival, POINTS + 1)
-    places = np.zeros((POINTS + 1, 3))
+    points = np.zeros((POINTS + 1, 3))
     for axis in range(2):
-        places[:, axis] = np.interp(times, np.arange(arrival + 1), positions[: arrival + 1, axis])
-    return places
+        points[:, axis] = np.interp(times, np.arange(arrival + 1), positions[: arrival + 1, axis])
+    return points
 
 
 class DenoisingNetwork(nn.Module):

@@ -72,14 +72,14 @@ class TrackedMotions(NamedTuple):
     Attributes:
         controls: ``(B, H, m)`` float32, zero once docked.
         states: ``(B, H+1, n)`` float32, from the first step on.
-        places: ``(B, H+1, 3)`` [m].
+        positions: ``(B, H+1, 3)`` [m].
         arrivals: ``(B,)`` int64 the step of arrival; ``H + 1`` for none.
         clearances: ``(B,)`` least distance of the centre from obstacles and bounds [m].
     """
 
     controls: FloatArray
     states: FloatArray
-    places: Floats
+    positions: Floats
     arrivals: IntArray
     clearances: Floats
 
@@ -135,12 +135,12 @@ def motion_kernel(
             fill_clock(points, durations[b], frame.speed, frame.acceleration, paces, times)
             reference = (points, times, arrays.time_step[0], wanted)
             driven.arrivals[b] = follow(arrays, robot, reference, 0, 0, start, False, driven.controls[b], states[b])
-            places, least = driven.places[b], np.inf
-            places[:] = 0.0
-            places[0, :d] = arrays.start[robot, :d]
-            for step in range(1, places.shape[0]):
-                places[step, :d] = states[b, step, :d]
-                least = min(least, clearance_at(space, places[step, 0], places[step, 1], places[step, 2]))
+            positions, least = driven.positions[b], np.inf
+            positions[:] = 0.0
+            positions[0, :d] = arrays.start[robot, :d]
+            for step in range(1, positions.shape[0]):
+                positions[step, :d] = states[b, step, :d]
+                least = min(least, clearance_at(space, positions[step, 0], positions[step, 1], positions[step, 2]))
             driven.clearances[b] = least
 
     return drive_motion

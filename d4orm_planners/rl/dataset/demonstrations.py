@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env import __version__, navigation_v0
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, shown, whole_number
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, short_repr, whole_number
 from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import source_digest
@@ -74,9 +74,9 @@ class Demonstrations:
 
     def __post_init__(self) -> None:
         if self.agents not in AGENTS:
-            raise ValueError(f"agents is {shown(self.agents)}; choose 'team' or 'robot'")
+            raise ValueError(f"agents is {short_repr(self.agents)}; choose 'team' or 'robot'")
         if not isinstance(self.seeds, Iterable):
-            raise ValueError(f"seeds is {shown(self.seeds)}; give the seeds themselves, as range(100)")
+            raise ValueError(f"seeds is {short_repr(self.seeds)}; give the seeds themselves, as range(100)")
         seeds = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_SEED) for seed in self.seeds))
         if not seeds:
             raise ValueError("seeds is empty; give at least one")
@@ -231,8 +231,8 @@ def record_episode(env: ParallelEnv, policy: Policy, seed: int = 0) -> RecordedE
         name: np.stack([getattr(step, name) for step in steps]) for name in ("arrived", "collided", "margin_violated")
     }
     acting, actions = recorder.team_actions()
-    there = flags["arrived"][1:]
-    finished = there if world.problem.docks else there & there.all(axis=1, keepdims=True)
+    arrived = flags["arrived"][1:]
+    finished = arrived if world.problem.docks else arrived & arrived.all(axis=1, keepdims=True)
     return RecordedEpisode(
         observations=np.stack([step.observations for step in steps]),
         actions=actions,

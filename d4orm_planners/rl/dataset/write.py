@@ -209,8 +209,8 @@ def _record(
     """Record what is missing, by so many workers; at the end failed episodes are an error."""
     for seed in packed & recording.seeds():  # packed just before it was broken off
         recording.forget(seed)
-    there, wanted = packed | recording.seeds() | recording.seeds(_DROPPED), list(demonstrations.seeds)
-    tasks = [_Task(demonstrations, recording, seed) for seed in wanted if seed not in there]
+    existing, wanted = packed | recording.seeds() | recording.seeds(_DROPPED), list(demonstrations.seeds)
+    tasks = [_Task(demonstrations, recording, seed) for seed in wanted if seed not in existing]
     done, size = len(wanted) - len(tasks), min(workers or available_cores(), len(tasks))
     progress("starting", done, len(wanted))
     if size > 1:

@@ -182,20 +182,20 @@ def grouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
         ValueError: If none of the trials is one of the figure's.
         ImportError: If a policy needs a library that is not installed.
     """
-    there = {_place(trial.label, trial.key): trial for trial in trials}
+    there = {_position(trial.label, trial.key): trial for trial in trials}
     groups = []
     for title, study in figure.studies(1 + max((trial.seed for trial in trials), default=0)):
         for jobs in study.groups():
             label = jobs[0].policy.label
             for condition in jobs[0].conditions:
-                places = [_place(label, job.key(condition)) for job in jobs]
-                if found := [there[place] for place in places if place in there]:
+                positions = [_position(label, job.key(condition)) for job in jobs]
+                if found := [there[position] for position in positions if position in there]:
                     groups.append(Group(title, label, found))
     if not groups:
         raise ValueError(f"none of the {len(trials)} trials is one of the figure {figure.name!r}; give it its own")
     return groups
 
 
-def _place(label: str, key: TrialKey) -> tuple[object, ...]:
+def _position(label: str, key: TrialKey) -> tuple[object, ...]:
     """Return a trial's place in a figure."""
     return label, json.loads(key.config).get("nodes"), *key[2:]

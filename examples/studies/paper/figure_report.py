@@ -97,18 +97,18 @@ def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
               for group in groups for row in [measured(group)]}  # fmt: skip
     one_column = figure.across == "policy"
     tests: dict[tuple[str, str, str], Paired] = {}
-    for (section, place, label), trials in placed.items():
-        others = placed.get((section, str(figure.reference) if one_column else place, str(figure.reference)))
+    for (section, position, label), trials in placed.items():
+        others = placed.get((section, str(figure.reference) if one_column else position, str(figure.reference)))
         if others is None or label == figure.reference:
             continue
         cost = _cost(figure, [*trials, *others])
-        tests[section, place, label] = paired(trials, others, cost, lambda one: first_solution(one) is not None)
+        tests[section, position, label] = paired(trials, others, cost, lambda one: first_solution(one) is not None)
     p_values = iter(holm([p for test in tests.values() for p in (test.success_p, test.cost_p)]))
     blocks: dict[str, list[tuple[str, ...]]] = {}
-    for (section, place, label), test in tests.items():
+    for (section, position, label), test in tests.items():
         counts = (str(count) for count in (test.pairs, test.only_first, test.only_second))
         blocks.setdefault(section, []).append(
-            (label, *[place] * (not one_column), *counts, f"{next(p_values):.2g}", f"{test.difference:+.2f}",
+            (label, *[position] * (not one_column), *counts, f"{next(p_values):.2g}", f"{test.difference:+.2f}",
              f"{next(p_values):.2g}")
         )  # fmt: skip
     header = ("policy", *[figure.across] * (not one_column), "pairs", "only it", f"only {figure.reference}", "p",

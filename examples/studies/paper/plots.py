@@ -84,19 +84,21 @@ def _metric(ax: Axes, figure: Figure, shown: Shown, *, value: str, ends: tuple[s
     numeric = figure.across in NUMERIC
     for i, (name, rows) in enumerate(_lines(figure, shown).items()):
         known = [row for row in rows if getattr(row, value) is not None]
-        places = [float(column(figure, row)) if numeric else columns.index(column(figure, row)) for row in known]
+        positions = [float(column(figure, row)) if numeric else columns.index(column(figure, row)) for row in known]
         values, line = [getattr(row, value) for row in known], "-" if numeric else "none"
-        ax.plot(places, values, label=name, marker="o", markersize=4, linestyle=line, color=f"C{i}")
-        failed = [(place, getattr(row, value)) for place, row in zip(places, known) if row.successes < row.trials]
+        ax.plot(positions, values, label=name, marker="o", markersize=4, linestyle=line, color=f"C{i}")
+        failed = [
+            (position, getattr(row, value)) for position, row in zip(positions, known) if row.successes < row.trials
+        ]
         if failed and value != "rate":
             ax.plot(*zip(*failed), marker="x", markersize=8, linestyle="none", color=f"C{i}")
         if ends:
             # What is never has no band.
             low, high = (np.array([getattr(row, end) for row in known], np.float64) for end in ends)
             if numeric:
-                ax.fill_between(places, low, high, color=f"C{i}", alpha=0.1, linewidth=0)
+                ax.fill_between(positions, low, high, color=f"C{i}", alpha=0.1, linewidth=0)
             else:
-                ax.vlines(places, low, high, color=f"C{i}", alpha=0.5)
+                ax.vlines(positions, low, high, color=f"C{i}", alpha=0.5)
     if not numeric:
         ax.set_xticks(range(len(columns)), columns, rotation=60 if figure.across == "policy" else 20, ha="right")
     elif figure.across != "control_noise_std":
