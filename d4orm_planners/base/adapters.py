@@ -6,7 +6,7 @@ No library is imported unless a model of it is given, and no file is read: load 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -32,6 +32,9 @@ __all__ = ["SharedPolicy", "from_rllib", "from_sb3", "from_torch", "from_torchrl
 Key: TypeAlias = str | tuple[str, ...]
 """A key of a ``TensorDict``."""
 
+Shapes: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+"""Shapes of observations and of actions."""
+
 Model: TypeAlias = Any
 """A model of a library that need not be installed."""
 
@@ -45,6 +48,8 @@ class SharedPolicy(Policy):
         normalized: Whether actions are in ``[-1, 1]``, which stand for the lowest and the highest of the environment.
         egocentric: Whether it was trained in ``egocentric`` environments; the one that it drives in is not. Where the
             goal speed is limited, its robots then brake to dock as go-to-goal does, as those of the package's policies.
+        trained: Shapes of the observations and actions of the training, where the model tells them. Those of a whole
+            team are of a model that steers it at once, trained in the joint environment.
     """
 
     def __init__(
@@ -53,37 +58,64 @@ class SharedPolicy(Policy):
         weights: Model,
         normalized: bool = False,
         egocentric: bool = False,
+        trained: Shapes | None = None,
     ) -> None:
         self._predict, self._weights, self._normalized, self._egocentric = predict, weights, normalized, egocentric
+        self._trained = trained
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
+        """See :meth:`Policy.reset`.
+
+        Raises:
+            ValueError: If the model was trained for other observations or actions, as far as it tells.
+        """
         super().reset(env, seed)
-        self._spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
+        spaces = [env.action_space(agent) for agent in env.possible_agents]
+        self._low, self._high = np.stack([space.low for space in spaces]), np.stack([space.high for space in spaces])
         self._features = Features.of_team(env.unwrapped.layout, self.problem.team) if self._egocentric else None
+        seen = env.observation_space(env.possible_agents[0]).shape
+        shapes = seen if self._features is None else (self._features.size,), self._low.shape[1:]
+        self._env, self._is_joint = env, self._steers_team(shapes)
+
+    def _steers_team(self, own: Shapes) -> bool:
+        """Check whether the model steers the whole team at once, given a robot's shapes."""
+        count = self.problem.num_robots
+        observed, acted = team = (count * own[0][0],), (count * own[1][0],)
+        if self._trained not in (None, own, team):
+            raise ValueError(
+                f"the model was trained for observations and actions of shapes {self._trained[0]} and "
+                f"{self._trained[1]}; a robot's here have {own[0]} and {own[1]}, and the team's {observed} and "
+                f"{acted}; make the environment as it was in training, with as many robots"
+            )
+        return self._trained == team and count > 1
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         if not observations:
             return {}
-        stacked = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
-        if self._features is not None:
-            return self._act_egocentrically(self._features, observations, stacked, state)
-        actions = as_float32(self._predict(stacked))
-        if self._normalized:
-            spaces = [self._spaces[agent] for agent in observations]
-            low, high = np.stack([space.low for space in spaces]), np.stack([space.high for space in spaces])
-            actions = low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
-        return within_limits(self.problem, dict(zip(observations, actions)))
+        robots, seen = robot_indices(observations), np.stack([*map(as_float32, observations.values())])
+        if self._is_joint:
+            # It wants to see those too that have left.
+            everybody = self._env.unwrapped.last_step.observations.copy()
+            everybody[robots] = seen
+            controls = self._controls(everybody, range(len(everybody)))[robots]
+        else:
+            controls = self._controls(seen, robots)
+        if self._egocentric:
+            controls = brake_to_dock(self.problem, robots, controls, split_state(self.problem, state))
+        return within_limits(self.problem, dict(zip(observations, controls)))
 
-    def _act_egocentrically(
-        self, features: Features, observations: Observations, stacked: FloatArray, state: FloatArray
-    ) -> Actions:
-        robots, joint = robot_indices(observations), split_state(self.problem, state)
-        seen, frames = features.encode(stacked)
-        limits = self.problem.team.control_limits[robots]
-        controls = features.decode(as_float32(self._predict(seen)), frames, limits)
-        return within_limits(
-            self.problem, dict(zip(observations, brake_to_dock(self.problem, robots, controls, joint)))
-        )
+    def _controls(self, seen: FloatArray, robots: Sequence[int]) -> FloatArray:
+        """``(N, m)`` controls of robots that see ``(N, D)``."""
+        if self._features is not None:
+            seen, frames = self._features.encode(seen)
+        asked = seen.reshape(1, -1) if self._is_joint else seen
+        actions = as_float32(self._predict(asked)).reshape(len(seen), -1)
+        if self._features is not None:
+            return self._features.decode(actions, frames, self.problem.team.control_limits[robots])
+        if self._normalized:
+            low, high = self._low[robots], self._high[robots]
+            return low + (np.clip(actions, -1, 1) + 1) / 2 * (high - low)
+        return actions
 
     def identity(self) -> dict[str, object]:
         digest = hashlib.sha256()
@@ -96,7 +128,8 @@ class SharedPolicy(Policy):
 
 
 def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False) -> SharedPolicy:
-    """A model of Stable-Baselines3, trained on the environment's own observations and actions, as through SuperSuit.
+    """A model of Stable-Baselines3, trained on the environment's own observations and actions: each robot's, as
+    through SuperSuit, or the team's, in the joint Gymnasium environment.
 
     Args:
         model: Result of ``PPO.load(path)`` or of the training.
@@ -104,7 +137,8 @@ def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False)
         egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
     """
     ask = partial(_ask_sb3, model, deterministic=deterministic)
-    return SharedPolicy(ask, model.policy, egocentric=egocentric)
+    trained = model.observation_space.shape, model.action_space.shape
+    return SharedPolicy(ask, model.policy, egocentric=egocentric, trained=trained)
 
 
 def from_torch(module: Model, normalized: bool = False, egocentric: bool = False) -> SharedPolicy:

@@ -6,12 +6,13 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.adapters import SharedPolicy, from_sb3
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
 from d4orm_planners.rl.detours import Detours
@@ -42,18 +43,22 @@ class LearnedConfig(CheckedSettings):
         detours: Whether a robot that has learned to head straight for its goal heads along the shortest path round
             robots that have docked where these are in the way. That is a law beside the network, which goes by the
             joint state; not with a communication range or a line of sight, which hide robots.
+        egocentric: Whether a ``.zip`` was trained in ``egocentric`` environments.
 
     Raises:
-        ValueError: If the path ends in something else.
+        ValueError: If the path ends in something else, or ``egocentric`` comes with one that does not end in ``.zip``.
     """
 
     path: PathText | None = None
     detours: bool = True
+    egocentric: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.path is not None and Path(self.path).suffix not in (SUFFIX, ".zip"):
             raise ValueError(f"path {self.path!r} must end in {SUFFIX} (of 'd4orm train') or .zip (of SB3)")
+        if self.egocentric and (self.path is None or Path(self.path).suffix != ".zip"):
+            raise ValueError("egocentric is of a .zip of SB3; other policy files tell themselves, so leave it out")
 
 
 class LearnedPolicy(Policy):
@@ -101,22 +106,27 @@ class LearnedPolicy(Policy):
         walls = "-walls" if _paths_matter(problem.world) else ""
         stems = (f"{self.name}-{model}{walls}", f"{self.name}-{model}", f"{self.name}{walls}")
         path = next((path for stem in stems if (path := SHIPPED / f"{stem}{SUFFIX}") in files), files[0])
-        if path != self._actor.path:
+        if path != self._path:
             self._use(path)
 
     def _use(self, path: Path) -> None:
-        kind = _ZipActor if path.suffix == ".zip" else _NetworkActor
-        self._actor: _NetworkActor | _ZipActor = kind(self.name, path)
-        self.training_time = self._actor.network.training_time if isinstance(self._actor, _NetworkActor) else None
+        self._path, self.training_time = path, None
+        if path.suffix == ".zip":
+            model = _load_zip(self.name, path)
+            self._actor: _NetworkActor | SharedPolicy = from_sb3(model, egocentric=self.config.egocentric)
+        else:
+            self._actor = _NetworkActor(self.name, path)
+            self.training_time = self._actor.network.training_time
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
         self._choose(self.problem)
-        agent, self._env = env.possible_agents[0], env
+        if isinstance(self._actor, SharedPolicy):
+            self._actor.reset(env, seed)
+            return
         options = env.unwrapped.options
-        if isinstance(self._actor, _NetworkActor):
-            self._actor.check_rays(range_sensors(options.observed_rays, options.ray_range))
-        self._actor.check(self.problem, env.observation_space(agent).shape, env.action_space(agent).shape)
+        self._actor.check_rays(range_sensors(options.observed_rays, options.ray_range))
+        self._actor.check(self.problem, env.observation_space(env.possible_agents[0]).shape)
         hiding = options.communication_range is not None or options.line_of_sight
         self._detours = Detours(self.problem) if self.config.detours and not hiding else None
 
@@ -124,19 +134,13 @@ class LearnedPolicy(Policy):
         require_reset(self)
         if not observations:
             return {}
+        if isinstance(self._actor, SharedPolicy):
+            return self._actor.act(observations, state)
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
         robots, joint = robot_indices(observations), split_state(self.problem, state)
-        if isinstance(self._actor, _NetworkActor):
-            self._look_along_paths(self._actor.network, robots, seen, joint)
-        if isinstance(self._actor, _ZipActor) and self._actor.is_joint:
-            # It wants to see those too that have left.
-            everybody = self._env.unwrapped.last_step.observations.copy()
-            everybody[robots] = seen
-            controls = self._actor.controls(everybody.reshape(1, -1), self.problem.team.control_limits)
-            controls = controls.reshape(len(everybody), -1)[robots]
-        else:
-            controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
-        if isinstance(self._actor, _NetworkActor) and not self._actor.network.header.brakes:
+        self._look_along_paths(self._actor.network, robots, seen, joint)
+        controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
+        if not self._actor.network.header.brakes:
             controls = brake_to_dock(self.problem, robots, controls, joint)
         return within_limits(self.problem, dict(zip(observations, controls)))
 
@@ -188,7 +192,7 @@ class _NetworkActor:
                 f"{self.network.header.algorithm!r}, path=...)"
             )
 
-    def check(self, problem: Problem, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
+    def check(self, problem: Problem, observation_shape: tuple[int, ...]) -> None:
         header, features = self.network.header, self.network.features
         if set(problem.team.models) != {header.model}:
             raise ValueError(
@@ -215,42 +219,18 @@ class _NetworkActor:
         return self.network.controls(observations, limits)
 
 
-class _ZipActor:
-    """Acts by a Stable-Baselines3 model.
-
-    Attributes:
-        is_joint: True if the model, by the last check, steers the whole team at once.
-    """
-
-    is_joint = False
-
-    def __init__(self, algorithm: str, path: Path) -> None:
-        try:
-            import stable_baselines3
-        except ImportError:
-            raise ImportError(
-                f"a policy in a .zip needs Stable-Baselines3; install it with: pip install 'd4orm-env[rl]' ({path})"
-            ) from None
-        if not path.is_file():
-            raise FileNotFoundError(f"policy file {path} does not exist")
-        try:
-            self.model = getattr(stable_baselines3, algorithm.upper()).load(path, device="cpu")
-        except Exception as error:  # whatever a foreign file makes its reader raise
-            message = " ".join(str(error).split())
-            raise ValueError(f"policy file {path} is no {algorithm.upper()} model of SB3: {message}") from error
-        self.path = path
-
-    def check(self, problem: Problem, observation_shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
-        trained = self.model.observation_space.shape, self.model.action_space.shape
-        joint = tuple((problem.num_robots * np.prod(shape, dtype=int),) for shape in (observation_shape, action_shape))
-        self.is_joint = trained == joint and problem.num_robots > 1
-        if trained not in ((observation_shape, action_shape), joint):
-            raise ValueError(
-                f"the policy in {self.path.name} was trained for observations and actions of shapes {trained[0]} and "
-                f"{trained[1]}; a robot's here have {observation_shape} and {action_shape}, and the team's "
-                f"{joint[0]} and {joint[1]}; make the environment as it was in training, with as many robots"
-            )
-
-    def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
-        actions: FloatArray = self.model.predict(observations, deterministic=True)[0]
-        return actions.astype(np.float32)
+def _load_zip(algorithm: str, path: Path) -> Any:
+    """A model of Stable-Baselines3."""
+    try:
+        import stable_baselines3
+    except ImportError:
+        raise ImportError(
+            f"a policy in a .zip needs Stable-Baselines3; install it with: pip install 'd4orm-env[rl]' ({path})"
+        ) from None
+    if not path.is_file():
+        raise FileNotFoundError(f"policy file {path} does not exist")
+    try:
+        return getattr(stable_baselines3, algorithm.upper()).load(path, device="cpu")
+    except Exception as error:  # whatever a foreign file makes its reader raise
+        message = " ".join(str(error).split())
+        raise ValueError(f"policy file {path} is no {algorithm.upper()} model of SB3: {message}") from error

@@ -318,6 +318,9 @@ def test_every_setting_of_a_policy_changes_something(
     elif setting == "path":
         with pytest.raises(FileNotFoundError):
             make_policy(name, path=tmp_path / "none.safetensors")
+    elif setting == "egocentric":  # tests of training have a file for it
+        with pytest.raises(ValueError, match="egocentric"):
+            make_policy(name, egocentric=True)
     else:
         value, beside = POLICY_CHANGES[name][setting]
         base = {**(CONTROLLER if name == "d4orm-c2f" else {}), **beside}

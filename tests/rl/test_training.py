@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, navigation_v0
+from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import make_policy, run_episode
+from d4orm_planners.base.adapters import from_sb3
 from d4orm_planners.cli import app as cli
 from d4orm_planners.rl.network import MAX_BYTES, load_network
 from d4orm_planners.rl.train_config import Stage, common_batch, make_stages, team_sizes
@@ -352,16 +354,38 @@ def test_a_zip_of_sb3_trained_on_the_joint_environment(tmp_path: Path) -> None:
     joint = gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=3)
     model = stable_baselines3.PPO("MlpPolicy", joint, device="cpu", n_steps=8, batch_size=8)
     model.save(tmp_path / "joint.zip")
-    policy = make_policy("ppo", path=str(tmp_path / "joint.zip"))
-    episode = run_episode(joint, policy, seed=0)
-    observation, _ = joint.reset(seed=0)
-    action = model.predict(observation, deterministic=True)[0].reshape(3, 2)
-    action /= np.maximum(np.linalg.norm(action, axis=1, keepdims=True), 1)
-    np.testing.assert_allclose(episode.trajectory.controls[0], action, atol=1e-5)
     other = navigation_v0.parallel_env("circle", num_robots=4)
     other.reset(seed=0)
-    with pytest.raises(ValueError, match="with as many robots"):
-        policy.reset(other)
+    for policy in (make_policy("ppo", path=str(tmp_path / "joint.zip")), from_sb3(model)):
+        episode = run_episode(joint, policy, seed=0)
+        observation, _ = joint.reset(seed=0)
+        action = model.predict(observation, deterministic=True)[0].reshape(3, 2)
+        action /= np.maximum(np.linalg.norm(action, axis=1, keepdims=True), 1)
+        np.testing.assert_allclose(episode.trajectory.controls[0], action, atol=1e-5)
+        with pytest.raises(ValueError, match=r"a robot's here have \(52,\) .* with as many robots"):
+            policy.reset(other)
+
+
+def test_a_zip_trained_in_egocentric_environments(tmp_path: Path) -> None:
+    import gymnasium
+    import stable_baselines3
+
+    joint = gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=3, egocentric=True)
+    model = stable_baselines3.PPO("MlpPolicy", joint, device="cpu", n_steps=8, batch_size=8)
+    model.save(tmp_path / "joint.zip")
+    plain = navigation_v0.parallel_env("circle", num_robots=3)
+    policy = make_policy("ppo", path=str(tmp_path / "joint.zip"), egocentric=True)
+    episode = run_episode(plain, policy, seed=0)
+    np.testing.assert_array_equal(
+        episode.trajectory.controls, run_episode(plain, from_sb3(model, egocentric=True), seed=0).trajectory.controls
+    )
+    joint.step(model.predict(joint.reset(seed=0)[0], deterministic=True)[0])
+    after = split_state(joint.unwrapped.problem, joint.unwrapped.state()).states
+    np.testing.assert_allclose(episode.trajectory.states[1], after, atol=1e-6)
+    with pytest.raises(ValueError, match="the model was trained for"):
+        run_episode(plain, make_policy("ppo", path=str(tmp_path / "joint.zip")), seed=0)
+    with pytest.raises(ValueError, match=r"egocentric is of a \.zip of SB3"):
+        make_policy("ppo", egocentric=True)
 
 
 def test_wrapped_joint_environments_are_refused() -> None:
