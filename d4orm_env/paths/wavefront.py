@@ -252,10 +252,9 @@ def _spread(
                 a, used = np.int32(used + 1), used + 2
                 value[n] = values[a] + distance(c, q)
             anchor[n], nodes.tested[n] = a, a >= 0
-            if a < 0:
-                continue
-            if value[n] > length:
+            if a >= 0 and value[n] > length:
                 heapq.heappush(heap, (value[n], n))
+            if a < 0 or value[n] > length:
                 continue
         nodes.done[n] = True
         at, kept = position_of(points, a), _kept(a, own_goal, safety_distance)

@@ -45,13 +45,12 @@ PathReader: TypeAlias = Callable[[ProblemArrays, Whole, Whole, Whole, FloatArray
 step ``first``."""
 
 
-def block_driver(model: Model) -> BlockDriver:
-    """Function that drives paths for a block."""
-    approach, step_towards, (aim_of, slowed) = inlined(model.functions.approach), velocity_step(model), aiming(model)
+def _lanes_driver(model: Model) -> Callable[[ProblemArrays, Whole, Whole, FloatArray], None]:
+    """Function that drives the paths in all lanes for so many steps."""
+    approach, step_towards, (_, slowed) = inlined(model.functions.approach), velocity_step(model), aiming(model)
     n, m, d, num_limits = model.state_size, model.control_size, model.dimension, len(model.limit_names)
-    read_x, write_x, pick_x = READ[n], WRITE[n], PICK[n]
-    read_u, write_u, pick_u, read_position, write_position = READ[m], WRITE[m], PICK[m], READ[d], WRITE[d]
-    no_control = (ZERO,) * m
+    read_x, write_x, pick_x, read_position = READ[n], WRITE[n], PICK[n], READ[d]
+    read_u, write_u, pick_u = READ[m], WRITE[m], PICK[m]
 
     @compiled
     def drive(arrays: ProblemArrays, robot: Whole, steps: Whole, w: FloatArray) -> None:
@@ -74,6 +73,15 @@ def block_driver(model: Model) -> BlockDriver:
             for axis in range(d):
                 for s in range(TILE):
                     w[(_PLACES + t * d + axis) * TILE + s] = w[(_STATE + axis) * TILE + s]
+
+    return drive
+
+
+def block_driver(model: Model) -> BlockDriver:
+    """Function that drives paths for a block."""
+    drive, (aim_of, _) = _lanes_driver(model), aiming(model)
+    n, num_limits, no_control = model.state_size, len(model.limit_names), (ZERO,) * model.control_size
+    write_x, write_u, write_position = WRITE[n], WRITE[model.control_size], WRITE[model.dimension]
 
     @compiled
     def drive_block(
