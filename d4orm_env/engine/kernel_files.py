@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from llvmlite.binding import get_host_cpu_features
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import IndexDataCacheFile, _cache_log
 from numba.core.environment import Environment, _rebuild_env, lookup_environment
 
 from d4orm_env.core.files import replaced_when_done
@@ -75,7 +75,9 @@ class KernelFiles(IndexDataCacheFile):
         content = self._content(self._data_path(name))
         # ImportError, AttributeError: another version of this package kept types that are gone.
         with suppress(ImportError, AttributeError):
-            return None if content is None else _Unpickler(BytesIO(content)).load()
+            kept = None if content is None else _Unpickler(BytesIO(content)).load()
+            _cache_log("[cache] data loaded from %r", self._data_path(name))  # as numba does with NUMBA_DEBUG_CACHE
+            return kept
         return None
 
     def _content(self, path: str) -> bytes | None:

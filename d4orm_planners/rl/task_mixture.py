@@ -48,7 +48,7 @@ MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
             "four_obstacles 8",
             f"{_PERTURBED} 12 base=swap",
             f"{_CLUTTER} 8",
-            f"{_CLUTTER} 8 places=1 obstacles=10",
+            f"{_CLUTTER} 8 positions=1 obstacles=10",
         ),
         "dense_crowds": (
             "random 4 max_observed=4",
@@ -67,7 +67,7 @@ MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
             f"{_PERTURBED} 8 base=four_obstacles max_observed=4",
             f"{_PERTURBED} 12 base=swap",
             f"{_CLUTTER} 8",
-            f"{_CLUTTER} 8 places=1 obstacles=10",
+            f"{_CLUTTER} 8 positions=1 obstacles=10",
         ),
         "walls": (
             "rooms 4",

@@ -212,9 +212,11 @@ def team_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     table = [row_of(label, plans, sum(row["planner"] == label for row in rows)) for label, plans in found.items()]
     times = [[plan["travel_time"] for plan in found[label]] for label in COMPARED if found[label]]
     first, last = max(map(min, times), default=1.0), min(map(max, times), default=0.0)
-    for label in COMPARED:
-        if alike := [plan for plan in found[label] if first <= plan["travel_time"] <= last]:
-            table.append(row_of(f"{label}, {first:.2f} to {last:.2f} s", alike, len(found[label])))
+    alike = {label: [plan for plan in found[label] if first <= plan["travel_time"] <= last] for label in COMPARED}
+    if all(alike.values()):
+        table += [
+            row_of(f"{label}, {first:.2f} to {last:.2f} s", plans, len(found[label])) for label, plans in alike.items()
+        ]
     return table
 
 

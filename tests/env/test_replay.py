@@ -146,7 +146,7 @@ def test_a_replay_shows_what_moves_among_the_robots_and_is_none() -> None:
     assert bodies["count"] == 3
     raw = np.frombuffer(base64.b64decode(bodies["data"]), "<u2").reshape(-1, 3, 3)
     read = bodies["low"] + raw * np.array(bodies["step"])
-    np.testing.assert_allclose(read[..., :2], episode.marks.bodies[: len(read), :, :2], atol=1e-3)
+    np.testing.assert_allclose(read[..., :2], episode.events.bodies[: len(read), :, :2], atol=1e-3)
     np.testing.assert_allclose(read[..., 2], 0.2, atol=1e-6)
 
 
