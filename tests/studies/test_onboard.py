@@ -25,6 +25,7 @@ from test_examples import PNG, ROOT, run, table
 from d4orm_env import Problem, Team, World
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import evaluate_controls
+from d4orm_planners.d_d4orm.planner import DD4orm
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
@@ -40,6 +41,23 @@ def onboard() -> Any:
             course=importlib.import_module("examples.studies.onboard.course"),
             mission=importlib.import_module("examples.studies.onboard.mission"),
         )
+
+
+def test_robots_get_out_of_where_denoising_of_the_whole_team_stayed_for_ever(onboard: Any) -> None:
+    """Six robots of a run, at rest round after round after 155 s."""
+    mission = onboard.mission.Mission(
+        robots=6, seed=0, side=4.0, horizon=80, samples=576, denoising_steps=50, iterations=2, think=7, agree=3,
+        timeout=10.0, silence=30.0, namespace="", world="", team="",
+    )  # fmt: skip
+    problem = mission.problem().with_state(
+        np.float32(
+            [[1.365, 1.017], [1.068, -1.525], [-1.031, -0.958], [-1.094, -0.415], [1.023, -0.811], [-1.148, 0.704]]
+        ),
+        np.float32(
+            [[-0.599, 1.236], [-1.024, 1.464], [-0.002, -1.396], [-0.497, -1.071], [-0.627, 0.388], [1.191, 0.231]]
+        ),
+    )
+    assert DD4orm(mission.planning()).solve(problem, seed=0, max_iterations=6).solved
 
 
 def corridor() -> Problem:

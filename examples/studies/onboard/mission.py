@@ -11,9 +11,9 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from d4orm_env import Problem, Team, World
 from d4orm_env.scenarios import make_problem
+from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.d_d4orm.settings import DD4ormConfig
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
-from d4orm_planners.sampling.d4orm import D4ormConfig
 
 TICK = 0.1
 """Time step of the world and of plans [s]."""
@@ -90,8 +90,9 @@ class Mission:
 
     def planning(self) -> DD4ormConfig:
         """The settings of D-D4orm."""
-        # Search for shorter paths takes a second an iteration where a round has less.
-        samples = D4ormConfig(num_samples=self.samples, num_steps=self.denoising_steps)
+        # Search for shorter paths takes a second an iteration where a round has less. Denoising of the whole team alone
+        # stays at what fails, round after round.
+        samples = D4ormDConfig(num_samples=self.samples, num_steps=self.denoising_steps)
         return DD4ormConfig(nodes=self.robots, refinement=samples, engine="cpu", improve=True)
 
     def join(self, part: str, listen: bool) -> ZenohTransport:

@@ -188,8 +188,12 @@ class Round:
         self._enough.set()
 
     def settle(self, timeout: float) -> None:
-        """Wait until every robot has sent a candidate as good as the best one here, or the seconds are over."""
-        self._settled.wait(timeout)
+        """Wait until every robot has sent a solution as good as the best one here, or the seconds are over.
+
+        Without one there is nothing to wait for: what others announce is asked for by its name.
+        """
+        if self._node is not None and self._node.search.best.solved:
+            self._settled.wait(timeout)
 
     def best(self) -> Course | None:
         """The best solution that this robot has by now, its own or another's, if there is any.
