@@ -44,7 +44,7 @@ HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 GENERATED = ("reference/settings.md", "reference/d4orm_env/modules.rst", "reference/d4orm_planners/modules.rst")
 """Pages that the build makes."""
 PRINTS = {
-    "own_policy": "3.0 0.0\nin turn 1.0\nat once 0.0\ngently 0.0\ngo-to-goal 0.0\n",
+    "own_policy": "3.0 0.0\nin turn 1.0 0\nat once 0.0 0\ngently 0.0 0\ngo-to-goal 0.0 0\n",
     "own_planner": "True solved True\nsolved\nsolved\n",
     "own_robot": "solved True\n",
 }
