@@ -144,7 +144,7 @@ def place_team(f: FootprintArrays | None, num_robots: int, w: FloatArray) -> Non
 
 
 class TeamBoxes(NamedTuple):
-    """Boxes round the places of a team's robots in a tile, for all pairs but those near to each other to be left out.
+    """Boxes round the positions of a team's robots in a tile, by which pairs that are far apart are left out.
 
     Attributes:
         corners: ``(K, 2, d)`` float32 lowest and highest positions [m]; ``(0, 2, d)`` for a team that is not big.
@@ -165,7 +165,7 @@ def allocate_boxes(arrays: ProblemArrays) -> TeamBoxes:
 
 @compiled
 def enclose_team(count: int, w: FloatArray, boxes: TeamBoxes) -> None:
-    """Find the lowest and the highest places of robots in the first worlds of a tile, if it is a big team.
+    """Find the lowest and the highest positions of robots in the first worlds of a tile, if it is a big team.
 
     In moments of one world, which are near to each other, most pairs are so seen to be apart. ``boxes`` are output.
     """
@@ -185,8 +185,8 @@ def _sort_boxes(corners: FloatArray, order: IntArray) -> None:
     """Sort the numbers of boxes by where these begin, quickly if they nearly are (Shell, 1959)."""
     stride = corners.shape[0] // 2
     while stride > 0:
-        for position in range(stride, corners.shape[0]):
-            k, at = order[position], position
+        for rank in range(stride, corners.shape[0]):
+            k, at = order[rank], rank
             while at >= stride and corners[order[at - stride], 0, 0] > corners[k, 0, 0]:
                 order[at], at = order[at - stride], at - stride
             order[at] = k
@@ -220,13 +220,13 @@ def mark_pairs(
     corners, order, largest = boxes.corners, boxes.order, ZERO
     for k in range(arrays.radius.shape[0]):
         largest = max(largest, arrays.radius[k])
-    for position in range(order.shape[0]):
-        for later in range(position + 1, order.shape[0]):
-            k, other = max(order[position], order[later]), min(order[position], order[later])
+    for rank in range(order.shape[0]):
+        for later in range(rank + 1, order.shape[0]):
+            k, other = max(order[rank], order[later]), min(order[rank], order[later])
             if corners.shape[0] > 0:
                 # Those that begin even later are as far apart.
-                end = WIDER * (arrays.radius[order[position]] + largest + extra)
-                if corners[order[later], 0, 0] - corners[order[position], 1, 0] > end:
+                end = WIDER * (arrays.radius[order[rank]] + largest + extra)
+                if corners[order[later], 0, 0] - corners[order[rank], 1, 0] > end:
                     break
                 if _is_apart(corners, k, other, arrays.radius[k] + arrays.radius[other] + extra):
                     continue

@@ -77,7 +77,7 @@ class Simulation:
         return self.setup.state_bounds(self.max_cycles, self.worlds.bodies.shape[1])
 
     def show(self, seen: FloatArray, worlds: slice | BoolArray = slice(None)) -> FloatArray:
-        """What robots of some worlds are shown of observations ``(b, K, D)``: these or, if egocentric, features."""
+        """Observations ``(b, K, D)`` of some worlds as their robots are shown them: as features, if egocentric."""
         if (features := self.setup.features) is None:
             return seen
         parts = features.encode(seen.reshape(-1, seen.shape[2]))

@@ -154,21 +154,21 @@ class Obstacles(TurningStatic):
 
     def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
         gaps, (position,) = np.empty(len(pairs)), positions
-        for kind, here, thing in self._kinds(pairs):
+        for kind, here, thing in self._by_kind(pairs):
             gaps[here] = self._distance(kind, thing, position[here])
         return gaps - WIDER * self.shapes.outer[self.rows[pairs]]
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
         ((position, turn),), gaps = poses, np.empty(len(pairs))
-        ways: dict[str, _Gap] = {"polygons": self._to_polygon, "cylinders": self._to_cylinder}
+        gap_to: dict[str, _Gap] = {"polygons": self._to_polygon, "cylinders": self._to_cylinder}
         planar = self._world.dimension == 2
-        ways |= {"circles": self._to_circle, "boxes": self._to_rectangle if planar else self._to_box}
-        ways["spheres"] = self._to_ball
-        for kind, here, thing in self._kinds(pairs):
-            gaps[here] = ways[kind](thing, self.rows[pairs[here]], position[here], turn[here])
+        gap_to |= {"circles": self._to_circle, "boxes": self._to_rectangle if planar else self._to_box}
+        gap_to["spheres"] = self._to_ball
+        for kind, here, thing in self._by_kind(pairs):
+            gaps[here] = gap_to[kind](thing, self.rows[pairs[here]], position[here], turn[here])
         return gaps
 
-    def _kinds(self, pairs: Indices) -> Iterator[tuple[str, Indices, Indices]]:
+    def _by_kind(self, pairs: Indices) -> Iterator[tuple[str, Indices, Indices]]:
         """Kinds of obstacles, which of these pairs ``(N,)`` concern one of them, and which one."""
         column, first = self.columns[pairs], 0
         for kind in _kinds(self._world):

@@ -44,7 +44,8 @@ class SharedPolicy(Policy):
 
     Args:
         predict: ``(B, n)`` float32 observations of any number of robots to ``(B, m)`` actions.
-        weights: Something with a ``state_dict``, by which a store of trials tells one training's model from another's.
+        weights: Something with a ``state_dict``, by which a store of trials tells one training's model from another's;
+            ``None`` where there is none, and a store refuses what it cannot tell.
         normalized: Whether actions are in ``[-1, 1]``, which stand for the lowest and the highest of the environment.
         egocentric: Whether it was trained in ``egocentric`` environments; the one that it drives in is not. Where the
             goal speed is limited, its robots then brake to dock as go-to-goal does, as those of the package's policies.
@@ -55,7 +56,7 @@ class SharedPolicy(Policy):
     def __init__(
         self,
         predict: Callable[[FloatArray], ArrayLike],
-        weights: Model,
+        weights: Model | None,
         normalized: bool = False,
         egocentric: bool = False,
         trained: Shapes | None = None,
@@ -118,6 +119,8 @@ class SharedPolicy(Policy):
         return actions
 
     def identity(self) -> dict[str, object]:
+        if self._weights is None:
+            return super().identity()
         digest = hashlib.sha256()
         for name, tensor in self._weights.state_dict().items():
             digest.update(name.encode())

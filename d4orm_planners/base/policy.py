@@ -15,7 +15,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.inputs import usable
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_env.envs.options import EnvOptions
 from d4orm_planners.base.driving import ATTRIBUTE, driven_alone
 from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.plan import Plan
@@ -68,7 +67,8 @@ class Policy(ABC):
         Raises:
             ValueError: If the environment is egocentric.
         """
-        getattr(env.unwrapped, "options", EnvOptions()).require_physical_units()
+        if (options := getattr(env.unwrapped, "options", None)) is not None:
+            options.require_physical_units()
         self.problem = env.unwrapped.problem
 
     @abstractmethod

@@ -182,7 +182,7 @@ def _message(error: Exception) -> str:
 
 
 def _given(error: Any) -> str:
-    """What was given, which Typer leaves out where a type does not fit, and how arguments of scenarios are given."""
+    """Remedy for an argument of scenarios; or the value given, which Typer leaves out where a type does not fit."""
     name = getattr(error, "option_name", "").lstrip("-").replace("-", "_")
     known = {option for parameter in error.ctx.command.params for option in parameter.opts} if name else ()
     if "--scenario-set" in known and name in (field.name for field in fields(Settings)):

@@ -26,9 +26,9 @@ from d4orm_planners.mapf.beam import Beam
 from d4orm_planners.mapf.motion_primitives import Moves, aiming, frame_at
 from d4orm_planners.tracking.tracker import velocity_step
 
-_STATE, _CONTROL, _AIM, _PACE, _ARRIVED, _END, _PLACES = 0, 6, 10, 13, 14, 15, 16
-"""First rows of the workspace; the places of a block's steps are the last."""
-LANES = (_PLACES + 3 * BLOCK) * TILE
+_STATE, _CONTROL, _AIM, _PACE, _ARRIVED, _END, _POSITIONS = 0, 6, 10, 13, 14, 15, 16
+"""First rows of the workspace; the positions of a block's steps are the last."""
+LANES = (_POSITIONS + 3 * BLOCK) * TILE
 """Size of the workspace."""
 
 _AHEAD = np.float32(0.5)
@@ -72,7 +72,7 @@ def _lanes_driver(model: Model) -> Callable[[ProblemArrays, Whole, Whole, FloatA
             # Apart from the rest, because where these rows are is not known when that is compiled.
             for axis in range(d):
                 for s in range(TILE):
-                    w[(_PLACES + t * d + axis) * TILE + s] = w[(_STATE + axis) * TILE + s]
+                    w[(_POSITIONS + t * d + axis) * TILE + s] = w[(_STATE + axis) * TILE + s]
 
     return drive
 
@@ -136,7 +136,7 @@ def count_faults(arrays: ProblemArrays, robot: Whole, s: Whole, steps: Whole, w:
     closed, d = is_closed(arrays), arrays.goal.shape[1]
     for t in range(steps):
         for axis in range(d):
-            path[t, axis] = w[(_PLACES + t * d + axis) * TILE + s]
+            path[t, axis] = w[(_POSITIONS + t * d + axis) * TILE + s]
         if t <= w[_END * TILE + s] and is_unsure(arrays, path[t], goal):
             faults += 1.0
         if closed and touches_static(arrays, safety_distance, path[t]):

@@ -49,7 +49,7 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
 
 
 class _Tree(NamedTuple):
-    """Where a search has come so far, with room for more.
+    """Entries of a search so far, with room for more.
 
     Attributes:
         entries: ``(N, 5)`` int64 nodes, departures for them, arrivals, entries that they were come to from, intervals.
@@ -137,13 +137,13 @@ def _departure(
 def _add_entry(
     tree: _Tree, head: Whole, depart: Whole, until: Whole, entry: Whole, arrival: Whole, cost: float
 ) -> None:
-    entries, heap, number, position = tree.entries, tree.heap, tree.sizes[0], tree.sizes[1]
+    entries, heap, number, slot = tree.entries, tree.heap, tree.sizes[0], tree.sizes[1]
     entries[number, 0], entries[number, 1], entries[number, 2] = head, depart, until
     entries[number, 3], entries[number, 4], tree.costs[number] = entry, arrival, cost
     # It has the highest number, so it rises above what costs more only.
-    while position > 0 and tree.costs[heap[(position - 1) // 2]] > cost:
-        heap[position], position = heap[(position - 1) // 2], (position - 1) // 2
-    heap[position] = number
+    while slot > 0 and tree.costs[heap[(slot - 1) // 2]] > cost:
+        heap[slot], slot = heap[(slot - 1) // 2], (slot - 1) // 2
+    heap[slot] = number
     tree.sizes[0], tree.sizes[1] = number + 1, tree.sizes[1] + 1
 
 

@@ -298,13 +298,13 @@ def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
 
         def slow(*arguments: Any) -> Any:
             thinking.set()
-            go_on.wait()
+            assert go_on.wait(60)
             return step(*arguments)
 
         controller.step = slow  # type: ignore[method-assign]
         loop = threading.Thread(target=tick)
         loop.start()
-        thinking.wait()
+        assert thinking.wait(60)
         session.say("e_stop", ros.make(BOOL, True))
         told = len(command)
         assert command[-1].linear.x == 0
