@@ -207,7 +207,10 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
             raise ValueError(self._complaint(actions))
         if len(actions) != len(self.agents) and not actions.keys() <= self._robots.keys():
             unknown = sorted(map(str, actions.keys() - self._robots.keys()))
-            raise ValueError(f"actions name unknown agents {', '.join(unknown)}; the agents are env.possible_agents")
+            raise ValueError(
+                f"actions name unknown agents {', '.join(unknown)}; the agents are robot_0 to "
+                f"{self.possible_agents[-1]}"
+            )
         return block
 
     def _complaint(self, actions: object) -> str:

@@ -37,7 +37,19 @@ def no_setting(name: str, owner: str, known: Iterable[str]) -> UnknownKeywordErr
     )
 
 
+ELSEWHERE = {
+    "max_steps": "max_cycles", "max_episode_steps": "max_cycles", "time_limit": "max_cycles", "robots": "num_robots",
+    "n_agents": "num_robots", "num_agents": "num_robots", "n_robots": "num_robots", "bicycle": "car",
+    "double_integrator": "holonomic2d", "single_integrator": "velocity2d", "lidar": "observed_rays",
+}  # fmt: skip
+"""Names that other libraries have for the same."""
+
+
 def did_you_mean(value: object, known: Iterable[str]) -> str:
-    """The end of a message that names the most similar of the known names; empty if none is."""
-    close = get_close_matches(value, known, 1) if isinstance(value, str) and len(value) < 100 else []
+    """The end of a message that names the known name that is meant, or most similar; empty if none is."""
+    if not isinstance(value, str) or len(value) >= 100:
+        return ""
+    names = list(known)
+    same = ELSEWHERE.get(value)
+    close = [same] if same in names else get_close_matches(value, names, 1)
     return f"; did you mean {close[0]!r}?" if close else ""

@@ -74,8 +74,10 @@ def _travel(problem: Problem, speed: Floats) -> Floats:
     limits, travel = problem.team.limits.astype(np.float64), np.full(problem.num_robots, np.inf)
     for robot, model in enumerate(problem.team.robot_models):
         if MODEL_CODES[model.name] < NUM_BUILT_IN:
-            gained = limits[robot, ACCELERATION] * problem.dt / 2 if ACCELERATION in model.control_limits else 0.0
-            travel[robot] = problem.dt * (speed[robot] + gained)
+            strength = 0.0 if model.first_order else limits[robot, ACCELERATION]
+            if ACCELERATION not in model.control_limits and not model.first_order:  # it grows within the step
+                strength += problem.dt * limits[robot, model.control_limits[0]]
+            travel[robot] = problem.dt * (speed[robot] + strength * problem.dt / 2)
     return travel
 
 

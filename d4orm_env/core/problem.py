@@ -128,7 +128,6 @@ class Problem(Frozen):
         # Asked for first, so that all clearances are found by the index of the engines.
         self.world.index(self._reach)
         checks.check_states(team, self.start)
-        self._set(start=checks.unwound_states(team, self.start))
         for fault in checks.check_physics(self):
             warnings.warn(f"problem {name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=2)
 

@@ -37,7 +37,7 @@ MAX_HORIZON, MAX_ROBOT_STEPS = 1_000_000, 50_000_000
 MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
 """Bounds of ``dt`` [s]."""
 MAX_HEADING = 1000.0
-"""Largest heading that is given as a state [rad]; float32 resolves it to 6e-5 rad. What is taken is unwound."""
+"""Largest heading that is measured [rad]; float32 resolves it to 6e-5 rad. What is taken is unwound."""
 LEAST_TOLERANCE = 1e-3
 """Smallest tolerance of a goal heading [rad]."""
 RESOLUTION = 100
@@ -137,7 +137,7 @@ def check_tolerances(tolerance: FloatArray) -> None:
         raise ValueError(f"{value}; it must be from {LEAST_TOLERANCE:g} to pi")
 
 
-def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
+def check_states(team: Team, states: FloatArray, what: str = "start", max_angle: float = float(MAX_ANGLE)) -> None:
     """Refuse states (``what``) ``(K, n)`` whose padding is not zero, or whose speed or heading is too large."""
     limits = team.limits
     for robot, model in enumerate(team.robot_models):
@@ -149,10 +149,10 @@ def check_states(team: Team, states: FloatArray, what: str = "start") -> None:
             )
         _check_state_limits(model, limits[robot], state, f"{what} {{}} of robot_{robot} is ")
         for index in model.angles:
-            if abs(float(state[index])) > MAX_HEADING:
+            if abs(float(state[index])) > max_angle:
                 raise ValueError(
                     f"{what} {model.state_names[index]} of robot_{robot} is {state[index]:g} rad; it must be at most "
-                    f"{MAX_HEADING:g} in magnitude, so take whole turns off"
+                    f"{max_angle:g} in magnitude, so take whole turns off, or convert degrees by numpy.deg2rad"
                 )
 
 

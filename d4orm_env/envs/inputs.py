@@ -19,7 +19,7 @@ from d4orm_env.core.arrays import (
     whole_number,
 )
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_checks import check_states, unwound_states
+from d4orm_env.core.problem_checks import MAX_HEADING, check_states, unwound_states
 from d4orm_env.disturbances.disturbance import check_components, per_component
 
 MAX_CYCLES = 10**9
@@ -43,7 +43,7 @@ def checked_states(
     array = frozen_array(states, "states", (*arrived.shape, problem.state_size), largest=LARGEST)
     low, high = (bound[: problem.start.size].reshape(problem.start.shape) for bound in bounds)
     for team in array.reshape(-1, *problem.start.shape):
-        check_states(problem.team, team, "state")
+        check_states(problem.team, team, "state", MAX_HEADING)
     array = unwound_states(problem.team, array)
     for team, parked in zip(array.reshape(-1, *problem.start.shape), arrived.reshape(-1, problem.num_robots)):
         outside = ((team < low) | (team > high)).any(axis=1)

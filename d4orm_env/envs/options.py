@@ -144,11 +144,13 @@ class EnvOptions:
             )
         if self.progress not in ("straight", "path"):
             raise ValueError(f"progress is {short_repr(self.progress)}; it must be 'straight' or 'path'")
-        for name in ("observed_path", "line_of_sight", "egocentric"):
+        for name in ("lifelong", "observed_path", "line_of_sight", "egocentric"):
             if not isinstance(value := getattr(self, name), bool):
                 raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
-        if not self.observed_rays and any(isinstance(one, RayNoise) for one in self.disturbances):
-            raise ValueError("RayNoise is of range sensors, and these robots have none; give observed_rays")
+        sensed = "ray_range" if self.ray_range != type(self).ray_range else ""
+        sensed = "RayNoise" if any(isinstance(one, RayNoise) for one in self.disturbances) else sensed
+        if sensed and not self.observed_rays:
+            raise ValueError(f"{sensed} is of range sensors, and these robots have none; give observed_rays")
         if self.lifelong and (self.progress == "path" or self.observed_path):
             raise ValueError(
                 "progress='path' and observed_path need goals that stay; leave them out in lifelong mode, which draws "

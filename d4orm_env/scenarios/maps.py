@@ -169,7 +169,8 @@ def read_map(path: PathLike, cell: float = 0.6, resolution: float | None = None)
                 raise ValueError("is an image without its map_server YAML file; give resolution=, its metres per pixel")
             return grid_of_fields({"image": file.name, "resolution": resolution, "origin": [0, 0, 0]}, file.parent)
         if resolution is not None:
-            raise ValueError("is no image, and only images take a resolution; leave it out")
+            kinds = " or ".join(IMAGES)
+            raise ValueError(f"is no {kinds} image, and only these take a resolution; leave it out, or convert it")
         if is_yaml_path(file):
             return read_occupancy_image(file)
         return _parse(read_limited(file, "a map", MAX_BYTES), cell)
@@ -195,7 +196,8 @@ def map(
     """
     if map is None:
         raise ValueError(
-            f"scenario {settings.scenario!r} needs map=, the path of a .map file or a map_server .yaml file"
+            f"scenario {settings.scenario!r} needs map=, the path of a .map file, of a map_server .yaml file, or of a "
+            ".png or .pgm image with its resolution="
         )
     require_plane(settings)
     grid, safety_distance = read_map(map, cell, resolution), safety_distance_of(settings)

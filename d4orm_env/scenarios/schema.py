@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.errors import did_you_mean
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import Arrival
@@ -268,15 +269,19 @@ def _footprint(entry: RobotEntry) -> Footprint:
 
 
 def _explain(error: ValidationError) -> str:
-    """The first error, as one line: where, what was expected, what was found."""
-    first = error.errors(include_url=False)[0]
+    """The first error, as one line: where, what was expected, what was found. A field too many may be one misspelt."""
+    errors = error.errors(include_url=False)
+    first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
     names = ["", *(part for part in first["loc"] if isinstance(part, str))]
     parts = [part for part in first["loc"] if part not in KINDS]
     where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts).lstrip(".")
     if first["type"] == "extra_forbidden":
-        message = f"unknown field; known are {', '.join(PARTS[names[-2]].model_fields)}"
+        known = PARTS[names[-2]].model_fields
+        message = f"unknown field; known are {', '.join(known)}{did_you_mean(names[-1], known)}"
     elif first["type"] == "missing":
-        message = "this field is missing"
+        message = "this field is missing" + ("; give version: 1" if names[-1] == "version" else "")
+    elif first["type"] == "model_type":
+        message = f"expected the fields {', '.join(PARTS[names[-1]].model_fields)}, not {short_repr(first['input'])}"
     elif first["type"] == "value_error":
         message = str(first["ctx"]["error"])
     else:

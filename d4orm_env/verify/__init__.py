@@ -199,10 +199,14 @@ def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
     except OverflowError as error:
         raise ValueError("controls hold a whole number too large for float64; keep them within the limits") from error
     except (TypeError, ValueError) as error:
-        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}") from error
+        remedy = "; give its controls" if hasattr(controls, "controls") else ""
+        raise ValueError(f"controls must be an array of numbers, not {type(controls).__name__}{remedy}") from error
     expected = (problem.horizon, len(problem.team.models), problem.team.control_size)
     if array.shape != expected:
-        raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}")
+        remedy = ""
+        if array.shape[1:] == expected[1:] and len(array):
+            remedy = f"; for so many steps, verify them for problem.replace(horizon={len(array)})"
+        raise ValueError(f"controls have shape {array.shape}; expected (H, K, m) = {expected}{remedy}")
     return array
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, as_float32
+from d4orm_env.core.arrays import FloatArray, as_float32, short_repr
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.envs.features import Features
 from d4orm_env.envs.joint_state import split_state
@@ -110,7 +110,12 @@ class SharedPolicy(Policy):
         if self._features is not None:
             seen, frames = self._features.encode(seen)
         asked = seen.reshape(1, -1) if self._is_joint else seen
-        actions = as_float32(self._predict(asked)).reshape(len(seen), -1)
+        try:
+            actions = as_float32(self._predict(asked)).reshape(len(seen), -1)
+        except RuntimeError as error:  # torch's, of a module that takes something else
+            raise ValueError(
+                f"the model fails on observations of shape {asked.shape}, which are those of this environment: {error}"
+            ) from error
         if self._features is not None:
             return self._features.decode(actions, frames, self.problem.team.control_limits[robots])
         if self._normalized:
@@ -138,7 +143,15 @@ def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False)
         model: Result of ``PPO.load(path)`` or of the training.
         deterministic: Take the most likely action rather than draw one.
         egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
+
+    Raises:
+        ValueError: If it is no model.
     """
+    if not hasattr(model, "policy"):
+        raise ValueError(
+            f"model is {short_repr(model)}; give a model of Stable-Baselines3, as PPO.load(path), or use "
+            "make_policy('ppo', path=...)"
+        )
     ask = partial(_ask_sb3, model, deterministic=deterministic)
     trained = model.observation_space.shape, model.action_space.shape
     return SharedPolicy(ask, model.policy, egocentric=egocentric, trained=trained)

@@ -122,10 +122,6 @@ def open_env(problem: Problem, physics: str = "model", policy: Policy | None = N
     check_physics(problem, physics)
     if isinstance(policy, Policy):  # a user's own may have no more than reset and act
         options = {**policy.observation_options(problem), **options}
-    if "ray_range" in options and not options.get("observed_rays"):
-        raise ValueError(
-            f"ray_range is {short_repr(options['ray_range'])}, and robots have no rays; give observed_rays too"
-        )
     return physics_module(physics).parallel_env(problem=problem, **options)
 
 

@@ -119,6 +119,12 @@ def find_policy(policy: object) -> object:
                 return table[policy]
         if ":" in policy:
             return load_reference(policy)
+    for present, missing in (("act", "reset"), ("reset", "act")):
+        if hasattr(policy, present):
+            raise ValueError(
+                f"policy {short_repr(policy)} has {present} and lacks {missing}; define it, or subclass "
+                "d4orm_planners.Policy"
+            )
     raise unknown("policy", policy, list_policies(), "give a Policy, a function, or package.module:Name of one")
 
 

@@ -277,10 +277,13 @@ def as_policy(thing: Any, owner: str) -> Policy:
         return thing
     count = required_parameters(thing) if callable(thing) and not isinstance(thing, type) else 0
     if count not in (1, 2):
-        raise ValueError(
-            f"{owner} is {short_repr(thing)}, which does not act; it must have reset and act, or be a function of "
-            "(observations, state) or of one robot's observation, distinguished by their required positional parameters"
+        remedy = (
+            "give it as from_torch(module), from d4orm_planners.base.adapters"
+            if hasattr(thing, "forward")
+            else "it must have reset and act, or be a function of (observations, state) or of one robot's observation, "
+            "distinguished by their required positional parameters"
         )
+        raise ValueError(f"{owner} is {short_repr(thing)}, which does not act; {remedy}")
     return TeamFunction(thing) if count == 2 else RobotFunction(thing)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, short_repr, whole_number
+from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.core.trajectory import trajectory_metrics
@@ -189,9 +189,10 @@ class SolveRun:
             self.state, self._began = self.planner.init(self), True
         result = self.planner.iterate(self, self.state)
         if not (isinstance(result, tuple) and len(result) == 2 and hasattr(result[1], "controls")):
+            kinds = [type(part).__name__ for part in (result if isinstance(result, tuple) else (result,))]
             raise ValueError(
-                f"iterate() of planner {self.planner.name!r} returned {short_repr(result)}; expected its new state and "
-                "an Iteration(controls)"
+                f"iterate() of planner {self.planner.name!r} returned {', '.join(kinds)}; write: return state, "
+                "Iteration(controls)"
             )
         self.state, iteration = result
         self.current = drive_further_in(self, iteration.evaluated or self._evaluate(iteration.controls), self._evaluate)

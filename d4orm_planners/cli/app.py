@@ -35,6 +35,14 @@ LONGEST = 2000
 """Characters of a complaint at most: a name that was given may have any number."""
 
 
+INSTEAD = {
+    "planner": ("--policy", "here it is --policy"),
+    "policy": ("--planner", "here it is --planner, and d4orm run takes policies"),
+    "policies": ("--compare", "for several give --compare"),
+    "set": ("--compare", "settings stand behind the policy, as in --policy d4orm:num_samples=64"),
+}
+"""Options of other commands: one that a command has in place, and what to say there."""
+
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("run:demo", "Plan, execute, verify and draw a team in a warehouse."),
     "plan": ("plan_command:plan", "Plan for a team; write plan, picture or animation."),
@@ -189,7 +197,12 @@ def _message(error: Exception) -> str:
 def _given(error: Any) -> str:
     """Remedy for an argument of scenarios; or the value given, which Typer leaves out where a type does not fit."""
     name = getattr(error, "option_name", "").lstrip("-").replace("-", "_")
-    known = {option for parameter in error.ctx.command.params for option in parameter.opts} if name else ()
+    context = getattr(error, "ctx", None)
+    known = {option for parameter in context.command.params for option in parameter.opts} if context else ()
+    if "unexpected extra argument" in error.message and "--scenario" in known:
+        return "; a scenario or its file goes by --scenario"
+    if INSTEAD.get(name, ("",))[0] in known:
+        return "; " + INSTEAD[name][1]
     if "--scenario-set" in known and name in (field.name for field in fields(Settings)):
         return f"; arguments of scenarios go by --scenario-set {name}=..."
     errors = getattr(error.__cause__, "errors", None)

@@ -81,6 +81,11 @@ def policies_by_label(texts: list[str], option: str = "--policy") -> dict[str, d
     for text in texts:
         # The name ends where the first setting begins, for an import path has a colon too.
         policy, colon, _ = text.partition("=")[0].rpartition(":")
+        if "=" in text and ("," in policy or not colon):
+            raise ValueError(
+                f"{option} {text!r}: settings stand behind one policy, as in d4orm:num_samples=64,label=few; give "
+                f"{option} once for each"
+            )
         if not colon or ("=" not in text and policy not in list_policies()):
             labelled += [(name, {}) for name in names(text) or ()]
             continue

@@ -122,6 +122,8 @@ def run(options: RunOptions) -> None:
         print_table("Execution", episode_rows(episode))
         if options.out is not None:
             typer.echo(f"wrote {options.out}")
+    if isinstance(policy, OpenLoop) and policy.plan is not None:
+        require_solved(policy.plan)
     require_success(episode, problem)
 
 

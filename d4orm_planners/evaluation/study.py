@@ -234,6 +234,7 @@ def conditions(
         ValueError: For an unknown name, a level that makes no sense, or nothing to do.
     """
     given = control_noise_std if isinstance(control_noise_std, Iterable) else (control_noise_std,)
+    given = (control_noise_std,) if isinstance(control_noise_std, str) else given
     noise = tuple(dict.fromkeys(positive_number(std, "control_noise_std", zero_allowed=True) for std in given))
     if not noise:
         raise ValueError("control_noise_std is empty; give at least one level")

@@ -160,7 +160,9 @@ def _csv(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float
 
 def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:
     if motion.problem.dimension == 2 and height <= 0:
-        raise ValueError(f"height is {height:g} m; a team that moves in the plane flies at a height above 0")
+        raise ValueError(
+            f"height is {height:g} m; a team that moves in the plane flies above 0: give height= (--height), as 1.0"
+        )
     if motion.problem.dimension == 3 and (lowest := setpoints.position[..., 2].min(axis=0)).min() <= 0:
         robot = int(lowest.argmin())
         raise ValueError(

@@ -32,9 +32,9 @@ def passage(width: float, *, robots: int = 1, upper: float = 3.0, **changes: obj
 
 def beside_wall(gap: float, speed: float, model: str = "holonomic2d") -> Problem:
     """A robot so far from a wall that drives towards it or away from it at first."""
-    start = [[0, 0.15 + gap, 0, speed]] if model == "holonomic2d" else [[0, 0.15 + gap]]
-    world = World(boxes=[[-5, -1, 5, 0]])
-    return Problem(Team((model,), max_acceleration=1.0), start, [[0, 3]], world, dt=0.1, margin=0.2)
+    team, world = Team((model,), max_acceleration=1.0), World(boxes=[[-5, -1, 5, 0]])
+    start = [[0, 0.15 + gap, 0, speed, 0, 0][: team.state_size]]
+    return Problem(team, start, [[0, 3]], world, dt=0.1, margin=0.2)
 
 
 @pytest.mark.parametrize("name", list_planners())
@@ -143,6 +143,11 @@ def test_a_start_within_the_margin_must_be_left_in_one_step(gap: float, speed: f
 @pytest.mark.parametrize(("gap", "proved"), [(0.09, True), (0.11, False)])
 def test_a_first_order_robot_may_start_at_full_speed(gap: float, proved: bool) -> None:
     assert bool(prove_infeasible(beside_wall(gap, 0.0, "velocity2d"))) == proved
+
+
+@pytest.mark.parametrize(("gap", "proved"), [(0.19, True), (0.1995, False)])
+def test_a_robot_of_limited_jerk_gains_a_little_in_its_first_step(gap: float, proved: bool) -> None:
+    assert bool(prove_infeasible(beside_wall(gap, 0.0, "holonomic2d_jerk"))) == proved
 
 
 @pytest.mark.parametrize("arrival", ["dock", "stay"])

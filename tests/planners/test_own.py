@@ -121,7 +121,7 @@ def test_an_episode_takes_whatever_acts(policy: Any) -> None:
 @pytest.mark.parametrize("result", [None, (None, np.zeros((1, 1, 2))), Iteration(np.zeros((1, 1, 2)))])
 def test_an_iteration_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch, result: object) -> None:
     monkeypatch.setattr(Ahead, "iterate", lambda *_: result)
-    with pytest.raises(ValueError, match=r"iterate\(\) of planner .* returned .*; expected its new state and an It"):
+    with pytest.raises(ValueError, match=r"iterate\(\) of planner .* returned .*; write: return state, Iteration"):
         make_planner(Ahead).solve(PROBLEM, seed=0)
 
 

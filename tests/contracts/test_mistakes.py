@@ -1,0 +1,84 @@
+"""Mistakes that people new to the package made, each with the remedy that its message must name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from d4orm_env import Problem, Team, load_map, load_problem, make_problem, navigation_v0, verify
+from d4orm_planners import make_policy
+from d4orm_planners.base.adapters import from_sb3
+
+DRIVE = Team(("differential_drive",))
+PROBLEM = make_problem("circle", num_robots=2)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Problem(DRIVE, [[0, 0, 180, 0]], [[2, 0]]), "180 rad; .* convert degrees by numpy.deg2rad"),
+        (lambda: navigation_v0.parallel_env(lifelong="yes"), "lifelong is 'yes'; it must be True or False"),
+        (lambda: navigation_v0.parallel_env(ray_range=3.0), "these robots have none; give observed_rays"),
+        (lambda: navigation_v0.parallel_env(max_steps=9), "did you mean 'max_cycles'"),
+        (lambda: make_problem("circle", robots=4), "did you mean 'num_robots'"),
+        (lambda: make_problem("circle", model="bicycle"), "did you mean 'car'"),
+        (lambda: make_policy(SimpleNamespace(act=print)), "has act and lacks reset; define it, or subclass"),
+        (lambda: make_policy(SimpleNamespace(reset=print)), "has reset and lacks act; define it, or subclass"),
+        (lambda: from_sb3("joint.zip"), "give a model of Stable-Baselines3, as PPO.load"),
+        (lambda: verify(PROBLEM, SimpleNamespace(controls=0)), "not SimpleNamespace; give its controls"),
+        (lambda: verify(PROBLEM, np.zeros((7, 2, 2))), r"problem.replace\(horizon=7\)"),
+    ],
+)
+def test_what_python_says(call: Callable[[], object], message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("robots: []", "version: this field is missing; give version: 1"),
+        (
+            "version: 1\nrobots: [{model: car, start: [0, 0], gaol: [1, 1]}]",
+            "gaol: unknown field.* did you mean 'goal'",
+        ),
+        (
+            "version: 1\nrobots: [{model: car, start: [0, 0], goal: [3, 3]}]\nworld: {circles: [[1, 1, 0.2]]}",
+            "expected the fields center, radius, not",
+        ),
+    ],
+)
+def test_what_a_scenario_file_says(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_problem(path)
+
+
+def test_a_photograph_of_a_floor_is_to_be_converted(tmp_path: Path) -> None:
+    path = tmp_path / "floor.jpg"
+    path.write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(ValueError, match=r"no \.png or \.pgm image, .* or convert it"):
+        load_map(path, resolution=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("plan", "yard.yaml"), "a scenario or its file goes by --scenario"),
+        (("run", "--planner", "d4orm"), "here it is --policy"),
+        (("plan", "--policy", "d4orm"), "here it is --planner"),
+        (("run", "--set", "num_samples=64"), "--policy d4orm:num_samples=64"),
+        (("evaluate", "--policy", "orca,d4orm:num_samples=64"), "give --policy once for each"),
+        (("evaluate", "--policy", "orca,label=x"), "settings stand behind one policy"),
+    ],
+)
+def test_what_the_command_line_says(d4orm: Callable[..., Any], arguments: tuple[str, ...], message: str) -> None:
+    outcome = d4orm(*arguments)
+    assert outcome.status == 2
+    assert message in outcome.err
