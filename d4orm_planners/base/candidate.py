@@ -20,20 +20,14 @@ PLAN_REACH = LARGEST_NUMBER / LARGEST
 
 @dataclass(frozen=True)
 class Candidate:
-    """Controls and what they lead to.
+    """Controls and what they lead to."""
 
-    Attributes:
-        planned: ``(H, K, m)`` as the method left them, at most :data:`PLAN_REACH` times the limits; zero once docked.
-        controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
-        trajectory: Their rollout.
-        failed: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked.
-        report: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, and it was not asked.
-    """
-
+    #: ``(H, K, m)`` as the method left them, at most :data:`PLAN_REACH` times the limits; zero once docked
     planned: FloatArray
-    controls: FloatArray
-    trajectory: Trajectory
-    failed: BoolArray
+    controls: FloatArray  #: ``(H, K, m)`` as executed: inside the limits, zero once docked
+    trajectory: Trajectory  #: Their rollout
+    failed: BoolArray  #: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked
+    #: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, and it was not asked
     report: VerificationReport | None
 
     @property

@@ -22,15 +22,10 @@ Groups = tuple[tuple[int, ...], ...]
 
 
 class Grouping(NamedTuple):
-    """A team's groups, and the conflicts that they come from.
+    """A team's groups, and the conflicts that they come from."""
 
-    Attributes:
-        graph: The conflicts.
-        groups: Components of the graph after :func:`reconnected`, singletons included.
-    """
-
-    graph: Graph
-    groups: Groups
+    graph: Graph  #: The conflicts
+    groups: Groups  #: Components of the graph after :func:`reconnected`, singletons included
 
 
 def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:

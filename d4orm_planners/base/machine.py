@@ -79,19 +79,12 @@ def _processor() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Origin of a plan, beside its planner's name and the seed.
+    """Origin of a plan, beside its planner's name and the seed."""
 
-    Attributes:
-        preset: Of :func:`~d4orm_planners.make_planner`; ``None`` for the defaults.
-        settings: All settings of the planner, by name; what JSON has no word for as text.
-        version: Of this package.
-        machine: Processor, cores and system, as the benchmark describes them.
-    """
-
-    preset: str | None
-    settings: Mapping[str, object]
-    version: str
-    machine: Mapping[str, object]
+    preset: str | None  #: Of :func:`~d4orm_planners.make_planner`; ``None`` for the defaults
+    settings: Mapping[str, object]  #: All settings of the planner, by name; what JSON has no word for as text
+    version: str  #: Of this package
+    machine: Mapping[str, object]  #: Processor, cores and system, as the benchmark describes them
 
     def __post_init__(self) -> None:
         kinds = {"preset": (str, type(None)), "settings": Mapping, "version": str, "machine": Mapping}

@@ -37,15 +37,10 @@ Rows = tuple[Expression, float, float]
 
 
 class CollocatedMotion(NamedTuple):
-    """Decision variables of the program.
+    """Decision variables of the program."""
 
-    Attributes:
-        states: ``(H+1, K, n)``, the start first.
-        controls: ``(H, K, m)``.
-    """
-
-    states: Floats
-    controls: Floats
+    states: Floats  #: ``(H+1, K, n)``, the start first
+    controls: Floats  #: ``(H, K, m)``
 
 
 class TeamProgram:

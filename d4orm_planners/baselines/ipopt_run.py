@@ -37,15 +37,10 @@ GRACE = 0.05
 
 
 class NonlinearProgram(NamedTuple):
-    """A program as CasADi takes it.
+    """A program as CasADi takes it."""
 
-    Attributes:
-        functions: Variables ``x``, cost ``f`` and constraints ``g``, each one column.
-        bounds: ``lbx``, ``ubx``, ``lbg`` and ``ubg`` of these.
-    """
-
-    functions: Mapping[str, Expression]
-    bounds: Mapping[str, Floats]
+    functions: Mapping[str, Expression]  #: Variables ``x``, cost ``f`` and constraints ``g``, each one column
+    bounds: Mapping[str, Floats]  #: ``lbx``, ``ubx``, ``lbg`` and ``ubg`` of these
 
 
 def run_ipopt(

@@ -69,19 +69,12 @@ def safe_velocities(
 
 
 class Barriers(NamedTuple):
-    """``normals @ (v_one - v_other) >= least`` for velocities; -1 is no robot, and at rest.
+    """``normals @ (v_one - v_other) >= least`` for velocities; -1 is no robot, and at rest."""
 
-    Attributes:
-        one: ``(R,)`` robots.
-        other: ``(R,)`` robots.
-        normals: ``(R, d)`` unit vectors.
-        least: ``(R,)`` [m/s].
-    """
-
-    one: IntArray
-    other: IntArray
-    normals: Array
-    least: Array
+    one: IntArray  #: ``(R,)`` robots
+    other: IntArray  #: ``(R,)`` robots
+    normals: Array  #: ``(R, d)`` unit vectors
+    least: Array  #: ``(R,)`` [m/s]
 
     def missing(self, velocities: Array) -> Array:
         """``(R,)`` how much of it velocities ``(K, d)`` lack [m/s]."""

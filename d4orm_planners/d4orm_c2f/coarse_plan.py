@@ -14,30 +14,19 @@ from d4orm_planners.tracking.reference_drives import follow_reference
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseWaypoints:
-    """Path that a team follows.
+    """Path that a team follows."""
 
-    Attributes:
-        path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
-        ordered: Whether the path was found on a roadmap, where precedence decides.
-    """
-
-    path: FloatArray
-    ordered: bool
+    path: FloatArray  #: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m]
+    ordered: bool  #: Whether the path was found on a roadmap, where precedence decides
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarsePlan(CoarseWaypoints):
-    """A coarse plan and the path made from it.
+    """A coarse plan and the path made from it."""
 
-    Attributes:
-        problem: The coarse problem: larger time steps from where the plan begins.
-        controls: ``(H_c, K, m)`` of the coarse plan.
-        states: ``(H_c+1, K, n)``.
-    """
-
-    problem: Problem
-    controls: FloatArray
-    states: FloatArray
+    problem: Problem  #: The coarse problem: larger time steps from where the plan begins
+    controls: FloatArray  #: ``(H_c, K, m)`` of the coarse plan
+    states: FloatArray  #: ``(H_c+1, K, n)``
 
 
 def coarse_problem(problem: Problem, factor: int) -> Problem:

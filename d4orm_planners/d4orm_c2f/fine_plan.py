@@ -22,41 +22,24 @@ NEAREST = 256
 
 
 class Prediction(NamedTuple):
-    """Prediction of a control loop.
+    """Prediction of a control loop."""
 
-    Attributes:
-        controls: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
-        positions: ``(1 + H_predict + S, K, d)`` where they lead, with the present place first [m].
-        gap: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot.
-    """
-
-    controls: FloatArray
-    positions: FloatArray
-    gap: float
+    controls: FloatArray  #: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take
+    positions: FloatArray  #: ``(1 + H_predict + S, K, d)`` where they lead, with the present place first [m]
+    gap: float  #: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot
 
 
 class Situation(NamedTuple):
-    """State at the beginning of a control loop.
+    """State at the beginning of a control loop."""
 
-    Attributes:
-        joint: State of the robots.
-        arrived: ``(K,)`` robots that stay there.
-        subgoals: ``(K, d)`` [m].
-        base: ``(H_predict, K, m)`` controls to deform.
-        left: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
-        careful: ``(H_predict, K, m)`` controls for robots that are stuck, if any are.
-        stuck: ``(K,)`` robots that are; they may come as near as half of the margin.
-        room: Added to the margin of the samples [m].
-    """
-
-    joint: JointState
-    arrived: BoolArray
-    subgoals: FloatArray
-    base: FloatArray
-    left: FloatArray
-    careful: FloatArray | None
-    stuck: BoolArray
-    room: float
+    joint: JointState  #: State of the robots
+    arrived: BoolArray  #: ``(K,)`` robots that stay there
+    subgoals: FloatArray  #: ``(K, d)`` [m]
+    base: FloatArray  #: ``(H_predict, K, m)`` controls to deform
+    left: FloatArray  #: ``(T, K, m)`` controls that the robots had in mind, with the stop after them
+    careful: FloatArray | None  #: ``(H_predict, K, m)`` controls for robots that are stuck, if any are
+    stuck: BoolArray  #: ``(K,)`` robots that are; they may come as near as half of the margin
+    room: float  #: Added to the margin of the samples [m]
 
 
 class Window:

@@ -98,15 +98,10 @@ class DeformedPlan(WorkingPlan):
 
 @dataclass(frozen=True, eq=False)
 class Repairs:
-    """The state of the search by independent repairs.
+    """The state of the search by independent repairs."""
 
-    Attributes:
-        failures: ``(K,)`` failed repairs in a row of each robot.
-        recency: ``(K,)`` how often each was repaired, decaying with every iteration.
-    """
-
-    failures: IntArray
-    recency: NDArray[np.float64]
+    failures: IntArray  #: ``(K,)`` failed repairs in a row of each robot
+    recency: NDArray[np.float64]  #: ``(K,)`` how often each was repaired, decaying with every iteration
 
     @classmethod
     def of(cls, num_robots: int) -> Repairs:

@@ -30,27 +30,16 @@ RESEND = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """Something that a node did.
+    """Something that a node did."""
 
-    Attributes:
-        node: The node that did it.
-        kind: One of :data:`KINDS`.
-        begin: Time at which it began to, by :func:`time.perf_counter` [s].
-        end: Time at which it was done, likewise. Messages take no time here.
-        of: The node that the candidate came from.
-        sequence: Number among that node's messages, from 1; 0 for one that was not sent yet.
-        candidate: The candidate, as evaluated by ``node``.
-        size: Bytes of the message that was sent, else 0.
-    """
-
-    node: int
-    kind: str
-    begin: float
-    end: float
-    of: int
-    sequence: int
-    candidate: Candidate
-    size: int = 0
+    node: int  #: The node that did it
+    kind: str  #: One of :data:`KINDS`
+    begin: float  #: Time at which it began to, by :func:`time.perf_counter` [s]
+    end: float  #: Time at which it was done, likewise. Messages take no time here.
+    of: int  #: The node that the candidate came from
+    sequence: int  #: Number among that node's messages, from 1; 0 for one that was not sent yet
+    candidate: Candidate  #: The candidate, as evaluated by ``node``
+    size: int = 0  #: Bytes of the message that was sent, else 0
 
 
 Observer = Callable[[Event], object]
@@ -63,23 +52,14 @@ def node_seed(seed: int, node: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class PlanningTask:
-    """Common task of the nodes of one solve.
+    """Common task of the nodes of one solve."""
 
-    Attributes:
-        num_nodes: Number of nodes.
-        seed: That of the whole solve.
-        controls: ``(H, K, m)`` to start from; ``None`` for zeros.
-        selection: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.inbox.choose`.
-        k: Number of candidates that it draws from.
-        links: ``(N, N)`` bool: which nodes each one hears; ``None`` for all.
-    """
-
-    num_nodes: int
-    seed: int
-    controls: FloatArray | None
-    selection: str
-    k: int
-    links: BoolArray | None = None
+    num_nodes: int  #: Number of nodes
+    seed: int  #: That of the whole solve
+    controls: FloatArray | None  #: ``(H, K, m)`` to start from; ``None`` for zeros
+    selection: str  #: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.inbox.choose`
+    k: int  #: Number of candidates that it draws from
+    links: BoolArray | None = None  #: ``(N, N)`` bool: which nodes each one hears; ``None`` for all
 
     def heard_by(self, node: int) -> set[int]:
         """Return the nodes that a node hears."""

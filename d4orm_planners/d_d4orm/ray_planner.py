@@ -121,21 +121,13 @@ def host_and_port(address: str) -> tuple[str, int]:
 
 
 class ActorOutcome(NamedTuple):
-    """Outcome of an actor's iteration.
+    """Outcome of an actor's iteration."""
 
-    Attributes:
-        data: The candidate, a message.
-        denoising_steps: Spent on it.
-        excluded: See :class:`~d4orm_planners.base.planner.Iteration`.
-        compiling: Seconds of it that went into compiling.
-        process: The process that did it.
-    """
-
-    data: bytes
-    denoising_steps: int
-    excluded: int
-    compiling: float
-    process: int
+    data: bytes  #: The candidate, a message
+    denoising_steps: int  #: Spent on it
+    excluded: int  #: See :class:`~d4orm_planners.base.planner.Iteration`
+    compiling: float  #: Seconds of it that went into compiling
+    process: int  #: The process that did it
 
 
 class Worker:

@@ -38,21 +38,13 @@ _CHECKSUM = struct.Struct("<I")
 
 @dataclass(frozen=True, eq=False)
 class Message:
-    """A candidate as a node claims it to be.
+    """A candidate as a node claims it to be."""
 
-    Attributes:
-        node: Its sender, from 0.
-        sequence: Number of the candidate, from 1.
-        controls: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would.
-        reward: Mean reward.
-        feasible: Whether it is a solution.
-    """
-
-    node: int
-    sequence: int
-    controls: FloatArray
-    reward: float
-    feasible: bool
+    node: int  #: Its sender, from 0
+    sequence: int  #: Number of the candidate, from 1
+    controls: FloatArray  #: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would
+    reward: float  #: Mean reward
+    feasible: bool  #: Whether it is a solution
 
 
 class MessageError(ValueError):

@@ -24,35 +24,20 @@ _WIDER = 1 + 2.0**-20
 
 
 class PathTable(NamedTuple):
-    """The index as kernels read it. Steps are counted from the first after the start.
+    """The index as kernels read it. Steps are counted from the first after the start."""
 
-    Attributes:
-        block: :data:`BLOCK`.
-        positions: ``(H+1, K, d)`` float32 [m].
-        radius: ``(K,)`` float64 [m].
-        margin: ``()`` float64 [m].
-        safety_distance: ``()`` float64 the largest distance at which two robots are near [m].
-        scale: ``()`` float64 cells in a metre.
-        middle: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
-        spread: ``(B, K)`` float64 and how far from there it gets [m].
-        widest: ``(1,)`` float64 the largest spread there has been.
-        moving: ``(1,)`` int64 the last block in which any robot has moved.
-        first: ``(B, N)`` int32 the first robot in each bucket of each block.
-        following: ``(B, K)`` int32 the robot after each in its bucket.
-    """
-
-    block: int
-    positions: FloatArray
-    radius: NDArray[np.float64]
-    margin: np.float64
-    safety_distance: np.float64
-    scale: np.float64
-    middle: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    widest: NDArray[np.float64]
-    moving: IntArray
-    first: NDArray[np.int32]
-    following: NDArray[np.int32]
+    block: int  #: :data:`BLOCK`
+    positions: FloatArray  #: ``(H+1, K, d)`` float32 [m]
+    radius: NDArray[np.float64]  #: ``(K,)`` float64 [m]
+    margin: np.float64  #: ``()`` float64 [m]
+    safety_distance: np.float64  #: ``()`` float64 the largest distance at which two robots are near [m]
+    scale: np.float64  #: ``()`` float64 cells in a metre
+    middle: NDArray[np.float64]  #: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
+    spread: NDArray[np.float64]  #: ``(B, K)`` float64 and how far from there it gets [m]
+    widest: NDArray[np.float64]  #: ``(1,)`` float64 the largest spread there has been
+    moving: IntArray  #: ``(1,)`` int64 the last block in which any robot has moved
+    first: NDArray[np.int32]  #: ``(B, N)`` int32 the first robot in each bucket of each block
+    following: NDArray[np.int32]  #: ``(B, K)`` int32 the robot after each in its bucket
 
 
 @inlined

@@ -48,42 +48,28 @@ _CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
 
 
 class Scratch(NamedTuple):
-    """Scratch of a tile of ``K`` robots.
+    """Scratch of a tile of ``K`` robots."""
 
-    Attributes:
-        boxes: ``(K d BOX,)`` where the robots are within a block, see :func:`~d4orm_env.engine.simd.enclose`, widened
-            so that what is within the margin of each other touches.
-        num_robots: ``(K,)`` how many robots before it each may touch,
-        robots: ``(K, K)`` and which.
-        near: ``(DIGITS, K, BLOCK)`` how many robots and bodies are near at a step of the block: a bit for every sample
-            of each binary digit, the lowest first. The last digit in use is set for all that does not fit.
-        buffer: ``(2 TILE,)`` two rows to overwrite.
-    """
-
+    #: ``(K d BOX,)`` where the robots are within a block, see :func:`~d4orm_env.engine.simd.enclose`, widened so that
+    #: what is within the margin of each other touches
     boxes: FloatArray
-    num_robots: Ints
-    robots: Ints
+    num_robots: Ints  #: ``(K,)`` how many robots before it each may touch,
+    robots: Ints  #: ``(K, K)`` and which
+    #: ``(DIGITS, K, BLOCK)`` how many robots and bodies are near at a step of the block: a bit for every sample of each
+    #: binary digit, the lowest first. The last digit in use is set for all that does not fit.
     near: NDArray[np.uint64]
-    buffer: FloatArray
+    buffer: FloatArray  #: ``(2 TILE,)`` two rows to overwrite
 
 
 class Bodies(NamedTuple):
-    """Bodies that move among the robots.
+    """Bodies that move among the robots."""
 
-    Attributes:
-        positions: ``(H, O, d)`` after every step.
-        radius: ``(O,)``.
-        boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
-            margin.
-        footprints: Theirs, or ``None`` where all bodies and robots are discs.
-        headings: ``(H, F)`` of their bodies and trailers, or ``(H, 0)`` where all are discs.
-    """
-
-    positions: FloatArray
-    radius: FloatArray
+    positions: FloatArray  #: ``(H, O, d)`` after every step
+    radius: FloatArray  #: ``(O,)``
+    #: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the margin
     boxes: FloatArray
-    footprints: FootprintArrays | None
-    headings: FloatArray
+    footprints: FootprintArrays | None  #: Theirs, or ``None`` where all bodies and robots are discs
+    headings: FloatArray  #: ``(H, F)`` of their bodies and trailers, or ``(H, 0)`` where all are discs
 
 
 def make_scratch(num_robots: int, dimension: int) -> Scratch:

@@ -25,18 +25,12 @@ else:
 
 
 class MovingObstacles(NamedTuple):
-    """Bodies that move along known paths, such as the robots outside a group that is replanned.
+    """Bodies that move along known paths, such as the robots outside a group that is replanned."""
 
-    Attributes:
-        positions: ``(H, O, d)`` where each body is after every step [m].
-        radius: ``(O,)`` [m]; outer radii of bodies that are no discs.
-        footprints: Theirs; ``None`` where all are discs.
-        headings: ``(H, F)`` what turns them and their trailers [rad], or ``None`` where all are discs.
-    """
-
-    positions: FloatArray
-    radius: FloatArray
-    footprints: FootprintArrays | None = None
+    positions: FloatArray  #: ``(H, O, d)`` where each body is after every step [m]
+    radius: FloatArray  #: ``(O,)`` [m]; outer radii of bodies that are no discs
+    footprints: FootprintArrays | None = None  #: Theirs; ``None`` where all are discs
+    #: ``(H, F)`` what turns them and their trailers [rad], or ``None`` where all are discs
     headings: FloatArray | None = None
 
 

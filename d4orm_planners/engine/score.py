@@ -56,49 +56,28 @@ HALF = np.float32(0.5)
 
 
 class Workspace(NamedTuple):
-    """Per-thread workspace to score tiles of ``K`` robots over ``H`` steps.
+    """Per-thread workspace to score tiles of ``K`` robots over ``H`` steps."""
 
-    Attributes:
-        w: ``(K STRIDE,)`` the robots.
-        positions: Their places in a block, see :func:`~d4orm_planners.engine.proximity.position_of`.
-        draws: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block.
-        controls: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block.
-        moved: ``(ARRIVED TILE,)`` one robot's states, moved and not docked yet.
-        keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
-        standing: ``(K,)`` whether a robot has docked in all samples.
-        scratch: Scratch of :mod:`~d4orm_planners.engine.proximity`.
-        poses: ``(F POSES,)`` poses of the ``F`` bodies in a block, or of size zero where all are discs.
-    """
-
-    w: FloatArray
-    positions: FloatArray
-    draws: FloatArray
-    controls: FloatArray
-    moved: FloatArray
-    keys: NDArray[np.uint32]
-    standing: BoolArray
-    scratch: Scratch
-    poses: FloatArray
+    w: FloatArray  #: ``(K STRIDE,)`` the robots
+    positions: FloatArray  #: Their places in a block, see :func:`~d4orm_planners.engine.proximity.position_of`
+    draws: FloatArray  #: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block
+    controls: FloatArray  #: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block
+    moved: FloatArray  #: ``(ARRIVED TILE,)`` one robot's states, moved and not docked yet
+    keys: NDArray[np.uint32]  #: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each
+    standing: BoolArray  #: ``(K,)`` whether a robot has docked in all samples
+    scratch: Scratch  #: Scratch of :mod:`~d4orm_planners.engine.proximity`
+    poses: FloatArray  #: ``(F POSES,)`` poses of the ``F`` bodies in a block, or of size zero where all are discs
 
 
 class Scoring(NamedTuple):
-    """Rules by which samples are scored, in all steps of a run.
+    """Rules by which samples are scored, in all steps of a run."""
 
-    Attributes:
-        arrived: ``(K,)`` bool, docked from the beginning.
-        collisions: Whether robots count when near each other or near a moving body.
-        bodies: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`.
-        bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`.
-        penalties: ``(K,)`` what a violation costs per step.
-        per_pair: Whether it costs so much for every robot and body that is near.
-    """
-
-    arrived: BoolArray
-    collisions: bool
-    bodies: Bodies
-    bounds: FloatArray
-    penalties: FloatArray
-    per_pair: bool
+    arrived: BoolArray  #: ``(K,)`` bool, docked from the beginning
+    collisions: bool  #: Whether robots count when near each other or near a moving body
+    bodies: Bodies  #: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`
+    bounds: FloatArray  #: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`
+    penalties: FloatArray  #: ``(K,)`` what a violation costs per step
+    per_pair: bool  #: Whether it costs so much for every robot and body that is near
 
 
 Score: TypeAlias = Kernel[[ProblemArrays, Scoring, Drawing, IntArray, Workspace, FloatArray, FloatArray], None]

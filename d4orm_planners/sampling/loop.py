@@ -75,15 +75,10 @@ def drive_times(problem: Problem, lengths: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class NextStep:
-    """State from which a run of the sampling loop would go on.
+    """State from which a run of the sampling loop would go on."""
 
-    Attributes:
-        mean: ``(H, K, m)`` mean of the samples.
-        noise_factor: ``(H, K, m)`` factors on their standard deviation.
-    """
-
-    mean: FloatArray
-    noise_factor: FloatArray
+    mean: FloatArray  #: ``(H, K, m)`` mean of the samples
+    noise_factor: FloatArray  #: ``(H, K, m)`` factors on their standard deviation
 
 
 class SamplingPlanner(Planner):

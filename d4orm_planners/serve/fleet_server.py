@@ -48,26 +48,17 @@ TELL = 1.0
 
 @dataclass
 class FleetRobot:
-    """A robot as it was last heard.
+    """A robot as it was last heard."""
 
-    Attributes:
-        name: Name of its topics.
-        heard: When it was last heard, by this process's clock [s].
-        state: ``(n,)`` as last heard; not a number before.
-        heading: As last heard [rad].
-        stand: ``(d,)`` where it is to stand, or is on its way to that, while nobody drives [m].
-        command: ``geometry_msgs/Twist`` that it was given last.
-        velocity: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s].
-        posed: Time by the robot's clock [s] and ``(3,)`` position of the later one [m].
-    """
-
-    name: str
-    state: FloatArray
-    heard: float = -np.inf
-    heading: float = 0.0
-    stand: Floats | None = None
-    command: Any = None
+    name: str  #: Name of its topics
+    state: FloatArray  #: ``(n,)`` as last heard; not a number before
+    heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
+    heading: float = 0.0  #: As last heard [rad]
+    stand: Floats | None = None  #: ``(d,)`` where it is to stand, or is on its way to that, while nobody drives [m]
+    command: Any = None  #: ``geometry_msgs/Twist`` that it was given last
+    #: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s]
     velocity: Floats = field(default_factory=lambda: np.zeros(3))
+    #: Time by the robot's clock [s] and ``(3,)`` position of the later one [m]
     posed: tuple[float, Floats] | None = None
 
     def take_pose(self, stamped: Any, base: float) -> None:

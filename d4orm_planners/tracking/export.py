@@ -39,19 +39,13 @@ AXES = ("x", "y", "z", "yaw")
 
 @dataclass(frozen=True, eq=False)
 class Polynomials:
-    """Pieces of equal duration.
+    """Pieces of equal duration."""
 
-    Attributes:
-        durations: ``(P,)`` [s].
-        coefficients: ``(P, K, 4, 8)`` of x, y, z [m] and yaw [rad], from the constant up, by the time in the piece.
-        deviation: Largest distance from the motion [m].
-        report: What the verification of the polynomials found.
-    """
-
-    durations: Floats
+    durations: Floats  #: ``(P,)`` [s]
+    #: ``(P, K, 4, 8)`` of x, y, z [m] and yaw [rad], from the constant up, by the time in the piece
     coefficients: Floats
-    deviation: float
-    report: VerificationReport
+    deviation: float  #: Largest distance from the motion [m]
+    report: VerificationReport  #: What the verification of the polynomials found
 
     @property
     def num_bytes(self) -> int:

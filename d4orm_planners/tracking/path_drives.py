@@ -26,44 +26,26 @@ from d4orm_planners.tracking.tracker import tracker
 
 
 class Route(NamedTuple):
-    """One robot's path as a row of points.
+    """One robot's path as a row of points."""
 
-    Attributes:
-        points: ``(P, 3)`` float64 [m].
-        times: ``(P,)`` float64 when each is passed, of which only the order counts.
-        bends: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero at sharp
-            corners.
-    """
-
-    points: Floats
-    times: Floats
+    points: Floats  #: ``(P, 3)`` float64 [m]
+    times: Floats  #: ``(P,)`` float64 when each is passed, of which only the order counts
+    #: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero at sharp corners
     bends: Floats
 
 
 class Routes(NamedTuple):
-    """Every robot's route, and the robots that it waits for.
+    """Every robot's route, and the robots that it waits for."""
 
-    Attributes:
-        points: ``(T, 3)`` float64 points of all routes, one robot's after another's [m].
-        times: ``(T,)`` float64, see :class:`Route`.
-        bends: ``(T,)`` float64.
-        first: ``(K + 1,)`` int64 where each robot's begin.
-        arcs: ``(T,)`` float64 length of the route up to each point [m].
-        wait_first: ``(K + 1,)`` int64 where each robot's waits begin.
-        wait_at: int64 points, counted from the robot's first, that it may not come to ...
-        wait_for: ... before this robot ...
-        wait_until: ... has come to this point of its own.
-    """
-
-    points: Floats
-    times: Floats
-    bends: Floats
-    first: IntArray
-    arcs: Floats
-    wait_first: IntArray
-    wait_at: IntArray
-    wait_for: IntArray
-    wait_until: IntArray
+    points: Floats  #: ``(T, 3)`` float64 points of all routes, one robot's after another's [m]
+    times: Floats  #: ``(T,)`` float64, see :class:`Route`
+    bends: Floats  #: ``(T,)`` float64
+    first: IntArray  #: ``(K + 1,)`` int64 where each robot's begin
+    arcs: Floats  #: ``(T,)`` float64 length of the route up to each point [m]
+    wait_first: IntArray  #: ``(K + 1,)`` int64 where each robot's waits begin
+    wait_at: IntArray  #: int64 points, counted from the robot's first, that it may not come to ...
+    wait_for: IntArray  #: ... before this robot ...
+    wait_until: IntArray  #: ... has come to this point of its own.
 
     def each(self) -> list[slice]:
         """The rows of every robot."""
@@ -71,19 +53,12 @@ class Routes(NamedTuple):
 
 
 class Corners(NamedTuple):
-    """Corners of paths, one robot's after another's, each from its start on.
+    """Corners of paths, one robot's after another's, each from its start on."""
 
-    Attributes:
-        positions: ``(C, 3)`` float64 [m].
-        begin: ``(K + 1,)`` int64 where each robot's begin.
-        departs: ``(C,)`` float64 when it sets out for each from the one before.
-        arrives: ``(C,)`` float64 when it gets there.
-    """
-
-    positions: Floats
-    begin: IntArray
-    departs: Floats
-    arrives: Floats
+    positions: Floats  #: ``(C, 3)`` float64 [m]
+    begin: IntArray  #: ``(K + 1,)`` int64 where each robot's begin
+    departs: Floats  #: ``(C,)`` float64 when it sets out for each from the one before
+    arrives: Floats  #: ``(C,)`` float64 when it gets there
 
 
 BRAKING = 0.5
@@ -97,21 +72,13 @@ SLOWEST = 0.1
 
 
 class Progress(NamedTuple):
-    """Progress of robots along their routes.
+    """Progress of robots along their routes."""
 
-    Attributes:
-        at: ``(K,)`` int64 the point of its route that each is at, counted from its first.
-        waits: ``(K,)`` int64 the wait of each that is not over, or where its waits end.
-        targets: ``(K, 3)`` float32 where each heads [m].
-        room: ``(K,)`` float32 how far it may drive on [m].
-        pace: ``(K,)`` float32 how fast [m/s].
-    """
-
-    at: IntArray
-    waits: IntArray
-    targets: FloatArray
-    room: FloatArray
-    pace: FloatArray
+    at: IntArray  #: ``(K,)`` int64 the point of its route that each is at, counted from its first
+    waits: IntArray  #: ``(K,)`` int64 the wait of each that is not over, or where its waits end
+    targets: FloatArray  #: ``(K, 3)`` float32 where each heads [m]
+    room: FloatArray  #: ``(K,)`` float32 how far it may drive on [m]
+    pace: FloatArray  #: ``(K,)`` float32 how fast [m/s]
 
     @classmethod
     def of(cls, routes: Routes) -> Progress:

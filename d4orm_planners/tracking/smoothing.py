@@ -39,19 +39,12 @@ SLOWEST = 4.0
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Most that a robot's controller is asked for, each ``(K,)``; infinite where anything goes.
+    """Most that a robot's controller is asked for, each ``(K,)``; infinite where anything goes."""
 
-    Attributes:
-        speed: [m/s].
-        acceleration: [m/s^2]; of robots with a heading along it.
-        turn_rate: [rad/s].
-        jerk: [m/s^3].
-    """
-
-    speed: Floats
-    acceleration: Floats
-    turn_rate: Floats
-    jerk: Floats
+    speed: Floats  #: [m/s]
+    acceleration: Floats  #: [m/s^2]; of robots with a heading along it
+    turn_rate: Floats  #: [rad/s]
+    jerk: Floats  #: [m/s^3]
 
     @classmethod
     def of(cls, problem: Problem, acceleration: ArrayLike | None = None, jerk: ArrayLike | None = None) -> MotionLimits:
@@ -88,21 +81,13 @@ def _each(name: str, value: ArrayLike | None, otherwise: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:
-    """A team's motion as splines over the plan's own time, driven ``stretch`` times as slowly.
+    """A team's motion as splines over the plan's own time, driven ``stretch`` times as slowly."""
 
-    Attributes:
-        problem: The team and its world.
-        curves: Of :meth:`position`, ``(K, d)`` by the plan's time [m].
-        headings: ``(K,)`` by the plan's time [rad]; zero for robots without one.
-        deviation: Largest distance from the plan at its steps [m].
-        stretch: Times the plan's duration that it takes, at least 1.
-    """
-
-    problem: Problem
-    curves: BSpline
-    headings: BSpline
-    deviation: float
-    stretch: float = 1.0
+    problem: Problem  #: The team and its world
+    curves: BSpline  #: Of :meth:`position`, ``(K, d)`` by the plan's time [m]
+    headings: BSpline  #: ``(K,)`` by the plan's time [rad]; zero for robots without one
+    deviation: float  #: Largest distance from the plan at its steps [m]
+    stretch: float = 1.0  #: Times the plan's duration that it takes, at least 1
 
     @property
     def duration(self) -> float:

@@ -158,19 +158,12 @@ def _robots_by_name(models: tuple[str, ...]) -> tuple[tuple[str, tuple[int, ...]
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Paths that robots could take, each robot alone: ``R`` robots, ``V`` paths each.
+    """Paths that robots could take, each robot alone: ``R`` robots, ``V`` paths each."""
 
-    Attributes:
-        controls: ``(H, R, V, m)``, zero after arrival.
-        states: ``(H+1, R, V, n)``.
-        arrived: ``(R, V)`` bool.
-        dimension: ``d``.
-    """
-
-    controls: FloatArray
-    states: FloatArray
-    arrived: BoolArray
-    dimension: int
+    controls: FloatArray  #: ``(H, R, V, m)``, zero after arrival
+    states: FloatArray  #: ``(H+1, R, V, n)``
+    arrived: BoolArray  #: ``(R, V)`` bool
+    dimension: int  #: ``d``
 
     @property
     def positions(self) -> FloatArray:

@@ -32,21 +32,13 @@ MOST_PENALTY = 5e7
 
 
 class Neighbourhood(NamedTuple):
-    """Surroundings that a team keeps clear of.
+    """Surroundings that a team keeps clear of."""
 
-    Attributes:
-        paths: ``(K, T, d)`` where robots are predicted to be [m].
-        radius: ``(K,)`` of the robots [m].
-        margin: Between surfaces [m].
-        boxes: ``(B, 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`.
-        bounds: ``(2, d)`` of the world, infinite where open [m].
-    """
-
-    paths: Floats
-    radius: Floats
-    margin: float
-    boxes: Floats
-    bounds: Floats
+    paths: Floats  #: ``(K, T, d)`` where robots are predicted to be [m]
+    radius: Floats  #: ``(K,)`` of the robots [m]
+    margin: float  #: Between surfaces [m]
+    boxes: Floats  #: ``(B, 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`
+    bounds: Floats  #: ``(2, d)`` of the world, infinite where open [m]
 
 
 @cached_kernel(**OPTIONS)

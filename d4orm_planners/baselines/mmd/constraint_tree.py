@@ -80,57 +80,34 @@ def first_conflict(positions: Floats, distances: Floats) -> tuple[Whole, Whole, 
 
 
 class Constraint(NamedTuple):
-    """A sphere that one robot's centre has to be out of for some steps.
+    """A sphere that one robot's centre has to be out of for some steps."""
 
-    Attributes:
-        sphere: Centre and radius [m].
-        span: First and last step.
-    """
-
-    sphere: tuple[float, float, float, float]
-    span: tuple[int, int]
+    sphere: tuple[float, float, float, float]  #: Centre and radius [m]
+    span: tuple[int, int]  #: First and last step
 
 
 @dataclass(frozen=True, eq=False)
 class RobotMotion:
-    """Motion of one robot in a node of the tree.
+    """Motion of one robot in a node of the tree."""
 
-    Attributes:
-        motions: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with.
-        controls: ``(H, m)``.
-        positions: ``(H+1, 3)`` [m].
-        cost: Steps until it arrives.
-        fails: Whether it comes too near to an obstacle or does not arrive.
-    """
-
-    motions: FloatArray
-    controls: FloatArray
-    positions: Floats
-    cost: int
-    fails: bool
+    motions: FloatArray  #: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with
+    controls: FloatArray  #: ``(H, m)``
+    positions: Floats  #: ``(H+1, 3)`` [m]
+    cost: int  #: Steps until it arrives
+    fails: bool  #: Whether it comes too near to an obstacle or does not arrive
 
 
 @dataclass(frozen=True, order=True)
 class TreeNode:
-    """A node of the tree; the one to be expanded next is the least.
+    """A node of the tree; the one to be expanded next is the least."""
 
-    Attributes:
-        conflicts: Pairs in conflict, and robots that fail by themselves.
-        cost: Sum of the robots' steps until arrival.
-        number: Of the node, counted as they are made.
-        motions: Of the robots.
-        constraints: Of each robot.
-        pair: Two robots in conflict, or -1.
-        step: Of their conflict.
-    """
-
-    conflicts: int
-    cost: int
-    number: int
-    motions: tuple[RobotMotion, ...] = field(compare=False)
-    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)
-    pair: tuple[int, int] = field(compare=False)
-    step: int = field(compare=False)
+    conflicts: int  #: Pairs in conflict, and robots that fail by themselves
+    cost: int  #: Sum of the robots' steps until arrival
+    number: int  #: Of the node, counted as they are made
+    motions: tuple[RobotMotion, ...] = field(compare=False)  #: Of the robots
+    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)  #: Of each robot
+    pair: tuple[int, int] = field(compare=False)  #: Two robots in conflict, or -1
+    step: int = field(compare=False)  #: Of their conflict
 
     @property
     def controls(self) -> FloatArray:

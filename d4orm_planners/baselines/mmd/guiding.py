@@ -28,29 +28,17 @@ the rest."""
 
 
 class PathSurroundings(NamedTuple):
-    """Constraints on a robot's motion.
+    """Constraints on a robot's motion."""
 
-    Attributes:
-        space: The world.
-        clearance: Distance from obstacles to keep with the robot's centre [m].
-        size: Radius of the largest robot [m].
-        dt: Of the steps [s].
-        spheres: ``(C, 4)`` centre and radius of hard constraints [m].
-        spans: ``(C, 2)`` int64 first and last step of each.
-        others: ``(S, T, 3)`` where other robots are at every step [m].
-        radii: ``(S,)`` distance to keep from each [m].
-        pull: Share of a soft violation that a step takes away; of hard ones it takes away all.
-    """
-
-    space: Space
-    clearance: float
-    size: float
-    dt: float
-    spheres: Floats
-    spans: IntArray
-    others: Floats
-    radii: Floats
-    pull: float
+    space: Space  #: The world
+    clearance: float  #: Distance from obstacles to keep with the robot's centre [m]
+    size: float  #: Radius of the largest robot [m]
+    dt: float  #: Of the steps [s]
+    spheres: Floats  #: ``(C, 4)`` centre and radius of hard constraints [m]
+    spans: IntArray  #: ``(C, 2)`` int64 first and last step of each
+    others: Floats  #: ``(S, T, 3)`` where other robots are at every step [m]
+    radii: Floats  #: ``(S,)`` distance to keep from each [m]
+    pull: float  #: Share of a soft violation that a step takes away; of hard ones it takes away all
 
 
 @register_jitable(nogil=True, **OPTIONS)

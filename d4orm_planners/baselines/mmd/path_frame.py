@@ -36,30 +36,19 @@ _FAR = 4.0
 
 
 class PathFrame(NamedTuple):
-    """A robot's path and the axes in which its motion is described; all float64.
+    """A robot's path and the axes in which its motion is described; all float64."""
 
-    Attributes:
-        reference: ``(POINTS + 1, 3)`` places on the shortest path at equal distances, from start to goal [m].
-        tangents: ``(POINTS + 1, 3)`` its direction at each, corners rounded; of at most unit length.
-        axes: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four
-            across the line from start to goal in space.
-        length: Of the path, at least the goal's radius [m].
-        safety_distance: The distance that the robot's centre keeps from obstacles [m].
-        speed: Limit of the robot [m/s].
-        acceleration: Limit of the robot; for one without inertia, a very large one [m/s^2].
-        quickest: Time that the path takes at full speed from rest [s].
-        features: ``(P, FEATURES)`` what the model is told, per axis.
-    """
-
-    reference: Floats
-    tangents: Floats
+    reference: Floats  #: ``(POINTS + 1, 3)`` places on the shortest path at equal distances, from start to goal [m]
+    tangents: Floats  #: ``(POINTS + 1, 3)`` its direction at each, corners rounded; of at most unit length
+    #: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four across
+    #: the line from start to goal in space
     axes: Floats
-    length: float
-    safety_distance: float
-    speed: float
-    acceleration: float
-    quickest: float
-    features: FloatArray
+    length: float  #: Of the path, at least the goal's radius [m]
+    safety_distance: float  #: The distance that the robot's centre keeps from obstacles [m]
+    speed: float  #: Limit of the robot [m/s]
+    acceleration: float  #: Limit of the robot; for one without inertia, a very large one [m/s^2]
+    quickest: float  #: Time that the path takes at full speed from rest [s]
+    features: FloatArray  #: ``(P, FEATURES)`` what the model is told, per axis
 
 
 def sine_table() -> Floats:

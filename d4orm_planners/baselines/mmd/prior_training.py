@@ -51,15 +51,10 @@ _LEAST = 1e-4
 
 
 class Examples(NamedTuple):
-    """Motions and what the model is told of them.
+    """Motions and what the model is told of them."""
 
-    Attributes:
-        features: ``(E, FEATURES)`` float32.
-        modes: ``(E, 2, MODES)`` float32 differences from the path, ahead and aside, in lengths of the path.
-    """
-
-    features: FloatArray
-    modes: FloatArray
+    features: FloatArray  #: ``(E, FEATURES)`` float32
+    modes: FloatArray  #: ``(E, 2, MODES)`` float32 differences from the path, ahead and aside, in lengths of the path
 
 
 def draw_examples(count: int, seed: int, progress: Callable[[int], object] = lambda done: None) -> Examples:
