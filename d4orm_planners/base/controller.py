@@ -25,7 +25,7 @@ Mode = Literal["nominal", "measured"]
 FEEDBACK = 0.25
 """Share of a distance from the reference that controls are to make up for within a step."""
 BEYOND = 4
-"""Multiple of the state space beyond it at which measured numbers end."""
+"""Distance beyond the state space at which measured numbers are cut off, in sizes of the space."""
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
 
@@ -79,11 +79,11 @@ class Controller:
             or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
             meanwhile, and its answer, which would be too late, is not used. ``None`` waits. A policy that is named and
-            has a ``deadline``, as D4orm-C2F, gets nine tenths of it, and plans anew beside its loops.
+            has a ``deadline``, as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
-            are shifted by what keeps the robots beside the reference, as a thrust that is too weak does, up to the
+            are shifted against a lasting distance from the reference, as a thrust that is too weak causes, up to the
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
             way a step: all at once would ask again for what the robots are about to do.
         **settings: Of the policy.
@@ -223,7 +223,7 @@ class Controller:
         return plausible
 
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
-        parked = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
+        at_rest = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
         self._observer.observe(measured, known)
         if self.tracker:
             self._shift(measured, known)
@@ -231,7 +231,7 @@ class Controller:
             seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
             if not self.over:
                 possible = self._possible(seen)
-                self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, possible))
+                self._observations, _ = self._env.set_state(np.where(at_rest[:, None], self._joint.states, possible))
             measured = measured if self.tracker else seen
         before, actions = self._joint, self._actions()
         moving = before.states if self._leads else measured
@@ -241,14 +241,14 @@ class Controller:
             actions = dict(zip(self._env.possible_agents, brakes)) if actions is None else actions
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
-        controls = self._with_feedback(measured, known if self._leads else known & parked, controls)
+        controls = self._with_feedback(measured, known if self._leads else known & at_rest, controls)
         return self._described(before, self._observer.compensated(controls, self.arrived), held)
 
     def _shift(self, measured: FloatArray, known: BoolArray) -> None:
-        """Shift setpoints against what keeps robots beside the reference, by as much as the margin."""
+        """Shift setpoints against a lasting distance from the reference, at most by the margin."""
         d, margin = self.problem.dimension, self.problem.margin
-        beside = np.where(known[:, None], self._joint.states[:, :d] - measured[:, :d], 0.0)
-        self._lead = np.clip(self._lead + GAIN * beside, -margin, margin)
+        error = np.where(known[:, None], self._joint.states[:, :d] - measured[:, :d], 0.0)
+        self._lead = np.clip(self._lead + GAIN * error, -margin, margin)
 
     def _blended(self, measured: FloatArray) -> FloatArray:
         """``(K, n)`` the reference, moved towards what was measured by a share that the lag allows."""

@@ -22,7 +22,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
-from d4orm_planners.base.policy import Policy
+from d4orm_planners.base.policy import Policy, robot_indices
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -212,8 +212,7 @@ def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> _Outcome:
     """Return the outcome of the last step for all robots, those that have left and may be run into included."""
     step = env.unwrapped.last_step
     outcome = _Outcome(step.rewards.copy(), step.collided, step.margin_violated)
-    for agent, reward in rewards.items():  # as wrappers have made them
-        outcome.rewards[int(agent.rsplit("_", 1)[1])] = reward
+    outcome.rewards[robot_indices(rewards)] = [*rewards.values()]  # as wrappers have made them
     return outcome
 
 

@@ -1,4 +1,4 @@
-"""Policies: what acts in an ``env.step`` loop, from observations and ``env.state()`` alone."""
+"""Policies, which act in an ``env.step`` loop from observations and ``env.state()`` alone."""
 
 from __future__ import annotations
 
@@ -212,8 +212,8 @@ class OpenLoop(StatePolicy):
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         if self.planner is not None:
-            reach = env.unwrapped.options.communication_range
-            planner = self.planner if reach is None else self.planner.within(reach)
+            limit = env.unwrapped.options.communication_range
+            planner = self.planner if limit is None else self.planner.within(limit)
             self.plan = planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
         elif self.plan is not None and self.plan.problem != self.problem:
             raise ValueError(

@@ -46,7 +46,7 @@ from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.tracking.reference_drives import follow_reference, reference_kernel
-from d4orm_planners.tracking.steering import prepare_drives, standing
+from d4orm_planners.tracking.steering import at_rest, prepare_drives
 from d4orm_planners.tracking.tracker import straight_kernel
 
 
@@ -134,7 +134,7 @@ def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
 
 def _index_paths(problem: Problem) -> None:
     """Look for meetings and faults of robots that stay where they are."""
-    states, robots = standing(problem)[0], np.arange(problem.num_robots)
+    states, robots = at_rest(problem)[0], np.arange(problem.num_robots)
     index = PathIndex(states[..., : problem.dimension], problem.team.radius, problem.margin)
     index.pairs()
     index.move(robots, index.positions)

@@ -78,8 +78,8 @@ class Barriers(NamedTuple):
 
     def missing(self, velocities: Array) -> Array:
         """``(R,)`` how much of it velocities ``(K, d)`` lack [m/s]."""
-        standing = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
-        missing: Array = self.least - (self.normals * (standing[self.one] - standing[self.other])).sum(axis=1)
+        padded = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
+        missing: Array = self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
         return missing
 
 

@@ -78,7 +78,7 @@ def rest_of(guidance: CoarsePlan, index: int, factor: int) -> tuple[Problem, Flo
 
 
 LEAST = 5
-"""Waypoints that a subgoal is ahead all the same: nearer ones hardly pull."""
+"""Least number of waypoints that a subgoal is ahead: nearer ones hardly attract."""
 
 _SHARES = np.linspace(0, 1, 9)[1:]
 """Shares of the straight line at which its clearance from obstacles is looked at."""
@@ -88,60 +88,62 @@ def visible_subgoals(
     problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, arrived: BoolArray,
     walls: bool,
 ) -> IntArray:  # fmt: skip
-    """``(K,)`` the furthest waypoints up to its subgoal that each robot can drive to straight, past what is at rest.
+    """``(K,)`` the furthest waypoint up to its subgoal that each robot can drive to straight, past all that is at rest.
 
-    A subgoal behind a corner, or behind a robot that has docked, would hold it there. Robots at ``positions``
-    ``(K, d)`` are at the waypoints ``indices`` ``(K,)`` of ``path`` ``(H+1, K, d)`` [m] and head for ``targets``
-    ``(K,)``; those ``arrived`` ``(K,)`` are at rest, and with ``walls`` obstacles count too.
+    A robot would get stuck on its way to a subgoal behind a corner, or behind a robot that has arrived.
+
+    Args:
+        problem: The problem.
+        positions: ``(K, d)`` of the robots [m].
+        path: ``(H+1, K, d)`` waypoints [m].
+        indices: ``(K,)`` the robots' own.
+        targets: ``(K,)`` their subgoals.
+        arrived: ``(K,)`` robots at rest.
+        walls: Whether obstacles count too.
     """
-    radius, standing = np.asarray(problem.team.radius), np.flatnonzero(arrived)
+    radius, resting = np.asarray(problem.team.radius), np.flatnonzero(arrived)
     result = targets.copy()
     waiting = np.flatnonzero(~arrived & (targets > indices + LEAST))
     while len(waiting):
         offset = path[result[waiting], waiting] - positions[waiting]
-        blocked = _meets_standing(
-            positions[waiting], offset, radius[waiting] + problem.margin / 2, positions[standing], radius[standing]
-        )
+        width = radius[waiting] + problem.margin / 2
+        blocked = _meets_resting(positions[waiting], offset, width, positions[resting], radius[resting])
         if walls:
             points = positions[waiting] + _SHARES[:, None, None] * offset
             clearance = problem.world.clearance(points.reshape(-1, points.shape[-1])).reshape(points.shape[:-1])
-            blocked |= (clearance <= radius[waiting] + problem.margin / 2).any(axis=0)
+            blocked |= (clearance <= width).any(axis=0)
         waiting = waiting[blocked]
         result[waiting] -= 1
         waiting = waiting[result[waiting] > indices[waiting] + LEAST]
     return result
 
 
-def _meets_standing(
-    begin: FloatArray, offset: FloatArray, safety_distance: FloatArray, others: FloatArray, radius: FloatArray
+def _meets_resting(
+    begin: FloatArray, offset: FloatArray, width: FloatArray, others: FloatArray, radius: FloatArray
 ) -> BoolArray:
-    """``(N,)`` whether the straight path from ``begin`` by ``offset`` comes within reach of one of the others."""
+    """``(N,)`` whether a straight path from ``begin`` by ``offset``, so wide to either side, meets another robot."""
     gap = others - begin[:, None]
     square = (offset**2).sum(axis=1)[:, None]
     share = np.clip((gap * offset[:, None]).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)
     away = ((gap - share[:, :, None] * offset[:, None]) ** 2).sum(axis=2)
-    meets: BoolArray = (away <= (safety_distance[:, None] + radius) ** 2).any(axis=1)
+    meets: BoolArray = (away <= (width[:, None] + radius) ** 2).any(axis=1)
     return meets
 
 
 STUCK_WITHIN, STUCK_AFTER = 3, 25
-"""Progress without which a robot is stuck: so many waypoints in so many time steps."""
-
+"""Waypoints that a robot must pass in so many time steps, or else is stuck."""
 BARRED_AFTER = 8
-"""The same for robots whose paths lead through those at rest for good."""
-
+"""The same number of steps for robots whose paths lead through others at rest for good."""
 WAITING_WITHIN = 1.0
-"""A robot this near to where it should be by now waits, in radii of the largest one."""
-
+"""Distance from its present waypoint within which a robot waits, in radii of the largest one."""
 CAREFUL_FOR = 30
 """Steps for which a robot that was stuck follows its path."""
-
 CATCHING_UP = 2.0
-"""Share of its lag that a robot makes good in a second [1/s]."""
+"""Share of its lag that a robot makes up for in a second [1/s]."""
 
 
 class StagnationMonitor:
-    """Watches an episode for robots that do not get on along their paths.
+    """Detects robots that make no progress along their paths.
 
     Args:
         joint: Their first state.
@@ -158,7 +160,7 @@ class StagnationMonitor:
         Args:
             step: Time step.
             indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
-            waiting: ``(K,)`` robots that are where they should be by now, or ahead of the team.
+            waiting: ``(K,)`` robots that are on time, or ahead of the team.
         """
         moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
         self._indices[moved], self._since[moved] = indices[moved], step
@@ -168,7 +170,7 @@ class StagnationMonitor:
 
 
 def keep_time(problem: Problem, joint: JointState, path: FloatArray, indices: IntArray, horizon: int) -> FloatArray:
-    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time, as if none docked.
+    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time, as if it had no goal.
 
     Of ``path`` ``(H+1, K, d)``, which has a waypoint per time step of the problem [m], they should be at ``indices``
     ``(K,)`` now; from elsewhere they catch up.

@@ -19,7 +19,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.candidate import PLAN_REACH
+from d4orm_planners.base.candidate import MOST_OF_LIMIT
 
 MAGIC = b"D4DC"
 VERSION = 1
@@ -83,7 +83,7 @@ def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
 
     Raises:
         MessageError: If it is anything but a message of this version with finite controls, none beyond
-            :data:`~d4orm_planners.base.candidate.PLAN_REACH`, for this problem from one of the nodes.
+            :data:`~d4orm_planners.base.candidate.MOST_OF_LIMIT`, for this problem from one of the nodes.
     """
     if len(data) > MAX_BYTES:
         raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")
@@ -120,8 +120,8 @@ def _checked(controls: FloatArray, shape: tuple[int, ...], reward: float, proble
     if not (np.isfinite(controls).all() and np.isfinite(reward)):
         raise MessageError("not_finite", "a control or the reward is not finite")
     controls = controls.reshape(shape)
-    if (np.abs(controls) > PLAN_REACH * problem.team.control_limits).any():
-        raise MessageError("limits", f"a control is more than {PLAN_REACH:g} times its limit")
+    if (np.abs(controls) > MOST_OF_LIMIT * problem.team.control_limits).any():
+        raise MessageError("limits", f"a control is more than {MOST_OF_LIMIT:g} times its limit")
     return controls
 
 

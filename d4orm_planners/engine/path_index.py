@@ -79,7 +79,7 @@ class PathIndex:
 
         Args:
             robots: ``(R,)``.
-            states: ``(R, V, H+1, n)`` states, or just places.
+            states: ``(R, V, H+1, n)`` states, or just positions.
             until: ``(R,)`` the last step that counts, or ``None`` for the horizon.
 
         Returns:
@@ -182,7 +182,7 @@ def _count_meetings(
             for v in range(num_paths):
                 middle, spread = enclose(paths[r, v], table.positions.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
-                    continue  # Nothing is other than it was in the block before.
+                    continue  # Nothing has moved since the block before.
                 count, soonest = _mark_near(table, robot, paths[r, v], middle, spread, block, met[v])
                 counts[r, v], when[r, v] = counts[r, v] + count, min(when[r, v], soonest)
 
@@ -198,7 +198,7 @@ def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) ->
     Args:
         arrays: The problem.
         robots: ``(R,)``.
-        states: ``(R, V, H+1, n)`` states, or just places.
+        states: ``(R, V, H+1, n)`` states, or just positions.
 
     Returns:
         ``(3, R, V)`` steps: the first after the start within the margin of an obstacle or the bounds; the last that
@@ -223,7 +223,7 @@ def _check_alone(
             path, last, touching, unsure = paths[r, v], never - 1, never, never
             while last > 0 and _is_same_position(path, dimension, last):
                 last -= 1
-            # Where it stands from then on it is no nearer to anything.
+            # From then on it is at rest, and no nearer to anything.
             for t in range(max(last, 1), 0, -1):
                 if closed and touches_static(arrays, safety_distance, path[t, :dimension]):
                     touching = t
@@ -242,7 +242,7 @@ def _is_same_position(path: FloatArray, dimension: int, t: int) -> bool:
 
 @inlined
 def is_unsure(arrays: ProblemArrays, position: FloatArray, goal: FloatArray) -> bool:
-    """Check whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
+    """Check whether rounding may decide, here or in the verification, if a robot at this position is at its goal."""
     gap2, extent = 0.0, 0.0
     for axis in range(goal.shape[0]):
         gap = np.float64(position[axis]) - np.float64(goal[axis])

@@ -122,16 +122,12 @@ def first_near(
 ) -> int:
     """The first step of a block at which a robot is within the margin of another, in float64; 0 if at none.
 
-    Its path begins with its place at step ``begin``.
+    Its path begins with its position at step ``begin``.
     """
     safety_distance = table.radius[robot] + table.radius[other] + table.margin
     x, y, z = table.middle[block, other]
-    x, y, z, far = (
-        x - middle[0],
-        y - middle[1],
-        z - middle[2],
-        _WIDER * (safety_distance + spread + table.spread[block, other]),
-    )
+    x, y, z = x - middle[0], y - middle[1], z - middle[2]
+    far = _WIDER * (safety_distance + spread + table.spread[block, other])
     if x * x + y * y + z * z > far * far:
         return 0
     first, last = steps_of(table, block)

@@ -164,15 +164,10 @@ class SamplingPlanner(Planner):
         """``(H, K, m)`` the controls, with final approaches where robots must slow down for their goals."""
         if not self.config.final_approach or np.isinf(search.problem.goal_speed).all():
             return controls
-        return with_final_approaches(search, controls)
-
-
-def with_final_approaches(search: SolveRun, controls: FloatArray) -> FloatArray:
-    """``(H, K, m)`` controls with which robots turn straight to their goals, where that is no worse."""
-    trajectory = search.engine.rollout(search.problem, controls)
-    team = WorkingPlan(search, trajectory)
-    approach_goals(team, np.arange(search.problem.num_robots), search.problem, trajectory)
-    return team.controls
+        trajectory = search.engine.rollout(search.problem, controls)
+        team = WorkingPlan(search, trajectory)
+        approach_goals(team, np.arange(search.problem.num_robots), search.problem, trajectory)
+        return team.controls
 
 
 def conflict_groups(search: SolveRun) -> Groups:

@@ -160,7 +160,7 @@ class ContinuationSettings(CheckedSettings):
 
     Attributes:
         clip_between_iterations: Start the next iteration from the controls as executed, inside the limits, rather than
-            as the last one left them. Either way they are zero once docked.
+            as the last one left them. Either way they are zero after arrival.
     """
 
     clip_between_iterations: bool = False

@@ -96,12 +96,12 @@ RouteStep: TypeAlias = Kernel[[ProblemArrays, IntArray, Progress, BoolArray, Flo
 def direct(
     routes: Routes,
     paces: Floats,
-    sights: Floats,
+    lookahead: Floats,
     dt: float,
     beyond: float,
     size: float,
     positions: Floats,
-    standing: BoolArray,
+    at_rest: BoolArray,
     progress: Progress,
 ) -> None:
     """Set the next target of all robots.
@@ -109,19 +109,19 @@ def direct(
     Args:
         routes: The routes.
         paces: ``(T,)`` how fast each point may be passed [m/s].
-        sights: ``(K,)`` how far ahead robots look at least [m].
+        lookahead: ``(K,)`` least distance ahead at which robots look [m].
         dt: Time step [s].
         beyond: Distance beyond their goals that robots may plan to drive, if these stop them [m].
         size: The radius of the largest robot [m].
         positions: ``(K, 3)`` float64 where they are [m].
-        standing: ``(K,)`` bool: docked, and so at the end of its route.
+        at_rest: ``(K,)`` bool: arrived, and so at the end of its route.
         progress: Changed in place.
     """
     points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
         i = point_reached(points, arcs, first + progress.at[k], last, positions[k], size)
-        progress.at[k] = (last if standing[k] else i) - first
+        progress.at[k] = (last if at_rest[k] else i) - first
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
         wait, end = progress.waits[k], routes.wait_first[k + 1]
@@ -130,7 +130,7 @@ def direct(
         progress.waits[k] = wait
         i, here = first + progress.at[k], positions[k]
         limit = last if wait == end else max(first + routes.wait_at[wait] - 1, i)
-        target = point_ahead(routes, paces, i, limit, np.inf, (sights[k], dt), here, size)
+        target = point_ahead(routes, paces, i, limit, np.inf, (lookahead[k], dt), here, size)
         progress.targets[k, 0], progress.targets[k, 1] = points[target, 0], points[target, 1]
         progress.targets[k, 2] = points[target, 2]
         room = RESERVE * (arcs[limit] - arcs[i])
@@ -213,12 +213,12 @@ def drive_routes(problem: Problem, routes: Routes, most_steps: int) -> tuple[Flo
     states, arrived = np.stack([problem.start, problem.start]), np.zeros(num_robots, bool)
     positions, progress = np.zeros((most_steps + 1, num_robots, 3)), Progress.of(routes)
     arrivals = np.full(num_robots, most_steps + 1, np.int64)
-    sights, beyond, size = lookaheads(problem), beyond_goal(problem), problem.team.largest_radius
+    lookahead, beyond, size = lookaheads(problem), beyond_goal(problem), problem.team.largest_radius
     parts = [(route_kernel(model.name), np.array(robots)) for model, robots in by_model(problem)]
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
         positions[steps, :, :d] = states[0, :, :d]
-        direct(routes, paces, sights, problem.dt, beyond, size, positions[steps], arrived & problem.docks, progress)
+        direct(routes, paces, lookahead, problem.dt, beyond, size, positions[steps], arrived & problem.docks, progress)
         # Without docking a robot may come through its goal before it has made way for others.
         done = arrived & (problem.docks | (progress.at == ends))
         arrivals[:] = np.where(done, np.minimum(arrivals, steps), most_steps + 1)
@@ -239,9 +239,9 @@ def beyond_goal(problem: Problem) -> float:
 
 
 def paces_along(problem: Problem, robot: int, arcs: Floats, bends: Floats, share: float = BRAKING) -> Floats:
-    """``(P,)`` how fast a robot may pass each point of its route [m/s], from their places along it and their bends.
+    """``(P,)`` speeds at which a robot may pass the points of its route, with a share of its acceleration [m/s].
 
-    It counts on that share of its acceleration.
+    ``arcs`` and ``bends`` are as in :class:`Routes`.
     """
     model, limits = problem.team.robot_models[robot], np.asarray(problem.team.limits[robot], np.float64)
     corner = np.sqrt(share * limits[ACCELERATION] * bends)

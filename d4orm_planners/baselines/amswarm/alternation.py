@@ -3,8 +3,8 @@
 After V. K. Adajania, S. Zhou, A. K. Singh and A. P. Schoellig, *AMSwarm: An alternating minimization approach for safe
 motion planning of quadrotor swarms in cluttered environments* (ICRA 2023). A body at ``x_j`` is kept clear of by
 ``p = x_j + d w``, a unit vector ``w`` (which the publication writes by its angles) and a distance ``d`` of at least the
-reach; velocity and acceleration are a direction and a length within the limits. With directions and lengths held, the
-coefficients follow from one linear system; with coefficients held, directions and lengths are closed forms.
+safety distance; velocity and acceleration are a direction and a length within the limits. With directions and lengths
+held, the coefficients follow from one linear system; with coefficients held, directions and lengths are closed forms.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def alternate(
     motion: Floats,
     guess: Guess,
 ) -> float:
-    """Alternate until no constraint is violated and no place moves, to the tolerance, or as often as may be.
+    """Alternate until no constraint is violated and no position changes, to the tolerance, or as often as may be.
 
     Args:
         method: :class:`Method`.
@@ -132,8 +132,9 @@ def _project(
     guess: Guess,
     targets: Targets,
 ) -> float:
-    """The nearest places, velocities and accelerations that limits and the bodies ``minded`` ``(K + B,)`` allow, summed
-    into ``targets``; the largest violation. The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`.
+    """Sum the nearest samples that limits and the bodies ``minded`` ``(K + B,)`` allow into ``targets``.
+
+    The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`. Returns the largest violation.
     """
     robots, (steps, d), radius = len(bodies.radius), guess.position.shape, bodies.radius[robot]
     worst = _stay_within(bodies.bounds, radius, limits, guess, targets)
@@ -175,7 +176,7 @@ def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, ta
 
 @compiled
 def _gap(position: Floats, low: Floats, high: Floats) -> float:
-    """Return the distance of a place from a box, zero within."""
+    """Distance of a position from a box, zero within."""
     square = 0.0
     for axis in range(len(position)):
         gap = max(low[axis] - position[axis], position[axis] - high[axis], 0.0)

@@ -68,20 +68,20 @@ class Method(NamedTuple):
     position: Floats  #: ``(T, n+1)`` see :class:`Basis`
     velocity: Floats  #: ``(T, n+1)``
     acceleration: Floats  #: ``(T, n+1)``
-    #: ``(4, n+1, n+1)`` of the constraints on places, velocities and accelerations the sums of squares over all steps,
-    #: and the objective's
+    #: ``(4, n+1, n+1)`` sums of squares over all steps: of the constraints on positions, velocities and accelerations,
+    #: and of the objective
     squares: Floats
     goal: Floats  #: ``(n+1,)`` what the objective wants of the coefficients, per metre of goal
-    barrier: float  #: Share ``gamma`` of its distance to a body's reach that a robot may use up in a step
-    lookout: float  #: Bodies are minded that come this near to the reach [m]
+    barrier: float  #: Share ``gamma`` of its distance beyond the safety distance that a robot may use up in a step
+    lookout: float  #: Bodies are avoided that come within the safety distance and this [m]
     penalty: float  #: First weight ``rho`` of the constraints
     growth: float  #: Factor by which it grows from one alternation to the next
     alternations: int  #: At most
-    tolerance: float  #: Largest violation, and change of a place, at which it ends, in SI units
+    tolerance: float  #: Largest violation, and change of a position, at which it ends, in SI units
 
 
 class Guess(NamedTuple):
-    """Samples of a motion at steps 1 to T, each ``(T, d)``: places [m], velocities [m/s], accelerations [m/s^2]."""
+    """Samples of a motion at steps 1 to T, each ``(T, d)``: positions [m], velocities [m/s], accelerations [m/s^2]."""
 
     position: Floats
     velocity: Floats
@@ -148,7 +148,7 @@ def solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
 
 @compiled
 def sample(method: Method, motion: Floats, guess: Guess) -> float:
-    """Make the guess the samples of a motion; return how far a place moved at most along an axis [m]."""
+    """Make the guess the samples of a motion; return the largest change of a position along an axis [m]."""
     (steps, size), d, change = method.position.shape, motion.shape[1], 0.0
     for step in range(steps):
         for axis in range(d):

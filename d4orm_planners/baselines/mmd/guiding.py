@@ -106,7 +106,7 @@ def guide(
 
 @compiled
 def _violation(surroundings: PathSurroundings, step: Whole, spot: Floats, push: Floats) -> bool:
-    """Fill ``push`` ``(3,)`` with what would end a place's violations at a step [m]; whether there are any."""
+    """Fill ``push`` ``(3,)`` with what would end a position's violations at a step [m]; whether there are any."""
     push[:] = 0.0
     position, aside = spot[0], spot[2]
     violated = False
@@ -123,7 +123,7 @@ def _violation(surroundings: PathSurroundings, step: Whole, spot: Floats, push: 
 
 @compiled
 def _push_clear(space: Space, clearance: float, probe: float, spot: Floats, push: Floats) -> bool:
-    """Add to ``push`` what brings a place out of obstacles, on the side where the path is; whether it is too near."""
+    """Add to ``push`` what brings a position out of obstacles on the side of the path; whether it is too near."""
     x, y, z = spot[0, 0], spot[0, 1], spot[0, 2]
     missing = clearance - clearance_at(space, x, y, z)
     if not missing > 0.0:
@@ -147,7 +147,7 @@ def _push_clear(space: Space, clearance: float, probe: float, spot: Floats, push
 
 @compiled
 def _push_out(centre: Floats, radius: float, share: float, aside: Floats, position: Floats, push: Floats) -> bool:
-    """Add to ``push`` that share of what brings a place out of a sphere; whether it is in it."""
+    """Add to ``push`` that share of what brings a position out of a sphere; whether it is in it."""
     dx, dy, dz = position[0] - centre[0], position[1] - centre[1], position[2] - centre[2]
     square = dx * dx + dy * dy + dz * dz
     if not square < radius * radius or share == 0.0:

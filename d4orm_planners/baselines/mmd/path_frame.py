@@ -24,7 +24,7 @@ POINTS = 64
 MODES = 16
 """Sines that a difference from the path is made of."""
 LOOKS = 16
-"""Places along the path at which the model is told of the path and of the room beside it."""
+"""Points along the path at which the model is told of the path and of the room beside it."""
 FEATURES = 5 * LOOKS + 2
 """Numbers that the model is told."""
 _ROUNDING = 2
@@ -32,13 +32,13 @@ _ROUNDING = 2
 _ANY = 1e6
 """Rate at which robots that take any velocity at once could reach their full speed [1/s]."""
 _FAR = 4.0
-"""Largest room that the model is told of, in robots' reach."""
+"""Largest clearance that the model is told of, in safety distances."""
 
 
 class PathFrame(NamedTuple):
     """A robot's path and the axes in which its motion is described; all float64."""
 
-    reference: Floats  #: ``(POINTS + 1, 3)`` places on the shortest path at equal distances, from start to goal [m]
+    reference: Floats  #: ``(POINTS + 1, 3)`` positions on the shortest path at equal distances, from start to goal [m]
     tangents: Floats  #: ``(POINTS + 1, 3)`` its direction at each, corners rounded; of at most unit length
     #: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four across
     #: the line from start to goal in space
@@ -99,10 +99,8 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> Path
     path[:, : problem.dimension] = corners
     reference = np.empty((POINTS + 1, 3))
     length = max(resample(path, reference), problem.goal_radius)
-    limits, safety_distance = (
-        problem.team.limits[robot].astype(np.float64),
-        float(problem.team.radius[robot]) + problem.margin,
-    )
+    limits = problem.team.limits[robot].astype(np.float64)
+    safety_distance = float(problem.team.radius[robot]) + problem.margin
     speed = float(limits[SPEED])
     acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY * speed
     tangents = np.empty_like(reference)
@@ -182,7 +180,7 @@ def round_tangents(reference: Floats, tangents: Floats) -> None:
 def locate(
     frame: PathFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, i: int, spot: Floats
 ) -> None:
-    """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its place on the way [m].
+    """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its point on the path [m].
 
     Args:
         frame: The robot's path.

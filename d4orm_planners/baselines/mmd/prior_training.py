@@ -97,7 +97,7 @@ def modes_of(frame: PathFrame, positions: Floats) -> Floats:
 
 
 def _motions(seed: int) -> Iterator[tuple[PathFrame, Floats]]:
-    """Frames and ``(POINTS + 1, 3)`` places at equal times from start to arrival."""
+    """Frames and ``(POINTS + 1, 3)`` positions at equal times from start to arrival."""
     random, number = np.random.default_rng(seed), seed
     while True:
         kind, settings = KINDS[number % len(KINDS)]

@@ -69,7 +69,7 @@ def fill_clock(
 class TrackedMotions(NamedTuple):
     """Rollouts along ``B`` motions."""
 
-    controls: FloatArray  #: ``(B, H, m)`` float32, zero once docked
+    controls: FloatArray  #: ``(B, H, m)`` float32, zero after arrival
     states: FloatArray  #: ``(B, H+1, n)`` float32, from the first step on
     positions: Floats  #: ``(B, H+1, 3)`` [m]
     arrivals: IntArray  #: ``(B,)`` int64 the step of arrival; ``H + 1`` for none
