@@ -209,18 +209,7 @@ def denoise(
 def denoise_around_rest(
     problem: Problem, noise_scale: ArrayLike, num_samples: int, temperature: float, seed: int, collisions: bool = True
 ) -> FloatArray:
-    """:func:`denoise` of a problem from zero controls, back on the host.
-
-    Args:
-        problem: A team of one model.
-        noise_scale: ``(N,)``.
-        num_samples: ``M``.
-        temperature: ``lambda``.
-        seed: Seed of the noise.
-        collisions: As in :func:`denoise`.
-
-    Returns:
-        ``(H, K, m)`` controls.
+    """``(H, K, m)`` controls of :func:`denoise` from zero, for a problem whose robots have one model.
 
     Raises:
         ValueError: If the team mixes models.

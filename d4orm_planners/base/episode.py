@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -200,31 +200,26 @@ def _moved_by(env: ParallelEnv, physics: str) -> ParallelEnv:
     return physics_module(physics).parallel_env(**env.options.keywords())
 
 
-class _Outcome(NamedTuple):
-    """Outcome of a step for every robot, each ``(K,)``."""
-
-    rewards: FloatArray
-    collided: BoolArray
-    margin_violated: BoolArray
-
-
-def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> _Outcome:
-    """Return the outcome of the last step for all robots, those that have left and may be run into included."""
+def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """``(K,)`` rewards, contacts and margin violations of the last step, of robots that have left the episode too."""
     step = env.unwrapped.last_step
-    outcome = _Outcome(step.rewards.copy(), step.collided, step.margin_violated)
-    outcome.rewards[robot_indices(rewards)] = [*rewards.values()]  # as wrappers have made them
-    return outcome
+    all_rewards = step.rewards.copy()
+    all_rewards[robot_indices(rewards)] = [*rewards.values()]  # as wrappers have made them
+    return all_rewards, step.collided, step.margin_violated
 
 
-def _trajectory(problem: Problem, joints: list[JointState], outcomes: list[_Outcome]) -> Trajectory:
+def _trajectory(
+    problem: Problem, joints: list[JointState], outcomes: list[tuple[FloatArray, BoolArray, BoolArray]]
+) -> Trajectory:
     """Join the reset and all steps to one trajectory."""
     states = np.stack([joint.states for joint in joints])
+    rewards, collided, margin_violated = map(np.stack, zip(*outcomes))
     return Trajectory(
         states=states,
         positions=states[..., : problem.dimension],
         controls=np.stack([joint.controls for joint in joints[1:]]),
-        rewards=np.stack([outcome.rewards for outcome in outcomes[1:]]),
+        rewards=rewards[1:],
         arrived=np.stack([joint.arrived for joint in joints]),
-        collided=np.stack([outcome.collided for outcome in outcomes]),
-        margin_violated=np.stack([outcome.margin_violated for outcome in outcomes]),
+        collided=collided,
+        margin_violated=margin_violated,
     )

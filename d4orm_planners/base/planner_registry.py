@@ -37,19 +37,14 @@ def list_policies() -> tuple[str, ...]:
     return (*PLANNERS, *POLICIES)
 
 
-def describe_planner(name: str) -> str:
-    """The first line of a planner's documentation."""
-    return _summary(_planner_class(name))
-
-
 def preset_names(name: str) -> tuple[str, ...]:
     """The presets of a planner or policy."""
     return tuple(_presets(find_policy(name)))
 
 
 def describe_policy(name: str) -> str:
-    """The first line of a policy's documentation."""
-    return _summary(find_policy(name))
+    """The first line of a planner's or policy's documentation."""
+    return (find_policy(name).__doc__ or "").strip().partition("\n")[0]
 
 
 def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None = None, **config: object) -> Planner:
@@ -279,7 +274,3 @@ def _time_limit(config: dict[str, object]) -> float | None:
 def _called(thing: object) -> str:
     """Return the name of a policy for messages."""
     return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
-
-
-def _summary(kind: object) -> str:
-    return (kind.__doc__ or "").strip().partition("\n")[0]

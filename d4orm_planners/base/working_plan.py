@@ -7,9 +7,9 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
@@ -26,8 +26,6 @@ else:
 
 MISSED_GOAL = 5
 """Cost of not arriving, or of touching an obstacle, in robots met."""
-
-Costs = NDArray[np.float64]
 
 
 class WorkingPlan:
@@ -90,7 +88,7 @@ class WorkingPlan:
         if self._checked is not self.index:
             self._checked.move(index, states[:: self._interval, :, : self.problem.dimension])
 
-    def faults(self, robots: ArrayLike) -> tuple[Costs, IntArray]:
+    def faults(self, robots: ArrayLike) -> tuple[Floats, IntArray]:
         """``(R,)`` present faults of robots ``(R,)`` at the steps that are checked, and ``(R,)`` the step of the first.
 
         They are counted in robots met: a missed goal and contact with an obstacle amount to :data:`MISSED_GOAL`, an
@@ -120,7 +118,7 @@ class WorkingPlan:
             if costs[1 + best] < (np.floor(present) + 1 if or_longer else present):
                 self.move([robot], paths.controls[:, [i], best], paths.states[:, [i], best], paths.arrived[[i], best])
 
-    def _path_costs(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Costs:
+    def _path_costs(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Floats:
         """``(1 + V,)`` costs of a robot's present path and of others ``(V, H+1, d)``; all zero if they are the same."""
         positions = np.concatenate([self.positions[None, :, robot], paths])
         arrives = np.append(self.arrived[robot], arrived)
@@ -130,10 +128,10 @@ class WorkingPlan:
         different, which = np.unique(same, return_inverse=True)
         if len(different) == 1:
             return np.zeros(len(positions))
-        costs: Costs = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
+        costs: Floats = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
         return costs
 
-    def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:
+    def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Floats, IntArray]:
         """``(R, V)`` faults of paths ``(R, V, H+1, d)``, plus the share of the horizon that they take, less than one;
         and the step of the first fault.
         """

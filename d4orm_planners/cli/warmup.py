@@ -119,7 +119,7 @@ def average_once(models: tuple[str, ...]) -> None:
     """Weigh and average samples, which a process that scores them needs last."""
     problem = _smallest_problem(models)
     rewards = np.zeros((1, 2), np.float32)
-    run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
+    run = Sampling(SamplingTask(problem, _no_controls(problem)), rewards.size, 0, Threads(1))
     run.moments(_RULES.weights(rewards, np), with_second=False)
 
 

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.caching import cached_kernel
@@ -29,8 +28,6 @@ EXACT = 1e-6
 
 _STEP = 1 / 150
 """Step for the direction away from an obstacle, in radii of the largest robot."""
-
-Array = NDArray[np.float64]
 
 
 def safe_velocities(
@@ -73,13 +70,13 @@ class Barriers(NamedTuple):
 
     one: IntArray  #: ``(R,)`` robots
     other: IntArray  #: ``(R,)`` robots
-    normals: Array  #: ``(R, d)`` unit vectors
-    least: Array  #: ``(R,)`` [m/s]
+    normals: Floats  #: ``(R, d)`` unit vectors
+    least: Floats  #: ``(R,)`` [m/s]
 
-    def missing(self, velocities: Array) -> Array:
+    def missing(self, velocities: Floats) -> Floats:
         """``(R,)`` how much of it velocities ``(K, d)`` lack [m/s]."""
         padded = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
-        missing: Array = self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
+        missing: Floats = self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
         return missing
 
 
@@ -90,9 +87,9 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     acceleration, speed = (problem.team.limits[:, limit].astype(np.float64) for limit in (ACCELERATION, SPEED))
     at_once = np.array([model.first_order for model in problem.team.robot_models])
     braking = np.where(free, np.where(at_once, speed / problem.dt, acceleration), 0)
-    rows: list[tuple[int, int, Array, float]] = []
+    rows: list[tuple[int, int, Floats, float]] = []
 
-    def add(one: int, other: int, normal: Array, room: float, brakes: float, speed: float = 0.0) -> None:
+    def add(one: int, other: int, normal: Floats, room: float, brakes: float, speed: float = 0.0) -> None:
         if room > 0:
             lost = brakes * reaction
             # Nobody has to back off as long as there is room: whoever stands keeps to everything.
@@ -164,7 +161,7 @@ def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any
     return False
 
 
-def _walls(problem: Problem, positions: Array, robots: list[int], near: float) -> Iterator[tuple[int, Array, float]]:
+def _walls(problem: Problem, positions: Floats, robots: list[int], near: float) -> Iterator[tuple[int, Floats, float]]:
     """Yield what is near robots at ``positions`` ``(R, d)``: which robot, the direction away from it, the distance."""
     d, (lower, upper), shapes = problem.dimension, problem.world.bounds.astype(np.float64), problem.world.shapes
     axes = np.eye(d)

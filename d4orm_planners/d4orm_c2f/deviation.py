@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.types import Engine
@@ -46,9 +45,9 @@ class StateFilter:
         shape = len(self._models), problem.state_size
         self._variance, self._covariance = np.zeros((2, *shape))
         self._count = np.zeros(len(self._models))
-        self._before: NDArray[np.float64] | None = None
+        self._before: Floats | None = None
 
-    def gains(self) -> NDArray[np.float64]:
+    def gains(self) -> Floats:
         """``(models, n)`` gains of the measurements."""
         count = np.maximum(self._count, 1)[:, None]
         total = self._variance / count
@@ -57,7 +56,7 @@ class StateFilter:
         ahead = (walk + np.sqrt(walk**2 + 4 * walk * noise)) / 2
         believed = np.maximum(ahead / np.maximum(ahead + noise, np.finfo(np.float64).tiny), MIN_FILTER_GAIN)
         known = (count >= MIN_DIFFERENCES) & (noise > MIN_NOISE_SHARE * total)
-        gains: NDArray[np.float64] = np.where(known, believed, 1.0)
+        gains: Floats = np.where(known, believed, 1.0)
         return gains
 
     def update(self, measured: FloatArray, led_to: FloatArray, expected: FloatArray, going: BoolArray) -> FloatArray:

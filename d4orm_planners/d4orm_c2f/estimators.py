@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.robot_model import ACCELERATION, STANDARD_LIMITS
@@ -32,7 +31,7 @@ GAIN_STEP = 0.05
 """Resolution of the shares of the limits that are kept back."""
 
 
-def effort(problem: Problem, controls: FloatArray | NDArray[np.float64]) -> NDArray[np.float64]:
+def effort(problem: Problem, controls: FloatArray | Floats) -> Floats:
     """``(K,)`` how large controls ``(K, m)`` are, in shares of the robots' limits."""
     limits = np.asarray(problem.team.control_limits, np.float64)
     shares = np.divide(controls, limits, out=np.zeros_like(limits), where=limits > 0)
@@ -83,7 +82,7 @@ class ActuatorGainEstimator:
             self._share = share
             self.problem = self._first.with_state(self._first.start, self._first.goal, team=self._team(share))
 
-    def _persistent(self, added: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _persistent(self, added: Floats) -> Floats:
         """``(K,)`` effort that is added for some time, now that ``added`` ``(K, m)`` is."""
         rate = max(FORGETTING_RATE, 1 / (PRIOR_STEPS + self._seen))
         self._variance += rate * ((added - self._added) ** 2 - self._variance)
@@ -93,7 +92,7 @@ class ActuatorGainEstimator:
         mean = effort(self._first, self._added)
         return np.where(mean > SIGNIFICANCE * effort(self._first, error), mean, 0.0)
 
-    def _team(self, share: NDArray[np.float64]) -> Team:
+    def _team(self, share: Floats) -> Team:
         """The team that does a share ``(K,)`` of what it was believed to do."""
         team = self._first.team
         limits = {name: getattr(team, name) * share.astype(np.float32) for name in STANDARD_LIMITS}

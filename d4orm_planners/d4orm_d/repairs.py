@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
@@ -101,7 +100,7 @@ class Repairs:
     """The state of the search by independent repairs."""
 
     failures: IntArray  #: ``(K,)`` failed repairs in a row of each robot
-    recency: NDArray[np.float64]  #: ``(K,)`` how often each was repaired, decaying with every iteration
+    recency: Floats  #: ``(K,)`` how often each was repaired, decaying with every iteration
 
     @classmethod
     def of(cls, num_robots: int) -> Repairs:

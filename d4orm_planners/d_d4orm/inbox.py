@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
@@ -265,7 +265,7 @@ def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, genera
     return among[int(generator.integers(len(among)))]
 
 
-def _square_distances(points: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+def _square_distances(points: Floats, centres: Floats) -> Floats:
     """``(n, c)``."""
-    gap2: NDArray[np.float64] = ((points[:, None] - centres[None]) ** 2).sum(axis=2)
+    gap2: Floats = ((points[:, None] - centres[None]) ** 2).sum(axis=2)
     return gap2

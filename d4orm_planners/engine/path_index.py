@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -72,26 +72,22 @@ class PathIndex:
         met = np.sort(np.concatenate(list(parts.values())))
         return np.stack(np.divmod(met, num_robots), axis=1)
 
-    def count_meetings(
-        self, robots: ArrayLike, states: FloatArray, until: ArrayLike | None = None
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Count the others that robots would meet on each of some paths, if nobody else's changed.
+    def count_meetings(self, robots: ArrayLike, states: FloatArray) -> tuple[Ints, Ints]:
+        """Count the others that robots would meet on each of some paths, if only that one changed.
 
         Args:
             robots: ``(R,)``.
             states: ``(R, V, H+1, n)`` states, or just positions.
-            until: ``(R,)`` the last step that counts, or ``None`` for the horizon.
 
         Returns:
             ``(R, V)``, and the first step at which each meets one, ``H+1`` if it meets none.
         """
         index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(states, np.float32)
-        last = np.full(len(index), paths.shape[2]) if until is None else np.asarray(until, np.int64)
         counts, when = np.empty((2, *paths.shape[:2]), np.int32)
 
         def count(part: IntArray) -> None:
             met = np.empty((paths.shape[1], self.table.positions.shape[1]), np.bool_)
-            _count_meetings(self.table, index, paths, last, part, met, counts, when)
+            _count_meetings(self.table, index, paths, part, met, counts, when)
 
         self._threads.over(len(index), count)
         return counts, when
@@ -160,26 +156,19 @@ def _pairs(table: PathTable, robot_range: IntArray) -> IntArray:
 
 @cached_kernel(**WITHOUT_ARRAYS)
 def _count_meetings(
-    table: PathTable,
-    robots: IntArray,
-    paths: FloatArray,
-    until: IntArray,
-    robot_range: IntArray,
-    met: BoolArray,
-    counts: Ints,
+    table: PathTable, robots: IntArray, paths: FloatArray, robot_range: IntArray, met: BoolArray, counts: Ints,
     when: Ints,
-) -> None:
+) -> None:  # fmt: skip
     """See :meth:`PathIndex.count_meetings`; ``met`` ``(V, K)`` is overwritten."""
     table = borrow(table)
-    num_paths, num_blocks = paths.shape[1], table.first.shape[0]
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
         met[:], met[:, robot] = False, True
         counts[r], when[r] = 0, paths.shape[2]
         # Time in the outer loop: paths of one robot look into the same cells.
-        for block in range(min(num_blocks, until[r] // BLOCK + 1)):
+        for block in range(table.first.shape[0]):
             first, last = steps_of(table, block)
-            for v in range(num_paths):
+            for v in range(paths.shape[1]):
                 middle, spread = enclose(paths[r, v], table.positions.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
                     continue  # Nothing has moved since the block before.
@@ -192,7 +181,7 @@ _DOUBT, _ROUNDING = 1 / 750, 64 * 2.0**-23
 farther than :mod:`d4orm_env.verify.docking` has it."""
 
 
-def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) -> NDArray[np.int32]:
+def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) -> Ints:
     """Check some robots' paths without looking at the others.
 
     Args:

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, IntArray, Whole
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.compiling import compiled, inlined
 
 BLOCK = 8
@@ -28,16 +27,16 @@ class PathTable(NamedTuple):
 
     block: int  #: :data:`BLOCK`
     positions: FloatArray  #: ``(H+1, K, d)`` float32 [m]
-    radius: NDArray[np.float64]  #: ``(K,)`` float64 [m]
+    radius: Floats  #: ``(K,)`` float64 [m]
     margin: np.float64  #: ``()`` float64 [m]
     safety_distance: np.float64  #: ``()`` float64 the largest distance at which two robots are near [m]
     scale: np.float64  #: ``()`` float64 cells in a metre
-    middle: NDArray[np.float64]  #: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
-    spread: NDArray[np.float64]  #: ``(B, K)`` float64 and how far from there it gets [m]
-    widest: NDArray[np.float64]  #: ``(1,)`` float64 the largest spread there has been
+    middle: Floats  #: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
+    spread: Floats  #: ``(B, K)`` float64 and how far from there it gets [m]
+    widest: Floats  #: ``(1,)`` float64 the largest spread there has been
     moving: IntArray  #: ``(1,)`` int64 the last block in which any robot has moved
-    first: NDArray[np.int32]  #: ``(B, N)`` int32 the first robot in each bucket of each block
-    following: NDArray[np.int32]  #: ``(B, K)`` int32 the robot after each in its bucket
+    first: Ints  #: ``(B, N)`` int32 the first robot in each bucket of each block
+    following: Ints  #: ``(B, K)`` int32 the robot after each in its bucket
 
 
 @inlined

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -183,20 +184,23 @@ class FleetServer:
         return DRIVING if self._begun is None else PLANNING
 
     def _read(self, now: float) -> None:
-        for topic, message in self._odometry.take():
-            self._hear(topic, message.pose.pose, position_of(message.twist.twist.linear), now)
-        for topic, message in self._poses.take():
-            number = self._by_name.get(topic.partition("/")[0])
-            if number is not None and np.isfinite(position_of(message.pose.position)).all():
+        for number, message in self._taken(self._odometry):
+            self._hear(number, message.pose.pose, position_of(message.twist.twist.linear), now)
+        for number, message in self._taken(self._poses):
+            if np.isfinite(position_of(message.pose.position)).all():
                 robot = self._robots[number]
                 robot.take_pose(message, BASE * self._problem.dt)
                 own = turned(robot.velocity, -heading_of(message.pose.orientation))
-                self._hear(topic, message.pose, own, now)
-        for topic, message in self._goal.take():
-            number = self._by_name.get(topic.partition("/")[0])
-            if number is not None:
-                self._take_goal(number, message.pose.position)
+                self._hear(number, message.pose, own, now)
+        for number, message in self._taken(self._goal):
+            self._take_goal(number, message.pose.position)
         self._mind(self._e_stop)
+
+    def _taken(self, subscriber: Subscriber) -> Iterator[tuple[int, Any]]:
+        """Yield new messages about robots of the team, each with the robot's number."""
+        for topic, message in subscriber.take():
+            if (number := self._by_name.get(topic.partition("/")[0])) is not None:
+                yield number, message
 
     def _mind(self, e_stop: Subscriber) -> None:
         """Stop everybody as soon as that is asked for, whatever the loop is at; it finds them standing then."""
@@ -207,10 +211,7 @@ class FleetServer:
                     self._replan, self._pace = True, 0.0
                     self._stand()
 
-    def _hear(self, topic: str, pose: Any, velocity: Floats, now: float) -> None:
-        number = self._by_name.get(topic.partition("/")[0])
-        if number is None:
-            return
+    def _hear(self, number: int, pose: Any, velocity: Floats, now: float) -> None:
         state, robot = state_from(self._problem, number, pose, velocity), self._robots[number]
         if np.isfinite(state).all():
             robot.state, robot.heading, robot.heard = state, heading_of(pose.orientation), now
