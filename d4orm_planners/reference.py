@@ -3,7 +3,7 @@
 One team is rolled out by a ``lax.scan`` over time, its robots by ``vmap``, the samples by another ``vmap`` on the first
 axis, with ``jax.random`` normals stored in full and the matrix of all distances at every step. The physics is written
 out here a second time, straight from the paper (sections III and IV-B), and shares no code with the core or the
-engines: agreement says something about both, and the benchmark has something to be measured against.
+engines: agreement is evidence for both, and the benchmark has a baseline.
 """
 
 from __future__ import annotations

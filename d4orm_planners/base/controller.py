@@ -68,8 +68,8 @@ class Controller:
     ``"measured"`` the policy sees what was measured. In both, controls make up for what pushes a robot all the time, as
     a thrust that is too weak does (:mod:`d4orm_planners.base.disturbance_observer`).
 
-    What is not a number in measured states is missing, and the reference takes its place. Speeds and coordinates beyond
-    what a robot's model allows count as the limit. A step that comes too late delays the reference; it never leaps.
+    Measured states that are not finite are missing, and replaced by the reference. Speeds and coordinates beyond what a
+    robot's model allows count as the limit. A late step delays the reference; it never leaps.
 
     Args:
         policy: Anything that :func:`~d4orm_planners.make_policy` takes.

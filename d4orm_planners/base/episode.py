@@ -67,7 +67,7 @@ class Episode(DisplayMixin):
 
     @property
     def controls(self) -> FloatArray:
-        """``(H, K, m)`` what was executed within the horizon, then zeros: a planner's ``initial_controls``."""
+        """``(H, K, m)`` executed controls within the horizon, then zeros: a planner's ``initial_controls``."""
         executed = self.trajectory.controls[: self.problem.horizon]
         controls = np.zeros((self.problem.horizon, *executed.shape[1:]), np.float32)
         controls[: len(executed)] = executed
@@ -83,7 +83,7 @@ class Episode(DisplayMixin):
 
 
 def check_physics(problem: Problem, physics: str) -> None:
-    """Refuse what is no physics, or none for a problem.
+    """Refuse an unknown physics, or one in which the robots of a problem have no bodies.
 
     Raises:
         ValueError: If it is not one of :data:`PHYSICS`, or robots have no bodies in it.
@@ -158,7 +158,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
     observations, infos = env.reset(seed=seed)
     problem = env.unwrapped.problem
     actor.reset(env, seed=seed)
-    # What is recorded is the truth, whatever the policy sees.
+    # The record has the true states, not those that the policy observes.
     joints, effects = [split_state(problem, env.unwrapped.true_state())], [env.unwrapped.effect().copy()]
     all_observations, all_infos = [observations], [infos]
     outcomes = [_outcome(env, {})]

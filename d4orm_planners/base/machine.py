@@ -1,4 +1,4 @@
-"""The machine and the versions of libraries, for the record of what was measured, and the provenance of plans."""
+"""The machine and the versions of libraries, for records of measurements and the provenance of plans."""
 
 from __future__ import annotations
 
@@ -55,16 +55,11 @@ def commit() -> str:
     package = Path(__file__).parents[1]
     if not (package.parent / ".git").exists():
         return ""
+    describe = ["git", "-C", str(package), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
     try:
-        number, changes = (
-            subprocess.run(
-                ["git", "-C", str(package), *words], capture_output=True, text=True, check=True, timeout=10
-            ).stdout.strip()
-            for words in (("rev-parse", "--short=12", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
-        )
+        return subprocess.run(describe, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return ""
-    return number + ("+" if changes else "")
 
 
 def _processor() -> str:

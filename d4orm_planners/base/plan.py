@@ -152,8 +152,8 @@ class Plan(DisplayMixin):
     def failures(self) -> dict[str, str]:
         """The robots that the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved.
 
-        It is the proof where there is one; else what each does wrong at the steps, or if none does anything, what
-        :func:`d4orm_env.verify` found.
+        It is the proof of infeasibility, or the faults of each robot at the steps, or if there are none, the violations
+        that :func:`d4orm_env.verify` found.
         """
         if self.solved:
             return {}

@@ -1,4 +1,4 @@
-"""Planners and policies: by name, those that come with the package and those that users bring, or given themselves."""
+"""Planners and policies by name, import path or object."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def is_brought(policy: object) -> bool:
 
 
 def origin(policy: object) -> object:
-    """Return what :func:`make_policy` takes for a policy in any process, whatever was registered there."""
+    """The import path or object of a policy, which :func:`make_policy` takes in any process without registration."""
     for table in (PLANNERS, POLICIES):
         if isinstance(policy, str) and policy in table:
             return table.origin(policy)
@@ -162,10 +162,10 @@ def default_settings(policy: str) -> dict[str, object]:
 
 
 def policy_settings(name: object, **config: Any) -> dict[str, object]:
-    """All that tells ``make_policy(name, **config)`` from other policies of that name.
+    """All that distinguishes ``make_policy(name, **config)`` from other policies of that name.
 
-    These are its settings, defaults filled in where a configuration class has them; a preset has become its settings.
-    A policy that does not come with this package has the digest of its source as well.
+    These are its settings, with the defaults of a configuration class, and with those of a preset in its place. A
+    policy from outside this package has the digest of its source as well.
 
     Raises:
         ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.

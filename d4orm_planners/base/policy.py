@@ -92,7 +92,7 @@ class Policy(ABC):
         return {}
 
     def identity(self) -> dict[str, object]:
-        """Identity that a store of trials tells this instance by from others of its class, as JSON has it.
+        """Identity by which a store of trials distinguishes this instance from others of its class, as JSON has it.
 
         By default the settings in ``config``, if it has any, else its attributes, which are digests unless they are
         numbers or text.
@@ -108,7 +108,7 @@ class Policy(ABC):
 
     @classmethod
     def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
-        """The same of an instance with these settings; more than they are where they name what may change."""
+        """The same of an instance with these settings; a subclass adds the content of files that they name."""
         return config.keywords()
 
 

@@ -1,4 +1,4 @@
-"""Work beside the control loop: a job at a time in a thread of its own."""
+"""Background work of a controller: a job at a time in a thread of its own."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Background(Generic[Result]):
         self._job = self._pool.submit(work)
 
     def result(self) -> tuple[bool, Result | None]:
-        """Return whether nothing is under way, and the last job's result, once."""
+        """True if no job is under way, and the result of the last one, which is given once."""
         if self._job is None:
             return True, None
         if not self._job.done():

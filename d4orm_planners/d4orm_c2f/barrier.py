@@ -15,16 +15,16 @@ from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.envs.joint_state import JointState
 
 NEAR, STOPS = 10 / 3, 2.0
-"""Only what is this near is minded: so many radii of the largest robot, and so many of its stops from full speed."""
+"""Range of the barriers, in radii of the largest robot plus stops from full speed."""
 
 PARTING = 2.0
-"""Rate at which robots part from what is too near, per distance missing [1/s]."""
+"""Rate at which robots separate where they are too near, per missing distance [1/s]."""
 
 SWEEPS = 400
-"""Times that every barrier is met at most; by then there are no velocities that keep to all, or hardly any."""
+"""Most sweeps over all barriers; after so many there hardly are velocities that keep to all."""
 
 EXACT = 1e-6
-"""Changes of that size are none, as a share of the largest speed limit."""
+"""Largest change that counts as none, as a share of the largest speed limit."""
 
 _STEP = 1 / 150
 """Step for the direction away from an obstacle, in radii of the largest robot."""
@@ -74,7 +74,7 @@ class Barriers(NamedTuple):
     least: Floats  #: ``(R,)`` [m/s]
 
     def missing(self, velocities: Floats) -> Floats:
-        """``(R,)`` how much of it velocities ``(K, d)`` lack [m/s]."""
+        """``(R,)`` violations of the barriers by velocities ``(K, d)``, negative for none [m/s]."""
         padded = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
         missing: Floats = self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
         return missing
@@ -92,7 +92,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     def add(one: int, other: int, normal: Floats, room: float, brakes: float, speed: float = 0.0) -> None:
         if room > 0:
             lost = brakes * reaction
-            # Nobody has to back off as long as there is room: whoever stands keeps to everything.
+            # As long as there is room nobody has to back off: zero velocities keep to all barriers.
             least = min(speed_slack + lost - np.sqrt(2 * brakes * room + lost**2), 0.0)
         else:
             least = -PARTING * room

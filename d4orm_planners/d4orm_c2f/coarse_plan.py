@@ -1,4 +1,4 @@
-"""The coarse guidance of D4orm-C2F: a path for the team, where on it each robot is and heads (paper, section VI)."""
+"""The coarse guidance of D4orm-C2F: a path for the team, and each robot's waypoint and subgoal (paper, section VI)."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def interpolate(path: FloatArray, factor: int) -> FloatArray:
 
 
 def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, window: int) -> IntArray:
-    """``(K,)`` where on ``path`` ``(H+1, K, d)`` robots at ``positions`` ``(K, d)`` are: indices of nearest waypoints.
+    """``(K,)`` indices of the waypoints on ``path`` ``(H+1, K, d)`` nearest to robots at ``positions`` ``(K, d)``.
 
-    From those found ``last`` ``(K,)`` on, because a path may cross itself, ``window`` waypoints are looked at.
+    As a path may cross itself, only ``window`` waypoints are searched, from those found ``last`` ``(K,)`` on.
     """
     index = np.minimum(np.asarray(last)[:, None] + np.arange(window + 1), len(path) - 1)
     ahead = path[index, np.arange(len(index))[:, None]]
@@ -63,8 +63,8 @@ def subgoal_indices(indices: IntArray, mean: int, offset: int, lag: int, last: i
     """``(K,)`` the waypoint, at most the ``last``, that every robot heads for (paper, Algorithm 4, line 7).
 
     The paper's is the same for all robots: the ``mean`` of their ``indices`` ``(K,)`` and an ``offset``. A robot that
-    was held up, by more than ``lag`` waypoints, would then leave its path, straight into whatever the path leads
-    around; it keeps to its own instead.
+    lags by more than ``lag`` waypoints would then leave its path, straight into obstacles that the path avoids; its
+    subgoal stays behind with it instead.
     """
     return np.minimum(np.minimum(mean, indices + lag) + offset, last)
 
@@ -155,7 +155,7 @@ class StagnationMonitor:
         self._careful_until = np.full(len(joint.goals), joint.steps)
 
     def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[IntArray, BoolArray]:
-        """``(K,)`` steps without progress, and robots that are stuck, or were not long ago, and so follow their paths.
+        """``(K,)`` steps without progress, and ``(K,)`` robots that are stuck or were so recently.
 
         Args:
             step: Time step.

@@ -94,9 +94,8 @@ class CoarsePlanning:
             search.advance()
             if number == 0:
                 ordered = isinstance(search.state, RoadmapSolution)
-            chosen = search.current if search.current.rank >= search.best.rank else search.best
-            if not search.current.failed.any():
-                chosen = search.current
+            accepted = not search.current.failed.any() or search.current.rank >= search.best.rank
+            chosen = search.current if accepted else search.best
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
         return chosen, CoarsePlan(

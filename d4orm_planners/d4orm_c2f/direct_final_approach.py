@@ -116,7 +116,7 @@ def approach_by_manoeuvres(
 
 
 def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, arrived: BoolArray) -> BoolArray:
-    """``(R, V)`` whether paths ``(T, R, V, d)`` keep the margin to all at rest, or come no nearer than at first."""
+    """``(R, V)`` bool: paths ``(T, R, V, d)`` that keep the margin to all at rest, or come no nearer than at first."""
     radius = np.asarray(window.team.radius, np.float64)
     room = window.world.clearance(positions) - radius[robots, None]
     clear = _no_nearer(room, window)
@@ -127,7 +127,7 @@ def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, arriv
 
 
 def _no_nearer(gaps: Floats, window: Problem) -> BoolArray:
-    """``(...)`` whether no gap of ``(T, ...)`` is less than the margin, or than the first one if that is less [m]."""
+    """``(...)`` bool: no gap of ``(T, ...)`` is less than the margin, or than the first one if that is less [m]."""
     keeps: BoolArray = (gaps >= np.minimum(gaps[0] - window.rounding, window.margin)).all(axis=0)
     return keeps
 

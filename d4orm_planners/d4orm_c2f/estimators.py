@@ -32,7 +32,7 @@ GAIN_STEP = 0.05
 
 
 def effort(problem: Problem, controls: FloatArray | Floats) -> Floats:
-    """``(K,)`` how large controls ``(K, m)`` are, in shares of the robots' limits."""
+    """``(K,)`` norms of controls ``(K, m)`` in shares of the robots' limits."""
     limits = np.asarray(problem.team.control_limits, np.float64)
     shares = np.divide(controls, limits, out=np.zeros_like(limits), where=limits > 0)
     return np.sqrt((shares**2).sum(axis=1))

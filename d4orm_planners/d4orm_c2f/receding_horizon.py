@@ -70,8 +70,8 @@ class D4ormC2F(StatePolicy):
         config: The settings.
         loops: A :class:`LoopRecord` per control loop of the present episode, of the last :data:`REMEMBERED`.
         coarse_time: Time that the first coarse plan took [s].
-        subgoals: ``(K, d)`` where the last control loop headed for [m]; the start before the first.
-        predicted: ``(1 + T, K, d)`` where its plan led, robots that brake or evade in the last resort apart [m].
+        subgoals: ``(K, d)`` subgoals of the last control loop [m]; the start before the first.
+        predicted: ``(1 + T, K, d)`` path of its plan, without braking and evading in the last resort [m].
     """
 
     name = "d4orm-c2f"

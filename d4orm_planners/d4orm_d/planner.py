@@ -94,7 +94,7 @@ class D4ormD(DeformingPlanner):
         return state.improve(team), replace(iteration, controls=team.controls)
 
     def is_big(self, problem: Problem) -> bool:
-        """Return whether the team is a big one."""
+        """Check whether the team is a big one."""
         return self.config.big_team is not None and problem.num_robots > self.config.big_team
 
     def num_samples(self, search: SolveRun) -> int:
@@ -102,7 +102,7 @@ class D4ormD(DeformingPlanner):
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         task = super().task(search, base)
-        # Only who starts from nothing is yet to find out who meets whom; a plan that is made better has to keep apart.
+        # Only a first plan may ignore collisions, to find out which robots meet; later ones keep robots apart.
         from_zero = search.iteration == 0 and not base.any()
         if self.config.first_collisions or not from_zero:
             return task

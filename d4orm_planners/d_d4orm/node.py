@@ -134,7 +134,7 @@ class Node:
             pass
 
     def step(self, stop: threading.Event, timeout: float, improve: bool) -> bool:
-        """One round of :meth:`run`; whether there is to be another one."""
+        """One round of :meth:`run`; True if there is to be another one."""
         self.refine()
         if stop.is_set() or self.search.time_left == 0 or (self.search.best.solved and not improve):
             return False
@@ -155,7 +155,7 @@ class Node:
             )
 
     def settle(self, seconds: float) -> bool:
-        """Send the best candidate again and again, until all others have one as good or the seconds are over.
+        """Send the best candidate repeatedly, until all others have one as good or the time is over.
 
         Without a solution it only takes what has arrived.
 
@@ -186,12 +186,9 @@ class Node:
 
     def _all_have(self, candidate: Candidate) -> bool:
         """Check whether each of the others has sent a solution as good as this one."""
-        reward = candidate.trajectory.rewards.mean() - TOLERANCE
-        reports = self.inbox.newest
+        found = {node: report.candidate for node, report in self.inbox.newest.items()}
         return all(
-            node in reports
-            and reports[node].candidate.solved
-            and reports[node].candidate.trajectory.rewards.mean() >= reward
+            node in found and found[node].solved and found[node].reward >= candidate.reward - TOLERANCE
             for node in self._others
         )
 
@@ -208,7 +205,7 @@ class Node:
             if rest <= 0:
                 break
             heard |= self._gather(rest)
-        # Who is silent, maybe for ever, is awaited again only when heard from.
+        # A silent node is awaited again only once it was heard from.
         self._awaited = heard
 
     def _gather(self, timeout: float = 0.0) -> set[int]:
@@ -228,7 +225,7 @@ class Node:
         candidates = [received[node][1] for node in nodes]
         chosen = choose(
             self._task.selection,
-            [candidate.trajectory.rewards.mean() for candidate in candidates],
+            [candidate.reward for candidate in candidates],
             np.stack([candidate.controls for candidate in candidates]),
             self._task.k,
             np.random.default_rng(self.search.iteration_seed(Stream.CHOICE)),

@@ -79,7 +79,7 @@ class DD4orm(Planner):
         return DD4orm(replace(self.config, communication_range=communication_range))
 
     def _links(self, problem: Problem) -> BoolArray | None:
-        """Return which nodes hear each other; ``None`` for all."""
+        """``(N, N)`` bool: nodes that hear each other; ``None`` for all."""
         limit, starts = self.config.communication_range, problem.start[:, : problem.dimension]
         return None if limit is None else communication_links(problem, starts, limit, line_of_sight=False)
 

@@ -83,7 +83,7 @@ def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
 
     Raises:
         MessageError: If it is anything but a message of this version with finite controls, none beyond
-            :data:`~d4orm_planners.base.candidate.MOST_OF_LIMIT`, for this problem from one of the nodes.
+            :data:`~d4orm_planners.base.candidate.MOST_OF_LIMIT` times its limit, for this problem, from a node.
     """
     if len(data) > MAX_BYTES:
         raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")
@@ -165,7 +165,7 @@ class Mailbox:
             self._changed.notify_all()
 
     def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """Return what has arrived, see :meth:`Transport.collect`."""
+        """See :meth:`Transport.collect`."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._arrived, timeout)
             messages = [] if self.closed else list(self._arrived)

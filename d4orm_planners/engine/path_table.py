@@ -1,8 +1,8 @@
-"""Table of a team's positions at every step, as compiled code reads it: near robots without looking at every pair.
+"""Table of a team's positions at every step, as compiled code reads it, to find near robots without all pairs.
 
-Time is cut into blocks of a few steps, in which robots get not far. In every block the robots are chained in the
-buckets of a hash table, by the cell of a grid that the middle of each one's path through the block is in. A robot that
-comes near a path is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
+Time is cut into blocks of a few steps, in which robots move little. In every block the robots are chained in the
+buckets of a hash table, by the grid cell that holds the middle of each one's path through the block. Robots near a path
+are in the few cells around it. Memory and time grow with the robots, not with the pairs.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
 
 @inlined
 def position_of(k: Whole, step: int, dimension: int) -> Whole:
-    """Return where the rows of robot ``k``'s positions after a step of the block begin: a row an axis."""
+    """First element of robot ``k``'s positions after a step of the block, which have a row per axis."""
     return (k * BLOCK + step) * dimension * TILE
 
 
@@ -93,13 +93,13 @@ POSES = BLOCK * POSE * TILE
 
 @inlined
 def pose_of(step: int) -> Whole:
-    """Return where the rows of a body's pose after a step of the block begin, among its :data:`POSES`."""
+    """First element of a body's pose after a step of the block, among its :data:`POSES`."""
     return step * POSE * TILE
 
 
 @inlined
 def box_of(thing: Whole, dimension: int) -> Whole:
-    """Return where the rows of a thing's boxes begin."""
+    """First element of the boxes of a robot or body."""
     return thing * dimension * BOX
 
 
@@ -227,7 +227,7 @@ def _refine_body(
     f: FootprintArrays | None, others: Any, arrays: ProblemArrays, bodies: Bodies, body: int, t: int,
     k: int, near: np.uint64, rows: FloatArray, poses: FloatArray, begin: Whole, s: Scratch,
 ) -> np.uint64:  # fmt: skip
-    """Return where, of the samples ``near``, robot ``k`` is within the margin of a body at time ``t``."""
+    """The samples, of those ``near``, in which robot ``k`` is within the margin of a body at time ``t``."""
     if f is None:
         return near
     sure, dimension = near, arrays.goal.shape[1]

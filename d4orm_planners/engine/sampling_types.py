@@ -1,4 +1,4 @@
-"""Sampling engines by name: what a denoising run is asked for, and what it answers."""
+"""Sampling engines by name, their requests and their answers."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class SamplingTask:
 
     @property
     def penalties(self) -> FloatArray:
-        """``(K,)`` what a violation costs each robot per step."""
+        """``(K,)`` cost of a violation to each robot per step."""
         penalties = np.asarray(self.penalty, np.float64) * self.problem.collision_penalty
         return np.full(self.problem.num_robots, penalties, np.float32)
 
@@ -95,7 +95,7 @@ class SamplingTask:
 
 
 Rule: TypeAlias = Callable[..., Any]
-"""It returns what the array library makes of its arrays."""
+"""It returns arrays of the library of its arguments."""
 
 
 class SamplingRules(NamedTuple):

@@ -29,20 +29,20 @@ from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig, al
 from d4orm_planners.sampling.weights import GroupWeights
 
 SHORT = 5.0
-"""Times the distance that two robots keep between their centres: paths of less are short."""
+"""Length below which paths are short, in distances that two robots keep between their centres."""
 SLACK, SLACK_GROWTH = 2.0, 0.2
-"""Times the drive that samples look ahead at first, and how much more with every iteration: it may take longer."""
+"""Horizon of the samples at first, in times of the drive, and its growth with every iteration."""
 
 
 def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
     """The task itself, unless all robots' paths are short: then one of fewer steps, with rewards for such paths.
 
-    A robot that evades another makes a detour. On a path that is long next to the robots it costs next to nothing; on a
-    short one nearly as much as driving through the other, by a reward that counts distances relative to the path and
-    most of whose steps come after the arrival. There samples look no farther ahead than driving and evading take, and
-    distances count relative to a path on which evading is cheap.
+    A detour round another robot costs little on a long path. On a short one it costs nearly as much as driving through
+    the other, as the reward counts distances relative to the path, and most steps come after the arrival. Samples of
+    short paths therefore look no farther ahead than driving and evading take, and distances count relative to a path on
+    which evading is cheap.
 
-    Where robots do not stay at their goals by themselves all steps count, and it is the task itself too.
+    Where goals are not absorbing all steps count, and it is the task itself too.
     """
     problem = task.problem
     reference = SHORT * (2 * float(np.max(problem.team.radius)) + problem.margin)
@@ -171,7 +171,7 @@ class SamplingPlanner(Planner):
 
 
 def conflict_groups(search: SolveRun) -> Groups:
-    """The robots that are in conflict with each other in the present candidate, directly or by others."""
+    """Groups of robots that conflict with each other in the present candidate, directly or through others."""
     problem = search.problem
     positions = search.current.trajectory.positions
     return components(conflicts(positions, problem.team.radius, problem.margin))

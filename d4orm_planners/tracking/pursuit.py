@@ -52,7 +52,7 @@ BACKING = np.float32(0.5)
 
 
 def lookaheads(problem: Problem) -> Floats:
-    """``(K,)`` how far ahead of them robots look at least [m]."""
+    """``(K,)`` least distance ahead at which robots look [m]."""
     return np.maximum(LOOKAHEAD * problem.team.largest_radius, CIRCLES * problem.team.turning_radius.astype(np.float64))
 
 

@@ -1,10 +1,9 @@
 """Smooth motions through a plan: splines of class C4 within limits on speed, acceleration and jerk, verified again.
 
 A plan's accelerations jump at every step, which no robot follows. Its positions are fitted by quintic P-splines (P. H.
-C. Eilers and B. D. Marx, Statistical Science, 1996), which begin and end without acceleration; where they need more
-than a limit allows, the whole team drives them more slowly: that changes neither where anybody drives nor who meets
-whom. The smoother the curves the quicker they may be driven, but the farther are they from the plan, and the first that
-touch nothing are taken, in the order of their duration.
+C. Eilers and B. D. Marx, Statistical Science, 1996), which begin and end without acceleration. Where they exceed a
+limit the whole team drives more slowly, which changes no path and no encounter. Smoother curves may be driven faster,
+but deviate more from the plan: of several, the quickest is taken that is free of collisions.
 """
 
 from __future__ import annotations
@@ -28,18 +27,18 @@ DEGREE = 5
 SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
 """Weights of the squared third differences of a curve's coefficients, against the squared distances from the plan."""
 GATHERING, SETTLING = 2, 5
-"""Steps before a plan from rest in which the team gathers way, and after the last arrival in which it comes to rest."""
+"""Steps before a plan from rest in which the team starts, and after the last arrival in which it comes to rest."""
 PER_STEP = 32
-"""Times a step at which a motion's speeds, accelerations and jerks are looked at."""
+"""Samples per step at which a motion's speeds, accelerations and jerks are checked."""
 RESERVE = 1e-3
-"""Share of the limits that is left for what happens between these times."""
+"""Share of the limits that is left for peaks between these samples."""
 SLOWEST = 4.0
-"""Times the plan's duration that a motion may take."""
+"""Longest duration of a motion, in durations of the plan."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Most that a robot's controller is asked for, each ``(K,)``; infinite where anything goes."""
+    """Limits of what a robot's controller is asked for, each ``(K,)``; infinite for none."""
 
     speed: Floats  #: [m/s]
     acceleration: Floats  #: [m/s^2]; of robots with a heading along it
@@ -91,7 +90,7 @@ class SmoothMotion:
 
     @property
     def duration(self) -> float:
-        """When everybody is at rest [s]."""
+        """Time at which all robots are at rest [s]."""
         return float(self.curves.t[-1]) * self.stretch
 
     def position(self, times: Floats, derivative: int = 0) -> Floats:
@@ -144,7 +143,7 @@ class SmoothMotion:
 
 
 def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits) -> SmoothMotion:
-    """The quickest smooth motion along a trajectory in which nobody touches anything.
+    """The quickest smooth motion along a trajectory that is free of collisions.
 
     Args:
         problem: What the trajectory solves.

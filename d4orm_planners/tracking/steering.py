@@ -158,7 +158,7 @@ def _robots_by_name(models: tuple[str, ...]) -> tuple[tuple[str, tuple[int, ...]
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Paths that robots could take, each robot alone: ``R`` robots, ``V`` paths each."""
+    """Paths of robots that each drive alone: ``R`` robots, ``V`` paths each."""
 
     controls: FloatArray  #: ``(H, R, V, m)``, zero after arrival
     states: FloatArray  #: ``(H+1, R, V, n)``

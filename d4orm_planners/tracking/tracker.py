@@ -27,9 +27,9 @@ from d4orm_env.engine.stepping import SQUARED_GAP, Docking, Row, docking_of, mak
 from d4orm_planners.tracking.steering import CREEPING
 
 Guide: TypeAlias = Callable[[Any, Any, int, Row, Row, Row, TimeStep], tuple[Row, Any, bool]]
-"""``(reference, memory, step, state, goal, limits, h) -> (velocity, memory, is_at_end)``: the velocity that is wanted,
-what the guide remembers for the next step, and whether the reference ends here: only there does a robot arrive that may
-be moved again."""
+"""``(reference, memory, step, state, goal, limits, h) -> (velocity, memory, is_at_end)``: the velocity wanted, the
+guide's memory for the next step, and whether the reference ends here: without absorbing goals robots arrive only
+there."""
 Tracker: TypeAlias = Callable[[ProblemArrays, Whole, Any, Any, int, Row, bool, FloatArray, FloatArray], int]
 VelocityStep: TypeAlias = Callable[[Row, Row, Row, Row, Docking, TimeStep], tuple[Row, Row, bool]]
 

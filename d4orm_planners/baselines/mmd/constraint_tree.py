@@ -1,4 +1,4 @@
-"""The search over conflicts: which robot plans again, and what it must keep clear of (CBS, ECBS, xECBS)."""
+"""Conflict-based search: the robot that plans again, and its constraints (CBS, ECBS, xECBS)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PADDING = 2
 
 
 def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> IntArray:
-    """``(B, 2)`` how many others each of some paths conflicts with, and at how many steps.
+    """``(B, 2)`` numbers of other robots that each of some paths conflicts with, and of steps at which it does.
 
     Args:
         positions: ``(B, T, 3)`` the paths [m].
@@ -38,7 +38,7 @@ def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> Int
 
 
 def first_conflict(positions: Floats, distances: Floats) -> tuple[int, int, tuple[int, int]]:
-    """How many pairs conflict, and the step and the robots of the earliest conflict; robots are -1 if none does.
+    """Number of pairs in conflict, and the step and the robots of the earliest conflict; robots are -1 for none.
 
     Args:
         positions: ``(K, T, 3)`` [m].

@@ -1,4 +1,4 @@
-"""Guidance: what pushes motions out of obstacles, constraints and other robots' paths while they are denoised.
+"""Guidance of motions out of obstacles, constraints and other robots' paths while they are denoised.
 
 Every step of guidance goes once along the motion. Where a point violates something, the motion's modes are changed by
 as little as it takes, measured by their deviation among the examples: a gradient step on one point's hinge loss in the
@@ -43,7 +43,7 @@ class PathSurroundings(NamedTuple):
 
 @register_jitable(nogil=True, **OPTIONS)
 def _point_variance(sines: Floats, deviation: Floats) -> Floats:
-    """``(N + 1, 2)`` how much each point varies among the examples, ahead and aside."""
+    """``(N + 1, 2)`` variances of each point among the examples, ahead and aside."""
     points, modes = sines.shape
     variance = np.zeros((points, 2))
     for i in range(points):

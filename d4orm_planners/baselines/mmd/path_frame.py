@@ -1,4 +1,4 @@
-"""The frame in which a robot's motion is described: its shortest path, and how much room there is beside it.
+"""The frame in which a robot's motion is described: its shortest path, and the clearance on both sides of it.
 
 The model never sees a map. It learns how motions differ from the shortest path driven at an even pace, in lengths of
 that path: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and

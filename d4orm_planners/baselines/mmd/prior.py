@@ -1,4 +1,4 @@
-"""The trained diffusion model: a small network that tells the clean motion in a noisy one, evaluated in a fixed order.
+"""The trained diffusion model: a small network that predicts the clean motion in a noisy one, in a fixed order.
 
 The network is a residual multilayer perceptron over the modes of a motion, whitened by their deviation among the
 examples. Its sums run in the order in which they are written, so that a seed has the same plan on every processor.

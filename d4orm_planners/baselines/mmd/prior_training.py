@@ -1,6 +1,4 @@
-"""Training of the diffusion model: its training set, plans of single robots among things that it is not told of, and
-the network.
-"""
+"""Training of the diffusion model on plans of single robots among obstacles that it does not observe."""
 
 from __future__ import annotations
 
@@ -135,7 +133,7 @@ def _with_phantoms(problem: Problem, frame: PathFrame, random: np.random.Generat
 
 
 def _evenly(positions: FloatArray, arrival: int) -> Floats:
-    """``(POINTS + 1, 3)`` where a robot was at equal times, interpolated."""
+    """``(POINTS + 1, 3)`` positions of a robot at equal times, interpolated."""
     times = np.linspace(0, arrival, POINTS + 1)
     points = np.zeros((POINTS + 1, 3))
     for axis in range(2):
@@ -155,7 +153,7 @@ class DenoisingNetwork(nn.Module):
         nn.init.zeros_(self.out.weight)
 
     def forward(self, noisy: Tensor, level: Tensor, features: Tensor) -> Tensor:
-        """Return what is to be added to ``sqrt(alpha_bar)`` times the noisy motion, over ``sqrt(1 - alpha_bar)``."""
+        """The term added to ``sqrt(alpha_bar)`` times the noisy motion, over ``sqrt(1 - alpha_bar)``."""
         layer = torch.relu(self.into(torch.cat([noisy, level], dim=1)) + self.context(features))
         for hidden in self.hidden:
             layer = layer + torch.relu(hidden(layer))
