@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures import TimeoutError as AnswerLate
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -14,6 +13,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, pos
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
@@ -78,7 +78,7 @@ class Controller:
             feedback, in mode ``"nominal"`` or with a tracker. By default 0.5 with a tracker, which has its robot tilt
             or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
-            meanwhile, and its answer, which would be too late, is not used. ``None`` waits. A policy that is named and
+            meanwhile, and its late answer is not used. ``None`` waits. A policy that is named and
             has a ``deadline``, as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
@@ -114,8 +114,7 @@ class Controller:
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = tracker
         self._lag, self._leads = lag, mode == "nominal" or tracker
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="controller")
-        self._late: Future[Actions] | None = None
+        self._background: Background[Actions] = Background()
         self._env: Any = None
 
     def __enter__(self) -> Self:
@@ -126,7 +125,7 @@ class Controller:
 
     def close(self) -> None:
         """End the policy's thread as soon as it has answered."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        self._background.close()
 
     def begin(self, problem: Problem, states: ArrayLike, time: float = 0.0, seed: int = 0) -> None:
         """Take over a team; policies that plan do so now, however long it takes.
@@ -140,7 +139,7 @@ class Controller:
         Raises:
             ValueError: If the states have another shape, or the lag fits no team of this size.
         """
-        self._wait_for_late(None)
+        self._background.forget()
         try:
             self._begin(problem, states, float(time), seed)
         except BaseException:
@@ -256,26 +255,11 @@ class Controller:
         return self._joint.states + (self._observer.trust * off).astype(np.float32)
 
     def _actions(self) -> Actions | None:
-        """Return the policy's actions; ``None`` if they do not come in time, or no longer."""
-        if self.over or not self._wait_for_late(0.0):
+        """Return the policy's actions; ``None`` if they do not come in time, or the episode is over."""
+        if self.over:
             return None
         acting = {agent: self._observations[agent] for agent in self._env.agents}
-        answer = self._executor.submit(self.policy.act, acting, self._env.state())
-        try:
-            return answer.result(self.timeout)
-        except AnswerLate:
-            self._late = answer
-            return None
-
-    def _wait_for_late(self, seconds: float | None) -> bool:
-        """Wait for an answer that is overdue and of no use any more, and return whether none is."""
-        if self._late is not None:
-            try:
-                self._late.result(seconds)
-            except AnswerLate:
-                return False
-            self._late = None
-        return True
+        return self._background.run(partial(self.policy.act, acting, self._env.state()), self.timeout)
 
     def _with_feedback(self, measured: FloatArray, follows: BoolArray, controls: FloatArray) -> FloatArray:
         """``(K, m)`` controls that bring those robots from where they were measured to the reference."""

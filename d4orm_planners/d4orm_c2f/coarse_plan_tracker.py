@@ -11,8 +11,8 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import (
     BARRED_AFTER,
     STUCK_AFTER,

@@ -13,9 +13,9 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings
-from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, CoarseWaypoints
 from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
@@ -198,7 +198,7 @@ class D4ormC2F(StatePolicy):
         inflation, limit = self._deviation.margin_inflation(self.config.reaction_time), self.config.deadline
         now = Situation(joint, arrived, subgoals, base, left, careful, stuck, inflation)
         work = partial(self._window.predict, now, seed)
-        result = work() if limit is None else self._control.run(work, limit - (time.perf_counter() - begin))
+        result = self._control.run(work, None if limit is None else limit - (time.perf_counter() - begin))
         margin, missed = float("nan"), result is None
         if result is not None:
             self._plan, self._next, self.predicted, margin = result.controls, 0, result.positions, result.gap

@@ -112,13 +112,12 @@ class D4ormD(DeformingPlanner):
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""
         if self.config.start == "auto":
-            return straight_start(problem) if self.is_big(problem) else None
+            return straight_if_sparse(problem) if self.is_big(problem) else None
         return straight_drives(problem).controls[:, :, 0] if self.config.start == "straight" else None
 
 
-def straight_start(problem: Problem) -> FloatArray | None:
-    """Controls ``(H, K, m)`` straight to the goals; ``None`` where robots so meet half of the others."""
+def straight_if_sparse(problem: Problem) -> FloatArray | None:
+    """Controls ``(H, K, m)`` straight to the goals; ``None`` where robots would meet half of the others on average."""
     drives = straight_drives(problem)
     graph = conflicts(drives.positions[:, :, 0], problem.team.radius, problem.margin)
-    # As many as when everybody meets half of the team.
     return None if 2 * sum(map(len, graph)) >= problem.num_robots**2 else drives.controls[:, :, 0]

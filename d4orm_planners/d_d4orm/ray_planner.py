@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from d4orm_env.core.errors import first_line
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.candidate import evaluate_controls
@@ -28,8 +29,6 @@ TIMEOUT = 10.0
 """Seconds to wait for the head of a cluster to answer."""
 
 LOOPBACK = ("127.0.0.1", "::1")
-
-
 RESTARTS = 3
 """Number of times that a lost actor is started again, before its node is done without."""
 START = 120.0
@@ -40,11 +39,7 @@ GLANCE = 0.1
 
 def import_ray(what: str) -> ModuleType:
     """Ray, or an ``ImportError`` that says what needs it and how to install it."""
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError(f"{what} needs ray; install it with: pip install 'd4orm-env[distributed]'") from error
-    return ray
+    return load(LazyModule("ray", what, "distributed"))
 
 
 class RayConnection:

@@ -13,7 +13,7 @@ from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.settings import Positive, one_of
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.d4orm_d.planner import D4ormD, straight_start
+from d4orm_planners.d4orm_d.planner import D4ormD, straight_if_sparse
 from d4orm_planners.d4orm_d.planner import State as DecouplingState
 from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
@@ -127,7 +127,7 @@ class Hybrid(Planner):
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""
-        return straight_start(problem) if self.config.start == "auto" else self.denoiser.straight_start(problem)
+        return straight_if_sparse(problem) if self.config.start == "auto" else self.denoiser.straight_start(problem)
 
     def repair(self, team: DeformedPlan, state: Repairs) -> Repairs:
         """Search for paths around others for robots that fail, and deform those that fail nevertheless."""

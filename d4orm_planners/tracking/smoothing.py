@@ -22,6 +22,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport
 from d4orm_env.verify.discs import verify_curves
+from d4orm_planners.tracking.steering import present_velocities
 
 DEGREE = 5
 SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
@@ -187,15 +188,8 @@ def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
 
 def _initial_velocity(problem: Problem) -> Floats:
     """``(K, d)`` velocities at the start [m/s]."""
-    velocity = np.zeros((problem.num_robots, problem.dimension))
-    for robot, model in enumerate(problem.team.robot_models):
-        state = problem.start[robot].astype(np.float64)
-        if model.heading_index is not None and model.speed_indices:
-            heading = state[model.heading_index]
-            velocity[robot, :2] = state[model.speed_indices[0]] * np.array([np.cos(heading), np.sin(heading)])
-        elif model.speed_indices:
-            velocity[robot] = state[list(model.speed_indices)]
-    return velocity
+    no_controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+    return present_velocities(problem, problem.start, no_controls).astype(np.float64)
 
 
 def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> SmoothMotion:

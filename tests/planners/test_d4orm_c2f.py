@@ -22,8 +22,8 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.fine_plan import Window
@@ -326,6 +326,20 @@ def test_a_job_in_the_background_is_one_at_a_time_and_gives_its_result_once() ->
     background._job.result()  # type: ignore[union-attr]
     assert background.result() == (True, True)
     assert background.result() == (True, None)
+
+
+def test_an_error_of_late_work_is_raised_once() -> None:
+    background, go = Background(), threading.Event()
+
+    def broken() -> None:
+        assert go.wait(60)
+        raise ValueError("broken")
+
+    assert background.run(broken, 0.01) is None
+    go.set()
+    with pytest.raises(ValueError, match="broken"):
+        background.run(lambda: None, 60)
+    assert background.run(lambda: 1, 60) == 1
 
 
 def test_the_control_loop_is_compiled_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:

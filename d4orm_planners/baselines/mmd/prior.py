@@ -237,15 +237,13 @@ class _Draws:
         self._call = 0
 
     def normals(self, shape: tuple[int, ...]) -> FloatArray:
-        numbers = np.empty((1, int(np.prod(shape))), np.float32)
-        draw_normals(self._keys, np.zeros(1, np.int64), np.uint32(0), np.uint32(self._next()), numbers)
-        return numbers.reshape(shape)
+        return self._drawn(draw_normals, shape)
 
     def uniforms(self, count: int) -> FloatArray:
-        numbers = np.empty((1, count), np.float32)
-        draw_uniforms(self._keys, np.zeros(1, np.int64), np.uint32(0), np.uint32(self._next()), numbers)
-        return numbers[0]
+        return self._drawn(draw_uniforms, (count,))
 
-    def _next(self) -> int:
+    def _drawn(self, draw: Callable[..., None], shape: tuple[int, ...]) -> FloatArray:
         self._call += 1
-        return self._call
+        numbers = np.empty((1, int(np.prod(shape))), np.float32)
+        draw(self._keys, np.zeros(1, np.int64), np.uint32(0), np.uint32(self._call), numbers)
+        return numbers.reshape(shape)
