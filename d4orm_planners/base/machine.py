@@ -74,7 +74,7 @@ def _processor() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Origin of a plan, beside its planner's name and the seed."""
+    """Origin of a plan, in addition to its planner's name and the seed."""
 
     preset: str | None  #: Of :func:`~d4orm_planners.make_planner`; ``None`` for the defaults
     settings: Mapping[str, object]  #: All settings of the planner, by name; what JSON has no word for as text

@@ -258,8 +258,8 @@ class Plan(DisplayMixin):
     def load(cls, path: str | os.PathLike[str]) -> Plan:
         """Read a plan that :meth:`save` wrote. Nothing is unpickled, nor unpacked beyond what the problem has room for.
 
-        What the file says of its controls is judged anew: ``solved`` and the metrics of the trajectory are what is
-        found here, and so is the trajectory itself, unless the file's is the same but for rounding.
+        The controls are evaluated again: ``solved``, the metrics and the trajectory are the result of that, unless the
+        trajectory in the file is the same but for rounding.
 
         Raises:
             FileNotFoundError: If there is no such file.
@@ -269,5 +269,5 @@ class Plan(DisplayMixin):
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """:meth:`Plan.load`, beside :func:`d4orm_env.load_problem`."""
+    """Read a plan, as :meth:`Plan.load` does."""
     return Plan.load(path)

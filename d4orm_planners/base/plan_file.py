@@ -1,4 +1,4 @@
-"""Files of plans: ``.npz`` without pickles, judged anew when they are read."""
+"""Files of plans: ``.npz`` without pickles, evaluated again when they are read."""
 
 from __future__ import annotations
 

@@ -201,7 +201,7 @@ def _presets(kind: object) -> Presets:
 
 
 def _policy_config(kind: object, config_class: type[Config], given: Mapping[str, object], owner: str) -> Config:
-    """A policy's settings; one that has presets may be given one beside them."""
+    """A policy's settings, with those of a preset where the policy has presets."""
     config, presets = dict(given), _presets(kind)
     preset = config.pop("preset", None) if presets else None
     return _configured(config_class, presets, preset, config, owner)

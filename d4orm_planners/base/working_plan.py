@@ -163,7 +163,7 @@ def approach_goals(
     """Give robots ``(R,)`` their motions in the trajectory of ``part``, their own problem, or turn them to their goals.
 
     Those that would get worse (:meth:`WorkingPlan.take_best`) keep their motions. After a long way a deformation ends
-    metres beside its aim: sampling is worst at arriving, which steering does at once.
+    metres off its aim: sampling is worst at arriving, which steering does at once.
     """
     gap = np.linalg.norm(trajectory.positions - part.goal, axis=2)
     nearest = np.where(trajectory.arrived.any(axis=0), trajectory.arrived.argmax(axis=0), gap.argmin(axis=0))

@@ -92,7 +92,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     def add(one: int, other: int, normal: Floats, room: float, brakes: float, speed: float = 0.0) -> None:
         if room > 0:
             lost = brakes * reaction
-            # As long as there is room nobody has to back off: zero velocities keep to all barriers.
+            # As long as there is room no robot has to back off: zero velocities keep to all barriers.
             least = min(speed_slack + lost - np.sqrt(2 * brakes * room + lost**2), 0.0)
         else:
             least = -PARTING * room
@@ -122,7 +122,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
 
 
 def _near(problem: Problem) -> float:
-    """Return the distance within which something is minded [m]."""
+    """Range of the barriers [m]."""
     speed, acceleration = (problem.team.limits[:, limit].astype(np.float64) for limit in (SPEED, ACCELERATION))
     return NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
 

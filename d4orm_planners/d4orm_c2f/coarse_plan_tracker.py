@@ -83,12 +83,12 @@ class CoarsePlanTracker:
 
     def begin(self, joint: JointState, arrived: BoolArray) -> None:
         """Plan for the episode, in which those ``arrived`` ``(K,)`` stay where they are."""
-        everybody = np.ones(self.problem.num_robots, bool)
-        self._patience, self.stuck = StagnationMonitor(joint), ~everybody
+        all_robots = np.ones(self.problem.num_robots, bool)
+        self._stagnation, self.stuck = StagnationMonitor(joint), ~all_robots
         warm = self._planning.warm_start(self.problem, joint)
         self.guidance = self._planning.plan(self.problem, joint, arrived, warm, self._config.coarse_iterations)
         self.index = 0
-        self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
+        self._follow(joint, self._relayed(joint, all_robots) or self.guidance, all_robots)
 
     def _follow(self, joint: JointState, guidance: CoarseWaypoints, rerouted: BoolArray) -> None:
         """Begin a new guidance, in which robots ``rerouted`` ``(K,)`` have new paths."""
@@ -178,7 +178,7 @@ class CoarsePlanTracker:
 
     def _idle_for_long(self, joint: JointState, arrived: BoolArray) -> BoolArray:
         """``(K,)`` robots without progress for so long that they need another path; also updates :attr:`stuck`."""
-        idle, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
+        idle, self.stuck = self._stagnation.observe(joint.steps, self._indices, self._waiting(joint))
         barred = self._barred(joint, arrived, idle > BARRED_AFTER)
         return np.minimum(idle, joint.steps - self._began) > np.where(barred, BARRED_AFTER, STUCK_AFTER)
 

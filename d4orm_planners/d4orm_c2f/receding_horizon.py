@@ -174,7 +174,7 @@ class D4ormC2F(StatePolicy):
             ahead = self._engine.step(arrays, states, arrived, controls)
             states = ahead.states
         wanted = present_velocities(problem, states, ahead.controls)
-        # Other velocities are reached by the next step, by which everybody will be elsewhere.
+        # Velocities take effect by the next step, so that positions after the present one count.
         safe = safe_velocities(problem, joint._replace(states=states), wanted, ~arrived, gap, speed_slack)
         evading = np.abs(safe - wanted).max(axis=1) > NEARLY * problem.team.max_speed
         if steps > 1:

@@ -48,7 +48,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     Attributes:
         engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
         coarse_factor: ``f``, fine time steps per coarse one.
-        check_interval: ``o``: the coarse plan must keep the margin at every so-manyth coarse step.
+        check_interval: ``o``: coarse steps from one check of the coarse plan's margin to the next.
         coarse_samples: ``M`` of the coarse plan.
         coarse_steps: ``N`` of the coarse plan.
         coarse_repair_steps: The same of repairs of the coarse plan.
@@ -87,7 +87,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         last_resort: Whether robots whose plan would end in contact are told to brake or to evade instead.
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
             control loops, which gives the same controls every time, or ``"off"``.
-        refine_every: At most every so-manyth control loop a refinement begins: it takes time from control loops.
+        refine_every: Least number of control loops between refinements, which take time from the loops.
         replan: Whether the guidance is planned anew for robots that are stuck or astray, and for a team that has lost
             it or has come to its end; for robots with new goals it always is.
         replan_distance: The guidance is planned anew for robots this far from it, and for all if they are so on

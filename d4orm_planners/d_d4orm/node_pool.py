@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from d4orm_env.core.errors import describe
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.base.planner import Iteration
@@ -184,7 +185,7 @@ class NodePool(ABC):
     def _lose_failed(self, job: ThreadJob) -> None:
         assert job.error is not None
         self._error = job.error
-        self._lose(job, f"failed ({type(job.error).__name__}: {' '.join(str(job.error).split())})")
+        self._lose(job, f"failed ({describe(job.error)})")
 
     def _check_alive(self) -> None:
         if not self.alive and self._error is not None:

@@ -15,7 +15,7 @@ from math import ceil
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from d4orm_env.core.errors import first_line
+from d4orm_env.core.errors import describe, first_line
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import available_cores
@@ -69,10 +69,9 @@ class RayConnection:
             elif self._owner:
                 self.ray.init(address=address, log_to_driver=False)
         except Exception as error:  # Ray raises errors of many kinds
-            text = " ".join(str(error).split())
             raise ConnectionError(
-                f"Ray cluster {address!r} cannot be reached ({type(error).__name__}: {text}); "
-                "start one with `ray start --head`, or leave the address out to run on this machine"
+                f"Ray cluster {address!r} cannot be reached ({describe(error)}); start one with `ray start --head`, or "
+                "leave the address out to run on this machine"
             ) from error
 
     def _start_here(self) -> None:

@@ -37,7 +37,7 @@ STARTING = 4
 DETOURS = 32
 """Random points by which a robot tries to drive if it has found no path."""
 AWAY = np.float32(1e6)
-"""Position of a robot that is in nobody's way [m]."""
+"""Coordinate of a robot that is out of the way of all others [m]."""
 SPREAD = 20 / 3
 """Deviation of detours' points from straight paths, beyond half of their lengths, in radii of the largest robot."""
 

@@ -55,7 +55,7 @@ class FleetRobot:
     state: FloatArray  #: ``(n,)`` as last heard; not a number before
     heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
     heading: float = 0.0  #: As last heard [rad]
-    stand: Floats | None = None  #: ``(d,)`` where it is to stand, or is on its way to that, while nobody drives [m]
+    stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]
     command: Any = None  #: ``geometry_msgs/Twist`` that it was given last
     #: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s]
     velocity: Floats = field(default_factory=lambda: np.zeros(3))

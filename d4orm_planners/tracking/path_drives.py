@@ -219,7 +219,7 @@ def drive_routes(problem: Problem, routes: Routes, most_steps: int) -> tuple[Flo
     while True:
         positions[steps, :, :d] = states[0, :, :d]
         direct(routes, paces, lookahead, problem.dt, beyond, size, positions[steps], arrived & problem.docks, progress)
-        # Without docking a robot may come through its goal before it has made way for others.
+        # Without absorbing goals a robot may pass its goal before it has yielded to others.
         done = arrived & (problem.docks | (progress.at == ends))
         arrivals[:] = np.where(done, np.minimum(arrivals, steps), most_steps + 1)
         if steps == most_steps or done.all():

@@ -70,11 +70,11 @@ def alternate(
     (steps, size), d = method.position.shape, len(goal)
     targets = Targets(np.empty((steps, d)), np.empty((steps, d)), np.empty((steps, d)))
     multiplier, right, matrix = np.zeros((size, d)), np.empty((size, d)), np.empty((size, size))
-    minded = np.zeros(len(bodies.radius) + len(bodies.boxes), np.bool_)
-    rows = _mind(method, bodies, robot, guess, minded) + 1  # the bounds are always minded
+    active = np.zeros(len(bodies.radius) + len(bodies.boxes), np.bool_)
+    rows = _activate(method, bodies, robot, guess, active) + 1  # the bounds always are
     bends = 1.0 if limits[1] < math.inf else 0.0
     squares = rows * method.squares[0] + method.squares[1] + bends * method.squares[2]
-    violation, penalty = _project(method, bodies, robot, limits, minded, motion[0], guess, targets), method.penalty
+    violation, penalty = _project(method, bodies, robot, limits, active, motion[0], guess, targets), method.penalty
     for _ in range(method.alternations):
         accumulate(method, targets, bends, right)
         for i in range(size):
@@ -84,7 +84,7 @@ def alternate(
                 right[i, axis] = method.goal[i] * goal[axis] + multiplier[i, axis] + penalty * right[i, axis]
         solve(matrix, right, fixed, motion)
         change = sample(method, motion, guess)
-        violation = _project(method, bodies, robot, limits, minded, motion[0], guess, targets)
+        violation = _project(method, bodies, robot, limits, active, motion[0], guess, targets)
         if max(violation, change) <= method.tolerance:
             break
         accumulate(method, targets, bends, right)
@@ -94,10 +94,10 @@ def alternate(
 
 
 @compiled
-def _mind(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, minded: BoolArray) -> int:
-    """Mark the bodies that come near the guess; how many there are."""
+def _activate(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, active: BoolArray) -> int:
+    """Mark the bodies near the guess, whose constraints are active; returns their number."""
     robots, d, count = len(bodies.radius), bodies.paths.shape[2], 0
-    for body in range(len(minded)):
+    for body in range(len(active)):
         if body == robot:
             continue
         for step in range(len(guess.position)):
@@ -115,7 +115,7 @@ def _mind(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, min
                     gap = max(box[axis] - x, x - box[d + axis], 0.0)
                     square += gap * gap
             if square < (safety_distance + method.lookout) * (safety_distance + method.lookout):
-                minded[body] = True
+                active[body] = True
                 count += 1
                 break
     return count
@@ -127,19 +127,19 @@ def _project(
     bodies: Neighbourhood,
     robot: Whole,
     limits: Floats,
-    minded: BoolArray,
+    active: BoolArray,
     here: Floats,
     guess: Guess,
     targets: Targets,
 ) -> float:
-    """Sum the nearest samples that limits and the bodies ``minded`` ``(K + B,)`` allow into ``targets``.
+    """Sum the nearest samples that limits and the bodies ``active`` ``(K + B,)`` allow into ``targets``.
 
     The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`. Returns the largest violation.
     """
     robots, (steps, d), radius = len(bodies.radius), guess.position.shape, bodies.radius[robot]
     worst = _stay_within(bodies.bounds, radius, limits, guess, targets)
-    for body in range(len(minded)):
-        if not minded[body]:
+    for body in range(len(active)):
+        if not active[body]:
             continue
         if body < robots:
             safety_distance = radius + bodies.radius[body] + bodies.margin

@@ -144,24 +144,24 @@ class Planning:
     def children(self, node: TreeNode, number: int, seeds: list[int], unlucky: int) -> list[TreeNode]:
         """Return a node's children: for each of two robots in conflict, one in which it keeps clear of where they met.
 
-        In a node without a pair in conflict a robot that fails plans anew, or if none does, ``unlucky``.
+        In a node without a pair in conflict a robot that fails plans from noise, or if none does, ``unlucky``.
         """
         one, another = node.pair
         if one < 0:
             failing = [robot for robot, motion in enumerate(node.motions) if motion.fails]
             robot = failing[0] if failing else unlucky
-            return [self._child(node, number, robot, node.constraints[robot], seeds[0], anew=True)]
+            return [self._child(node, number, robot, node.constraints[robot], seeds[0], from_noise=True)]
         added = []
         for count, (robot, other) in enumerate(((one, another), (another, one))):
             own = (*node.constraints[robot], self._constraint(node, robot, other))
-            added.append(self._child(node, number + count, robot, own, seeds[count], anew=False))
+            added.append(self._child(node, number + count, robot, own, seeds[count], from_noise=False))
         return added
 
     def _child(
-        self, node: TreeNode, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, anew: bool
+        self, node: TreeNode, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, from_noise: bool
     ) -> TreeNode:
         others = [other for other in range(len(node.motions)) if other != robot]
-        before = None if anew or self._config.reuse_steps is None else node.motions[robot].motions
+        before = None if from_noise or self._config.reuse_steps is None else node.motions[robot].motions
         motion = self._plan(robot, list(node.motions), others, own, seed, before)
         motions = tuple(motion if k == robot else kept for k, kept in enumerate(node.motions))
         constraints = tuple(own if k == robot else kept for k, kept in enumerate(node.constraints))

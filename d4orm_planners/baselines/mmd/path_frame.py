@@ -1,7 +1,7 @@
 """The frame in which a robot's motion is described: its shortest path, and the clearance on both sides of it.
 
 The model never sees a map. It learns how motions differ from the shortest path driven at an even pace, in lengths of
-that path: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and
+that path: how far ahead or behind on it, and how far to its side. So one model serves all maps, sizes and
 directions, and a robot that waits or hurries stays on its path.
 """
 
@@ -24,7 +24,7 @@ POINTS = 64
 MODES = 16
 """Sines that a difference from the path is made of."""
 LOOKS = 16
-"""Points along the path at which the model is told of the path and of the room beside it."""
+"""Points along the path at which the model gets the path and the clearances on both sides of it."""
 FEATURES = 5 * LOOKS + 2
 """Numbers that the model is told."""
 _ROUNDING = 2
