@@ -213,8 +213,11 @@ class NodePool(ABC):
 
     def _new_records(self) -> list[IterationRecord]:
         """Return records of the nodes' iterations since the last call."""
-        new = [record for node in self._nodes for record in node.search.history[self._read[node] :]]
-        self._read = {node: len(node.search.history) for node in self._nodes}
+        new = []
+        for node in self._nodes:
+            records = node.search.history[self._read[node] :]  # which may grow meanwhile
+            self._read[node] += len(records)
+            new += records
         return new
 
 
