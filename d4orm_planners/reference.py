@@ -3,7 +3,7 @@
 One team is rolled out by a ``lax.scan`` over time, its robots by ``vmap``, the samples by another ``vmap`` on the first
 axis, with ``jax.random`` normals stored in full and the matrix of all distances at every step. The physics is written
 out here a second time, straight from the paper (sections III and IV-B), and shares no code with the core or the
-engines: agreement says something about both, and the benchmark has something to be measured against.
+engines: agreement is evidence for both, and the benchmark has a baseline.
 """
 
 from __future__ import annotations
@@ -209,18 +209,7 @@ def denoise(
 def denoise_around_rest(
     problem: Problem, noise_scale: ArrayLike, num_samples: int, temperature: float, seed: int, collisions: bool = True
 ) -> FloatArray:
-    """:func:`denoise` of a problem from zero controls, back on the host.
-
-    Args:
-        problem: A team of one model.
-        noise_scale: ``(N,)``.
-        num_samples: ``M``.
-        temperature: ``lambda``.
-        seed: Seed of the noise.
-        collisions: As in :func:`denoise`.
-
-    Returns:
-        ``(H, K, m)`` controls.
+    """``(H, K, m)`` controls of :func:`denoise` from zero, for a problem whose robots have one model.
 
     Raises:
         ValueError: If the team mixes models.

@@ -14,26 +14,20 @@ from d4orm_env.engine.types import Engine
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.conflict_groups import Graph, conflicts
 
-PLAN_REACH = LARGEST_NUMBER / LARGEST
-"""Times its limit that a planned control may be, so that no square of it overflows: some methods scale theirs up."""
+MOST_OF_LIMIT = LARGEST_NUMBER / LARGEST
+"""Largest multiple of its limit that a planned control may be, so that its square does not overflow."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Controls and what they lead to.
+    """Controls and what they lead to."""
 
-    Attributes:
-        planned: ``(H, K, m)`` as the method left them, at most :data:`PLAN_REACH` times the limits; zero once docked.
-        controls: ``(H, K, m)`` as executed: inside the limits, zero once docked.
-        trajectory: Their rollout.
-        failed: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked.
-        report: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, and it was not asked.
-    """
-
+    #: ``(H, K, m)`` as the method left them, at most :data:`MOST_OF_LIMIT` times the limits; zero after arrival
     planned: FloatArray
-    controls: FloatArray
-    trajectory: Trajectory
-    failed: BoolArray
+    controls: FloatArray  #: ``(H, K, m)`` as executed: inside the limits, zero after arrival
+    trajectory: Trajectory  #: Their rollout
+    failed: BoolArray  #: ``(K,)`` robots that do not arrive, or violate the margin at some step that was checked
+    #: Report of :func:`d4orm_env.verify`; ``None`` where a robot fails at any step, and it was not asked
     report: VerificationReport | None
 
     @property
@@ -61,12 +55,12 @@ class Candidate:
 
 
 def evaluate_controls(engine: Engine, problem: Problem, controls: FloatArray, check_interval: int = 1) -> Candidate:
-    """Roll controls ``(H, K, m)`` out and evaluate them: failures at some steps, a solution at all."""
-    safety_distance = PLAN_REACH * problem.team.control_limits
-    bounded = np.clip(controls, -safety_distance, safety_distance)
+    """Roll out and evaluate controls ``(H, K, m)``: failures at every ``check_interval``-th step, a solution at all."""
+    bound = MOST_OF_LIMIT * problem.team.control_limits
+    bounded = np.clip(controls, -bound, bound)
     trajectory = engine.rollout(problem, bounded)
-    arrived = trajectory.arrived[:-1, :, None] & problem.docks
-    planned = np.where(arrived, np.float32(0), bounded)
+    at_rest = trajectory.arrived[:-1, :, None] & problem.docks
+    planned = np.where(at_rest, np.float32(0), bounded)
     failed = failed_robots(trajectory, check_interval)
     report = None if failed_robots(trajectory).any() else verify(problem, trajectory.controls)
     return Candidate(planned, trajectory.controls, trajectory, failed, report)
@@ -83,17 +77,17 @@ def failed_robots(trajectory: Trajectory, check_interval: int = 1) -> BoolArray:
 
 
 def step_faults(problem: Problem, trajectory: Trajectory, unreachable: Set[int]) -> dict[int, list[str]]:
-    """Say what each failing robot does wrong at the steps; those without a path to their goals are given."""
+    """Faults of each failing robot at the steps; ``unreachable`` are those without a path to their goals."""
     near = conflicts(trajectory.positions, problem.team.radius, problem.margin)
     rounding = ["comes so near to the margin of something that rounding decides"]
     faults = {}
     for robot in np.flatnonzero(failed_robots(trajectory)).tolist():
-        missed = _not_there(problem, trajectory, robot, robot in unreachable)
+        missed = _missed_goal(problem, trajectory, robot, robot in unreachable)
         faults[robot] = [*missed, *_too_near(problem, trajectory, robot, near)] or rounding
     return faults
 
 
-def _not_there(problem: Problem, trajectory: Trajectory, robot: int, unreachable: bool) -> Iterator[str]:
+def _missed_goal(problem: Problem, trajectory: Trajectory, robot: int, unreachable: bool) -> Iterator[str]:
     if not trajectory.arrived[-1, robot]:
         gap = np.linalg.norm(trajectory.positions[-1, robot] - problem.goal[robot])
         turns = (problem.team.headings(trajectory.states[-1]) - problem.goal_heading)[robot] / (2 * np.pi)

@@ -22,15 +22,10 @@ Groups = tuple[tuple[int, ...], ...]
 
 
 class Grouping(NamedTuple):
-    """A team's groups, and the conflicts that they come from.
+    """A team's groups, and the conflicts that they come from."""
 
-    Attributes:
-        graph: The conflicts.
-        groups: Components of the graph after :func:`reconnected`, singletons included.
-    """
-
-    graph: Graph
-    groups: Groups
+    graph: Graph  #: The conflicts
+    groups: Groups  #: Components of the graph after :func:`reconnected`, singletons included
 
 
 def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
@@ -51,7 +46,7 @@ def graph_of(num_robots: int, pairs: IntArray) -> Graph:
 
 
 def regrouped(graph: Graph, previous: Grouping | None) -> Grouping:
-    """Return the groups of a graph of conflicts that comes after the previous one's."""
+    """The groups of a graph of conflicts that follows a previous one."""
     return Grouping(graph, components(reconnected(graph, previous)))
 
 
@@ -96,7 +91,7 @@ def failure_groups(failed: BoolArray, groups: Groups) -> Groups:
 
 
 def independent_robots(candidates: Iterable[int], graph: Graph) -> tuple[int, ...]:
-    """Return those candidates, taken in order, that conflict with none taken before; sorted."""
+    """Candidates, taken in order, that conflict with none taken before; sorted."""
     taken: set[int] = set()
     for robot in candidates:
         if taken.isdisjoint(graph[robot]):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures import TimeoutError as AnswerLate
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -14,6 +13,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, pos
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
@@ -25,7 +25,7 @@ Mode = Literal["nominal", "measured"]
 FEEDBACK = 0.25
 """Share of a distance from the reference that controls are to make up for within a step."""
 BEYOND = 4
-"""Multiple of the state space beyond it at which measured numbers end."""
+"""Distance beyond the state space at which measured numbers are cut off, in sizes of the space."""
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
 
@@ -68,8 +68,8 @@ class Controller:
     ``"measured"`` the policy sees what was measured. In both, controls make up for what pushes a robot all the time, as
     a thrust that is too weak does (:mod:`d4orm_planners.base.disturbance_observer`).
 
-    What is not a number in measured states is missing, and the reference takes its place. Speeds and coordinates beyond
-    what a robot's model allows count as the limit. A step that comes too late delays the reference; it never leaps.
+    Measured states that are not finite are missing, and replaced by the reference. Speeds and coordinates beyond what a
+    robot's model allows count as the limit. A late step delays the reference; it never leaps.
 
     Args:
         policy: Anything that :func:`~d4orm_planners.make_policy` takes.
@@ -78,12 +78,12 @@ class Controller:
             feedback, in mode ``"nominal"`` or with a tracker. By default 0.5 with a tracker, which has its robot tilt
             or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
-            meanwhile, and its answer, which would be too late, is not used. ``None`` waits. A policy that is named and
-            has a ``deadline``, as D4orm-C2F, gets nine tenths of it, and plans anew beside its loops.
+            meanwhile, and its late answer is not used. ``None`` waits. A policy that is named and
+            has a ``deadline``, as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
-            are shifted by what keeps the robots beside the reference, as a thrust that is too weak does, up to the
+            are shifted against a lasting distance from the reference, as a thrust that is too weak causes, up to the
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
             way a step: all at once would ask again for what the robots are about to do.
         **settings: Of the policy.
@@ -114,8 +114,7 @@ class Controller:
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = tracker
         self._lag, self._leads = lag, mode == "nominal" or tracker
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="controller")
-        self._late: Future[Actions] | None = None
+        self._background: Background[Actions] = Background()
         self._env: Any = None
 
     def __enter__(self) -> Self:
@@ -126,7 +125,7 @@ class Controller:
 
     def close(self) -> None:
         """End the policy's thread as soon as it has answered."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        self._background.close()
 
     def begin(self, problem: Problem, states: ArrayLike, time: float = 0.0, seed: int = 0) -> None:
         """Take over a team; policies that plan do so now, however long it takes.
@@ -140,7 +139,7 @@ class Controller:
         Raises:
             ValueError: If the states have another shape, or the lag fits no team of this size.
         """
-        self._wait_for_late(None)
+        self._background.forget()
         try:
             self._begin(problem, states, float(time), seed)
         except BaseException:
@@ -223,7 +222,7 @@ class Controller:
         return plausible
 
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
-        parked = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
+        at_rest = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
         self._observer.observe(measured, known)
         if self.tracker:
             self._shift(measured, known)
@@ -231,7 +230,7 @@ class Controller:
             seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
             if not self.over:
                 possible = self._possible(seen)
-                self._observations, _ = self._env.set_state(np.where(parked[:, None], self._joint.states, possible))
+                self._observations, _ = self._env.set_state(np.where(at_rest[:, None], self._joint.states, possible))
             measured = measured if self.tracker else seen
         before, actions = self._joint, self._actions()
         moving = before.states if self._leads else measured
@@ -241,14 +240,14 @@ class Controller:
             actions = dict(zip(self._env.possible_agents, brakes)) if actions is None else actions
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
-        controls = self._with_feedback(measured, known if self._leads else known & parked, controls)
+        controls = self._with_feedback(measured, known if self._leads else known & at_rest, controls)
         return self._described(before, self._observer.compensated(controls, self.arrived), held)
 
     def _shift(self, measured: FloatArray, known: BoolArray) -> None:
-        """Shift setpoints against what keeps robots beside the reference, by as much as the margin."""
+        """Shift setpoints against a lasting distance from the reference, at most by the margin."""
         d, margin = self.problem.dimension, self.problem.margin
-        beside = np.where(known[:, None], self._joint.states[:, :d] - measured[:, :d], 0.0)
-        self._lead = np.clip(self._lead + GAIN * beside, -margin, margin)
+        error = np.where(known[:, None], self._joint.states[:, :d] - measured[:, :d], 0.0)
+        self._lead = np.clip(self._lead + GAIN * error, -margin, margin)
 
     def _blended(self, measured: FloatArray) -> FloatArray:
         """``(K, n)`` the reference, moved towards what was measured by a share that the lag allows."""
@@ -256,26 +255,11 @@ class Controller:
         return self._joint.states + (self._observer.trust * off).astype(np.float32)
 
     def _actions(self) -> Actions | None:
-        """Return the policy's actions; ``None`` if they do not come in time, or no longer."""
-        if self.over or not self._wait_for_late(0.0):
+        """Return the policy's actions; ``None`` if they do not come in time, or the episode is over."""
+        if self.over:
             return None
         acting = {agent: self._observations[agent] for agent in self._env.agents}
-        answer = self._executor.submit(self.policy.act, acting, self._env.state())
-        try:
-            return answer.result(self.timeout)
-        except AnswerLate:
-            self._late = answer
-            return None
-
-    def _wait_for_late(self, seconds: float | None) -> bool:
-        """Wait for an answer that is overdue and of no use any more, and return whether none is."""
-        if self._late is not None:
-            try:
-                self._late.result(seconds)
-            except AnswerLate:
-                return False
-            self._late = None
-        return True
+        return self._background.run(partial(self.policy.act, acting, self._env.state()), self.timeout)
 
     def _with_feedback(self, measured: FloatArray, follows: BoolArray, controls: FloatArray) -> FloatArray:
         """``(K, m)`` controls that bring those robots from where they were measured to the reference."""

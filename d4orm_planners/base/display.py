@@ -1,6 +1,6 @@
-"""Display of plans and episodes: text, pictures, replays; and text of others where more is read into it than text.
+"""Display of plans and episodes as text, pictures and replays; and escaping of text from untrusted sources.
 
-Names of scenarios and policies, messages of errors and whatever else a store of trials holds may come from anybody.
+Names of scenarios and policies, error messages and all else in a store of trials may come from anybody.
 """
 
 from __future__ import annotations

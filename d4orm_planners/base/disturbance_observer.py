@@ -1,4 +1,4 @@
-"""An estimate of what pushes robots all the time: a thrust that is too weak, a slope, a steady wind."""
+"""An estimate of constant disturbances: a thrust that is too weak, a slope, a steady wind."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from d4orm_env.core.problem import Problem
 from d4orm_planners.tracking.steering import limit_controls
 
 GAIN = 0.1
-"""Share of what is left unexplained in a step that goes into the estimate."""
+"""Share of a step's residual that goes into the estimate."""
 MOST = 0.5
 """Largest estimate, as a share of the control's limit: the rest is needed to steer."""
 
 
 class DisturbanceObserver:
-    """The part of each robot's motion that its controls do not explain, for models whose controls are derivatives.
+    """Estimator of the disturbance of each robot, for models whose controls are derivatives.
 
     ``y(t+1) = y(t) + dt (u(t) + bias)``, where ``y`` is the velocity of double integrators and the position of
     first-order ones, and ``u`` follows the control with a first-order lag.
@@ -26,7 +26,7 @@ class DisturbanceObserver:
         lag: Time constant of the actuators [s], one or ``K``.
 
     Attributes:
-        trust: ``(K, 1)`` share of a robot's way off a reference that is not what its lag has yet to do.
+        trust: ``(K, 1)`` share of a robot's distance from its reference that its lag does not explain.
         bias: ``(K, d)`` the estimate, in units of the controls; zero for other models.
 
     Raises:
@@ -101,7 +101,7 @@ class DisturbanceObserver:
         return executed
 
     def compensated(self, controls: FloatArray, resting: BoolArray) -> FloatArray:
-        """``(K, m)`` controls that come to what these would without the disturbance; unchanged for robots at rest."""
+        """``(K, m)`` controls with the same effect as these without the disturbance; unchanged for robots at rest."""
         d, wanted = self.problem.dimension, controls.copy()
         wanted[:, :d] -= np.where(resting[:, None], 0.0, self.bias).astype(np.float32)
         sent = limit_controls(self.problem, wanted)

@@ -30,7 +30,7 @@ class Driving:
 
     @contextmanager
     def turn(self, env: Any = None) -> Iterator[None]:
-        """While a thread resets the policy for an environment or, without one, asks it for controls.
+        """Context in which a thread resets the policy for an environment or, without one, asks it for controls.
 
         Raises:
             RuntimeError: If another thread does so at this moment, or has reset the policy for its own environment.

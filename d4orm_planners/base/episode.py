@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -22,7 +22,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
-from d4orm_planners.base.policy import Policy
+from d4orm_planners.base.policy import Policy, robot_indices
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -67,7 +67,7 @@ class Episode(DisplayMixin):
 
     @property
     def controls(self) -> FloatArray:
-        """``(H, K, m)`` what was executed within the horizon, then zeros: a planner's ``initial_controls``."""
+        """``(H, K, m)`` executed controls within the horizon, then zeros: a planner's ``initial_controls``."""
         executed = self.trajectory.controls[: self.problem.horizon]
         controls = np.zeros((self.problem.horizon, *executed.shape[1:]), np.float32)
         controls[: len(executed)] = executed
@@ -83,7 +83,7 @@ class Episode(DisplayMixin):
 
 
 def check_physics(problem: Problem, physics: str) -> None:
-    """Refuse what is no physics, or none for a problem.
+    """Refuse an unknown physics, or one in which the robots of a problem have no bodies.
 
     Raises:
         ValueError: If it is not one of :data:`PHYSICS`, or robots have no bodies in it.
@@ -154,7 +154,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
     observations, infos = env.reset(seed=seed)
     problem = env.unwrapped.problem
     actor.reset(env, seed=seed)
-    # What is recorded is the truth, whatever the policy sees.
+    # The record has the true states, not those that the policy observes.
     joints, effects = [split_state(problem, env.unwrapped.true_state())], [env.unwrapped.effect().copy()]
     all_observations, all_infos = [observations], [infos]
     outcomes = [_outcome(env, {})]
@@ -196,32 +196,26 @@ def _moved_by(env: ParallelEnv, physics: str) -> ParallelEnv:
     return physics_module(physics).parallel_env(**env.options.keywords())
 
 
-class _Outcome(NamedTuple):
-    """Outcome of a step for every robot, each ``(K,)``."""
-
-    rewards: FloatArray
-    collided: BoolArray
-    margin_violated: BoolArray
-
-
-def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> _Outcome:
-    """Return the outcome of the last step for all robots, those that have left and may be run into included."""
+def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """``(K,)`` rewards, contacts and margin violations of the last step, of robots that have left the episode too."""
     step = env.unwrapped.last_step
-    outcome = _Outcome(step.rewards.copy(), step.collided, step.margin_violated)
-    for agent, reward in rewards.items():  # as wrappers have made them
-        outcome.rewards[int(agent.rsplit("_", 1)[1])] = reward
-    return outcome
+    all_rewards = step.rewards.copy()
+    all_rewards[robot_indices(rewards)] = [*rewards.values()]  # as wrappers have made them
+    return all_rewards, step.collided, step.margin_violated
 
 
-def _trajectory(problem: Problem, joints: list[JointState], outcomes: list[_Outcome]) -> Trajectory:
+def _trajectory(
+    problem: Problem, joints: list[JointState], outcomes: list[tuple[FloatArray, BoolArray, BoolArray]]
+) -> Trajectory:
     """Join the reset and all steps to one trajectory."""
     states = np.stack([joint.states for joint in joints])
+    rewards, collided, margin_violated = map(np.stack, zip(*outcomes))
     return Trajectory(
         states=states,
         positions=states[..., : problem.dimension],
         controls=np.stack([joint.controls for joint in joints[1:]]),
-        rewards=np.stack([outcome.rewards for outcome in outcomes[1:]]),
+        rewards=rewards[1:],
         arrived=np.stack([joint.arrived for joint in joints]),
-        collided=np.stack([outcome.collided for outcome in outcomes]),
-        margin_violated=np.stack([outcome.margin_violated for outcome in outcomes]),
+        collided=collided,
+        margin_violated=margin_violated,
     )

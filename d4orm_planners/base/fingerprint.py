@@ -1,4 +1,4 @@
-"""Fingerprints of objects, by which a store of trials tells a user's instances and functions from others."""
+"""Fingerprints of objects, by which a store of trials distinguishes a user's instances and functions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from d4orm_env.core.problem import Problem
 
 
 def attributes(thing: object) -> dict[str, object]:
-    """All that tells an instance or a function from others of the same source, by name, as JSON has it.
+    """All that distinguishes an instance or a function from others of the same source, by name, as JSON has it.
 
-    These are an instance's attributes, and a function's arguments by default and what it closes over. Numbers, truth
-    values and text are themselves, and all else is a digest.
+    These are the attributes of an instance, and the default arguments and closure of a function. Numbers, truth values
+    and text stay as they are; of all else there is a digest.
 
     Raises:
         ValueError: If one of them cannot be told from others of its type, as an open file.
@@ -49,7 +49,7 @@ def _described(values: Mapping[str, object], owner: object) -> dict[str, object]
     for name, value in values.items():
         try:
             found[name] = digests.of(value)
-        except Exception as error:  # objects say by methods of their own what they are made of
+        except Exception as error:  # objects reduce themselves by methods of their own
             called = getattr(owner, "__name__", type(owner).__name__)
             raise ValueError(
                 f"{name!r} of {called} cannot be told from others of its kind "
@@ -76,7 +76,7 @@ class _Digests:
         return self._known[id(value)][1]
 
     def _parts(self, value: object) -> list[object]:
-        """Return what tells an object from others of its type."""
+        """The parts that distinguish an object from others of its type."""
         if isinstance(value, list | tuple) and type(value) in (list, tuple):
             return list(value)
         if type(value) is dict:

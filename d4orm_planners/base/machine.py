@@ -1,4 +1,4 @@
-"""The machine and the versions of libraries, for the record of what was measured, and the provenance of plans."""
+"""The machine and the versions of libraries, for records of measurements and the provenance of plans."""
 
 from __future__ import annotations
 
@@ -55,16 +55,11 @@ def commit() -> str:
     package = Path(__file__).parents[1]
     if not (package.parent / ".git").exists():
         return ""
+    describe = ["git", "-C", str(package), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"]
     try:
-        number, changes = (
-            subprocess.run(
-                ["git", "-C", str(package), *words], capture_output=True, text=True, check=True, timeout=10
-            ).stdout.strip()
-            for words in (("rev-parse", "--short=12", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
-        )
+        return subprocess.run(describe, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return ""
-    return number + ("+" if changes else "")
 
 
 def _processor() -> str:
@@ -79,19 +74,12 @@ def _processor() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Origin of a plan, beside its planner's name and the seed.
+    """Origin of a plan, in addition to its planner's name and the seed."""
 
-    Attributes:
-        preset: Of :func:`~d4orm_planners.make_planner`; ``None`` for the defaults.
-        settings: All settings of the planner, by name; what JSON has no word for as text.
-        version: Of this package.
-        machine: Processor, cores and system, as the benchmark describes them.
-    """
-
-    preset: str | None
-    settings: Mapping[str, object]
-    version: str
-    machine: Mapping[str, object]
+    preset: str | None  #: Of :func:`~d4orm_planners.make_planner`; ``None`` for the defaults
+    settings: Mapping[str, object]  #: All settings of the planner, by name; what JSON has no word for as text
+    version: str  #: Of this package
+    machine: Mapping[str, object]  #: Processor, cores and system, as the benchmark describes them
 
     def __post_init__(self) -> None:
         kinds = {"preset": (str, type(None)), "settings": Mapping, "version": str, "machine": Mapping}

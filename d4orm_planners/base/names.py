@@ -1,4 +1,4 @@
-"""The tables of planners and policies by name, which users and other packages extend."""
+"""Registries of planners and policies, which users and other packages extend."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class Plan(DisplayMixin):
         planner: Name of the planner.
         problem: The problem.
         seed: The seed.
-        controls: ``(H, K, m)`` inside the limits, zero once docked.
+        controls: ``(H, K, m)`` inside the limits, zero after arrival.
         solved: Whether everyone arrives, the margin is kept at every step, and :func:`d4orm_env.verify` found no fault.
         status: End of the search. ``"solved"``: with a solution. ``"iteration_limit"`` or ``"time_limit"``: with the
             budget, so without a solution unless it was to be improved. ``"stopped"`` (by the callback) or
@@ -152,8 +152,8 @@ class Plan(DisplayMixin):
     def failures(self) -> dict[str, str]:
         """The robots that the plan leaves unsolved, and why: a sentence for each, by agent name; empty if it is solved.
 
-        It is the proof where there is one; else what each does wrong at the steps, or if none does anything, what
-        :func:`d4orm_env.verify` found.
+        It is the proof of infeasibility, or the faults of each robot at the steps, or if there are none, the violations
+        that :func:`d4orm_env.verify` found.
         """
         if self.solved:
             return {}
@@ -258,8 +258,8 @@ class Plan(DisplayMixin):
     def load(cls, path: str | os.PathLike[str]) -> Plan:
         """Read a plan that :meth:`save` wrote. Nothing is unpickled, nor unpacked beyond what the problem has room for.
 
-        What the file says of its controls is judged anew: ``solved`` and the metrics of the trajectory are what is
-        found here, and so is the trajectory itself, unless the file's is the same but for rounding.
+        The controls are evaluated again: ``solved``, the metrics and the trajectory are the result of that, unless the
+        trajectory in the file is the same but for rounding.
 
         Raises:
             FileNotFoundError: If there is no such file.
@@ -269,5 +269,5 @@ class Plan(DisplayMixin):
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """:meth:`Plan.load`, beside :func:`d4orm_env.load_problem`."""
+    """Read a plan, as :meth:`Plan.load` does."""
     return Plan.load(path)

@@ -1,4 +1,4 @@
-"""Files of plans: ``.npz`` without pickles, judged anew when they are read."""
+"""Files of plans: ``.npz`` without pickles, evaluated again when they are read."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def save_plan(plan: Plan, path: str | os.PathLike[str]) -> None:
         "provenance": None if plan.provenance is None else asdict(plan.provenance),
         **{name: getattr(plan, name) for name in _SCALARS},
     }
-    arrays = {field.name: getattr(plan.trajectory, field.name) for field in fields(Trajectory)}
+    arrays = {name: getattr(plan.trajectory, name) for name in _ARRAYS}
     with replaced_when_done(target) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 

@@ -94,10 +94,10 @@ class Planner(ABC):
 
     @abstractmethod
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
-        """One iteration from the search's current candidate to the next: the new state, and what came of it."""
+        """One iteration from the search's current candidate: the new state, and the next candidate."""
 
     def finish(self, search: SolveRun, state: State) -> None:  # noqa: B027 - a hook that most planners need not fill
-        """Let go of what the state holds open; called once after :meth:`init`, however the solve ends."""
+        """Release the resources of the state; called once after :meth:`init`, however the solve ends."""
 
     def within(self, communication_range: float) -> Planner:
         """This planner where robots know of others within this range [m] only; itself if it is a central one."""
@@ -160,7 +160,7 @@ class Planner(ABC):
 
 
 def _run(search: SolveRun, most: int, callback: Callback | None) -> Status:
-    """Iterate until something ends the search, and say what."""
+    """Iterate until something ends the search; returns the reason."""
     while not search.is_over:
         if search.iteration >= most:
             return "iteration_limit"

@@ -1,4 +1,4 @@
-"""Planners and policies: by name, those that come with the package and those that users bring, or given themselves."""
+"""Planners and policies by name, import path or object."""
 
 from __future__ import annotations
 
@@ -37,19 +37,14 @@ def list_policies() -> tuple[str, ...]:
     return (*PLANNERS, *POLICIES)
 
 
-def describe_planner(name: str) -> str:
-    """The first line of a planner's documentation."""
-    return _summary(_planner_class(name))
-
-
 def preset_names(name: str) -> tuple[str, ...]:
     """The presets of a planner or policy."""
     return tuple(_presets(find_policy(name)))
 
 
 def describe_policy(name: str) -> str:
-    """The first line of a policy's documentation."""
-    return _summary(find_policy(name))
+    """The first line of a planner's or policy's documentation."""
+    return (find_policy(name).__doc__ or "").strip().partition("\n")[0]
 
 
 def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None = None, **config: object) -> Planner:
@@ -134,7 +129,7 @@ def is_brought(policy: object) -> bool:
 
 
 def origin(policy: object) -> object:
-    """Return what :func:`make_policy` takes for a policy in any process, whatever was registered there."""
+    """The import path or object of a policy, which :func:`make_policy` takes in any process without registration."""
     for table in (PLANNERS, POLICIES):
         if isinstance(policy, str) and policy in table:
             return table.origin(policy)
@@ -173,10 +168,10 @@ def default_settings(policy: str) -> dict[str, object]:
 
 
 def policy_settings(name: object, **config: Any) -> dict[str, object]:
-    """All that tells ``make_policy(name, **config)`` from other policies of that name.
+    """All that distinguishes ``make_policy(name, **config)`` from other policies of that name.
 
-    These are its settings, defaults filled in where a configuration class has them; a preset has become its settings.
-    A policy that does not come with this package has the digest of its source as well.
+    These are its settings, with the defaults of a configuration class, and with those of a preset in its place. A
+    policy from outside this package has the digest of its source as well.
 
     Raises:
         ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.
@@ -212,7 +207,7 @@ def _presets(kind: object) -> Presets:
 
 
 def _policy_config(kind: object, config_class: type[Config], given: Mapping[str, object], owner: str) -> Config:
-    """A policy's settings; one that has presets may be given one beside them."""
+    """A policy's settings, with those of a preset where the policy has presets."""
     config, presets = dict(given), _presets(kind)
     preset = config.pop("preset", None) if presets else None
     return _configured(config_class, presets, preset, config, owner)
@@ -285,7 +280,3 @@ def _time_limit(config: dict[str, object]) -> float | None:
 def _called(thing: object) -> str:
     """Return the name of a policy for messages."""
     return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
-
-
-def _summary(kind: object) -> str:
-    return (kind.__doc__ or "").strip().partition("\n")[0]

@@ -1,4 +1,4 @@
-"""Policies: what acts in an ``env.step`` loop, from observations and ``env.state()`` alone."""
+"""Policies, which act in an ``env.step`` loop from observations and ``env.state()`` alone."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Policy(ABC):
         return {}
 
     def identity(self) -> dict[str, object]:
-        """Identity that a store of trials tells this instance by from others of its class, as JSON has it.
+        """Identity by which a store of trials distinguishes this instance from others of its class, as JSON has it.
 
         By default the settings in ``config``, if it has any, else its attributes, which are digests unless they are
         numbers or text.
@@ -107,7 +107,7 @@ class Policy(ABC):
 
     @classmethod
     def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
-        """The same of an instance with these settings; more than they are where they name what may change."""
+        """The same of an instance with these settings; a subclass adds the content of files that they name."""
         return config.keywords()
 
 
@@ -211,8 +211,8 @@ class OpenLoop(StatePolicy):
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         if self.planner is not None:
-            reach = env.unwrapped.options.communication_range
-            planner = self.planner if reach is None else self.planner.within(reach)
+            limit = env.unwrapped.options.communication_range
+            planner = self.planner if limit is None else self.planner.within(limit)
             self.plan = planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
         elif self.plan is not None and self.plan.problem != self.problem:
             raise ValueError(

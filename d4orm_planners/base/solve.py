@@ -1,4 +1,4 @@
-"""One solve on its way: what a planner's iterations see of it, and how they follow each other."""
+"""The state of a solve, and the sequence of its iterations."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class Stopwatch:
-    """Wall time since it was made, what was left out not counted."""
+    """Wall time since its construction, without pauses."""
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
@@ -51,7 +51,7 @@ class Stopwatch:
 
     @property
     def paused_seconds(self) -> float:
-        """Seconds left out so far, those of a pause that lasts included; other threads may look."""
+        """Seconds of all pauses so far, the present one included; other threads may read it."""
         since = self._paused_since
         return self._paused if since is None else self._paused + time.perf_counter() - since
 
@@ -71,7 +71,7 @@ class Stopwatch:
 
 
 class SolveRun:
-    """One solve on its way.
+    """The state of a solve.
 
     Args:
         planner: Planner that iterates.
@@ -80,8 +80,8 @@ class SolveRun:
         initial_controls: ``(H, K, m)`` to start from; zeros by default.
         engine: Engine for rollouts and samples, if not the planner's own.
         evaluate: Function that makes a candidate of an iteration's controls, if not :func:`evaluate_controls`.
-        check_interval: Failures are looked for at every so many steps only (paper, section VI-A); a solution keeps the
-            margin at all steps.
+        check_interval: Number of steps between checks for failures (paper, section VI-A); a solution keeps the margin
+            at all steps.
 
     Attributes:
         watch: Time used.
@@ -121,7 +121,7 @@ class SolveRun:
         with self.watch.paused():
             # The first rollout may compile.
             self.engine.rollout(problem, controls)
-        # A plan of fewer steps is looked at where it ends.
+        # A shorter plan is checked at its end.
         self.check_interval = min(check_interval, problem.horizon)
         of_controls = partial(evaluate_controls, self.engine, problem, check_interval=self.check_interval)
         self.current = self.best = of_controls(controls)
@@ -147,7 +147,7 @@ class SolveRun:
         return self.best.solved and not self.planner.config.improve
 
     def should_stop(self) -> bool:
-        """Check whether an iteration must come to its end as it is."""
+        """Check whether the present iteration must end early."""
         return self.time_left == 0 or self.cancelled.is_set()
 
     def score(self, controls: ArrayLike) -> FloatArray:

@@ -1,6 +1,4 @@
-"""A team's controls in the course of an iteration, changed for some robots after others; and final approaches, in which
-robots turn straight to their goals in time, and drive further in where rounding decides.
-"""
+"""A team's plan during an iteration, changed robot by robot, and final approaches straight to the goals."""
 
 from __future__ import annotations
 
@@ -9,9 +7,9 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
@@ -26,10 +24,8 @@ if TYPE_CHECKING:
 else:
     path_index = LazyModule("d4orm_planners.engine.path_index")
 
-MISSING = 5
-"""Robots that a robot may meet rather than never arrive, or touch an obstacle."""
-
-Costs = NDArray[np.float64]
+MISSED_GOAL = 5
+"""Cost of not arriving, or of touching an obstacle, in robots met."""
 
 
 class WorkingPlan:
@@ -44,7 +40,7 @@ class WorkingPlan:
         controls: ``(H, K, m)``.
         states: ``(H+1, K, n)``.
         arrived: ``(K,)`` whether each ends at its goal.
-        refused: ``(K,)`` step of the fault that the report finds with each; ``H + 1`` for none, or once it moves.
+        reported: ``(K,)`` step of each robot's fault in the report; ``H + 1`` for none, or once it moves.
         index: Positions of all robots.
     """
 
@@ -52,13 +48,13 @@ class WorkingPlan:
         self.search, self.problem = search, search.problem
         self.controls, self.states = trajectory.controls.copy(), trajectory.states.copy()
         self.arrived: BoolArray = trajectory.arrived[-1].copy()
-        self.refused = np.full(self.problem.num_robots, self.problem.horizon + 1)
+        self.reported = np.full(self.problem.num_robots, self.problem.horizon + 1)
         arrivals = arrival_steps(trajectory.arrived)
         for violation in () if report is None else report.violations:
             robots = list(violation.robots)
             # Who has not arrived may stop where it seems to.
             step = np.minimum(int(violation.time / self.problem.dt) + 1, arrivals[robots])
-            self.refused[robots] = np.minimum(self.refused[robots], step)
+            self.reported[robots] = np.minimum(self.reported[robots], step)
         # The engine, in float32, must not find near what this has found clear.
         margin = self.problem.margin + self.problem.rounding
         self.index = path_index.PathIndex(trajectory.positions, self.problem.team.radius, margin)
@@ -76,33 +72,32 @@ class WorkingPlan:
         return self.index.positions
 
     def conflicts(self) -> Graph:
-        """Return which robots come within the margin of each other after the start, at the steps that are checked."""
+        """The robots that come within the margin of each other after the start, at the steps that are checked."""
         return graph_of(self.problem.num_robots, self._checked.pairs())
 
     def move(self, robots: ArrayLike, controls: FloatArray, states: FloatArray, arrived: ArrayLike) -> None:
-        """Let robots ``(R,)`` do otherwise: ``(H, R, m)``, ``(H+1, R, n)`` and ``(R,)``."""
+        """Give robots ``(R,)`` other controls ``(H, R, m)``, states ``(H+1, R, n)`` and arrivals ``(R,)``."""
         index = np.asarray(robots)
         self.controls[:, index] = 0
         self.controls[:, index, : controls.shape[2]] = controls
         self.states[:, index] = 0
         self.states[:, index, : states.shape[2]] = states
         self.arrived[index] = arrived
-        self.refused[index] = self.problem.horizon + 1
+        self.reported[index] = self.problem.horizon + 1
         self.index.move(index, states[..., : self.problem.dimension])
         if self._checked is not self.index:
             self._checked.move(index, states[:: self._interval, :, : self.problem.dimension])
 
-    def faults(self, robots: ArrayLike) -> tuple[Costs, IntArray]:
-        """Return the faults of robots ``(R,)`` at present, at the steps that are checked.
+    def faults(self, robots: ArrayLike) -> tuple[Floats, IntArray]:
+        """``(R,)`` present faults of robots ``(R,)`` at the steps that are checked, and ``(R,)`` the step of the first.
 
-        Returns:
-            ``(R,)`` counted in robots met: a missed goal and contact with an obstacle amount to several, docking where
-            rounding decides to one. And ``(R,)`` the step of the first fault, for those that have any.
+        They are counted in robots met: a missed goal and contact with an obstacle amount to :data:`MISSED_GOAL`, an
+        arrival that rounding decides to one. The steps mean something for robots with faults only.
         """
         index = np.asarray(robots)
         costs, first = self._costs(index, self.positions[:, index].swapaxes(0, 1)[:, None], self.arrived[index, None])
-        refused = self.refused[index]
-        return np.floor(costs[:, 0]) + (refused <= self.problem.horizon), np.minimum(first[:, 0], refused)
+        reported = self.reported[index]
+        return np.floor(costs[:, 0]) + (reported <= self.problem.horizon), np.minimum(first[:, 0], reported)
 
     def take_best(self, robots: ArrayLike, paths: Rollouts, *, or_longer: bool = False) -> None:
         """Let one robot after the other take the best of its paths, if that is better than what it does.
@@ -113,8 +108,8 @@ class WorkingPlan:
             or_longer: Take it even if it takes longer, as long as it has no more faults.
         """
         for i, robot in enumerate(np.asarray(robots).tolist()):
-            costs = self._costs_beside(robot, np.moveaxis(paths.positions[:, i], 1, 0), paths.arrived[i])
-            if self.refused[robot] <= self.problem.horizon:
+            costs = self._path_costs(robot, np.moveaxis(paths.positions[:, i], 1, 0), paths.arrived[i])
+            if self.reported[robot] <= self.problem.horizon:
                 costs[0] += 1
                 costs[1:] += (paths.states[:, i] == self.states[:, robot, None, : paths.states.shape[3]]).all(
                     axis=(0, 2)
@@ -123,20 +118,20 @@ class WorkingPlan:
             if costs[1 + best] < (np.floor(present) + 1 if or_longer else present):
                 self.move([robot], paths.controls[:, [i], best], paths.states[:, [i], best], paths.arrived[[i], best])
 
-    def _costs_beside(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Costs:
-        """``(1 + V,)`` costs of what a robot does and of its paths ``(V, H+1, d)``; all zero if these are just that."""
+    def _path_costs(self, robot: int, paths: FloatArray, arrived: BoolArray) -> Floats:
+        """``(1 + V,)`` costs of a robot's present path and of others ``(V, H+1, d)``; all zero if they are the same."""
         positions = np.concatenate([self.positions[None, :, robot], paths])
         arrives = np.append(self.arrived[robot], arrived)
-        # Most turn to their goals when they head there anyhow: what is done before costs as much again.
+        # Most paths turn to the goal where the robot heads for it anyhow. Equal ones are checked once.
         alike = (positions[:, None] == positions[:2]).all(axis=(2, 3)) & (arrives[:, None] == arrives[:2])
         same = np.where(alike.any(axis=1), alike.argmax(axis=1), np.arange(len(positions)))
         different, which = np.unique(same, return_inverse=True)
         if len(different) == 1:
             return np.zeros(len(positions))
-        costs: Costs = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
+        costs: Floats = self._costs([robot], positions[None, different], arrives[None, different])[0][0, which]
         return costs
 
-    def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Costs, IntArray]:
+    def _costs(self, robots: ArrayLike, paths: FloatArray, arrived: BoolArray) -> tuple[Floats, IntArray]:
         """``(R, V)`` faults of paths ``(R, V, H+1, d)``, plus the share of the horizon that they take, less than one;
         and the step of the first fault.
         """
@@ -148,7 +143,7 @@ class WorkingPlan:
             touching = path_index.check_alone(self.problem.arrays, robots, checked)[0] * self._interval
             # What there is none of comes after the last step.
             meeting = np.minimum(meeting * self._interval, horizon + 1)
-        faults = met + (unsure <= horizon) + MISSING * (~arrived | (touching <= horizon))
+        faults = met + (unsure <= horizon) + MISSED_GOAL * (~arrived | (touching <= horizon))
         return faults + moves / (horizon + 1), np.minimum(np.minimum(meeting, touching), unsure)
 
 
@@ -165,11 +160,10 @@ SHARES = (1.0, 0.5, 0.75, 0.25)
 def approach_goals(
     team: WorkingPlan, robots: IntArray, part: Problem, trajectory: Trajectory, *, or_longer: bool = False
 ) -> None:
-    """Let ``robots`` ``(R,)`` of the team do as in the trajectory in ``part``, the problem of them alone, or turn to
-    their goals in time; those that get worse (:meth:`WorkingPlan.take_best`) stay as they were.
+    """Give robots ``(R,)`` their motions in the trajectory of ``part``, their own problem, or turn them to their goals.
 
-    A deformation ends metres from where it was aimed at after a long way: arriving is what sampling does worst, and
-    steering does at once.
+    Those that would get worse (:meth:`WorkingPlan.take_best`) keep their motions. After a long way a deformation ends
+    metres off its aim: sampling is worst at arriving, which steering does at once.
     """
     gap = np.linalg.norm(trajectory.positions - part.goal, axis=2)
     nearest = np.where(trajectory.arrived.any(axis=0), trajectory.arrived.argmax(axis=0), gap.argmin(axis=0))
@@ -187,7 +181,7 @@ def approach_goals(
 
 
 def drive_further_in(search: SolveRun, candidate: Candidate, evaluate: Callable[[FloatArray], Candidate]) -> Candidate:
-    """The candidate, or if rounding alone decides who has arrived in it, one whose robots drive further in."""
+    """The candidate, or one whose robots drive further in if rounding alone decides who has arrived."""
     report = candidate.report
     if report is None or report.ok or any(violation.kind != "not arrived" for violation in report.violations):
         return candidate
@@ -207,7 +201,7 @@ def drive_further_in(search: SolveRun, candidate: Candidate, evaluate: Callable[
 
 
 def _driven(search: SolveRun, candidate: Candidate, robot: int, step: int, share: float) -> FloatArray:
-    """The team's controls, where a robot takes a share of its control at a step and then drives to the goal."""
+    """The team's controls, in which a robot takes a share of its control at a step and then drives to the goal."""
     part, controls = search.problem.select([robot]), candidate.controls.copy()
     own = np.ascontiguousarray(controls[:, [robot], : part.control_size])
     own[step] *= np.float32(share)

@@ -37,22 +37,17 @@ Rows = tuple[Expression, float, float]
 
 
 class CollocatedMotion(NamedTuple):
-    """Decision variables of the program.
+    """Decision variables of the program."""
 
-    Attributes:
-        states: ``(H+1, K, n)``, the start first.
-        controls: ``(H, K, m)``.
-    """
-
-    states: Floats
-    controls: Floats
+    states: Floats  #: ``(H+1, K, n)``, the start first
+    controls: Floats  #: ``(H, K, m)``
 
 
 class TeamProgram:
     """Direct collocation of a problem: the states and controls of all robots at all steps are variables.
 
     A control is held over its step, and the defect of a step is that of the environment's own RK4, so that a solution
-    is what the engines roll out. Limits hold as they do there: on a norm, or on single components.
+    is what the engines roll out. Limits hold as in the engines: on a norm, or on single components.
 
     IPOPT's tolerances are absolute, so that it is given lengths in a unit in which robots have the default size. Every
     distance to keep is larger by ``clearance`` [m].
@@ -86,11 +81,11 @@ class TeamProgram:
         self,
         guess: CollocatedMotion,
         contacts: Contacts,
-        docks: IntArray,
+        arrivals: IntArray,
         options: Options,
         should_stop: Callable[[], bool],
     ) -> tuple[CollocatedMotion, str]:
-        """Solve from a guess, with robots at their goals by steps ``docks`` ``(K,)``, from which on they stay there.
+        """Solve from a guess, with robots at their goals by steps ``arrivals`` ``(K,)``, from which on they stay there.
 
         ``should_stop`` is asked every hundredth of a second; it ends within a tenth, even where writing the program or
         one of IPOPT's iterations takes longer.
@@ -98,15 +93,15 @@ class TeamProgram:
         Returns:
             The motion that IPOPT came to, feasible or not, and its word for how it ended.
         """
-        write = partial(self._program, contacts, docks)
+        write = partial(self._program, contacts, arrivals)
         values, ended = run_ipopt(write, self._packed(guess), options, should_stop)
         # IPOPT gives up where a function has no value; the guess is then the best there is.
         return self._unpacked(values) if np.isfinite(values).all() else guess, ended
 
-    def _program(self, contacts: Contacts, docks: IntArray) -> NonlinearProgram:
+    def _program(self, contacts: Contacts, arrivals: IntArray) -> NonlinearProgram:
         """The program as CasADi takes it."""
         ca = self.casadi
-        rows = [*self._motion_rows(), *self._goal_rows(docks), *self._contact_rows(contacts, docks)]
+        rows = [*self._motion_rows(), *self._goal_rows(arrivals), *self._contact_rows(contacts, arrivals)]
         sizes = [row.numel() for row, _, _ in rows]
         lower, upper = (np.repeat([row[bound] for row in rows], sizes) for bound in (1, 2))
         lowest, highest = self._variable_bounds()
@@ -126,7 +121,7 @@ class TeamProgram:
         points = [self.casadi.DM(own) for own in states]
         found = {}
         for robot, body in self._encounters():
-            near = steps[np.asarray(self._gap(robot, body, points)).ravel() < self._reach(robot, body) + lookout]
+            near = steps[np.asarray(self._gap(robot, body, points)).ravel() < self._min_gap(robot, body) + lookout]
             if len(near):
                 found[robot, body] = near
         return found
@@ -136,7 +131,7 @@ class TeamProgram:
         return ((robot, body) for robot in range(self.problem.num_robots) for body in range(robot + 1, bodies))
 
     def _gap(self, robot: int, body: int, positions: Expression) -> Expression:
-        """Distance from a robot's centre to another's, or to an obstacle's surface [m], at every column of places."""
+        """Distance from a robot's centre to another's, or to an obstacle's surface [m], per column."""
         if body >= self.problem.num_robots:
             return self.obstacles[body - self.problem.num_robots](positions[robot])
         return self._norm(positions[robot] - positions[body])
@@ -154,7 +149,7 @@ class TeamProgram:
         """Norm of every column; nowhere without a derivative."""
         return self.casadi.sqrt(self.casadi.sum1(vectors**2) + TINY * self.unit**2)
 
-    def _reach(self, robot: int, body: int | None = None) -> float:
+    def _min_gap(self, robot: int, body: int | None = None) -> float:
         """Distance to keep from a robot's centre to another's, or to an obstacle's surface or the bounds [m].
 
         The margin holds at the steps only. Between them, on a chord of length ``L`` whose ends are at distance ``D``,
@@ -200,7 +195,7 @@ class TeamProgram:
         return self._norm(ca.vertcat(*outside)) + ca.fmin(depth, 0.0)
 
     def _cost(self) -> Expression:
-        """The mean of distance over initial distance, smoothed within the goal radius, where a robot has docked."""
+        """The mean of distance over initial distance, smoothed within the goal radius."""
         problem, ca = self.problem, self.casadi
         weight = inverse_initial_distance(problem.start[:, : problem.dimension], problem.goal, problem.goal_radius)
         distances = (
@@ -238,31 +233,31 @@ class TeamProgram:
             components = [index for index, own in enumerate(model.control_limits) if own == column]
             yield self.controls[robot], components, -float(lower[column]), float(limits[column])
 
-    def _goal_rows(self, docks: IntArray) -> Iterator[Rows]:
-        """At the step at which a robot docks it is within the goal radius, and no faster than docking allows."""
+    def _goal_rows(self, arrivals: IntArray) -> Iterator[Rows]:
+        """At the step of its arrival a robot is within the goal radius, and no faster than its goal speed."""
         problem = self.problem
         radius = problem.goal_radius - min(self.clearance, problem.goal_radius / 2)
-        for robot, dock in enumerate(docks):
-            yield self._squared_goal_distance(robot)[dock - 1] / self.unit**2, -np.inf, (radius / self.unit) ** 2
+        for robot, arrival in enumerate(arrivals):
+            yield self._squared_goal_distance(robot)[arrival - 1] / self.unit**2, -np.inf, (radius / self.unit) ** 2
             if np.isfinite(problem.goal_speed[robot]):
-                variables = self.states[robot][:, dock - 1], self.controls[robot][:, dock - 1]
+                variables = self.states[robot][:, arrival - 1], self.controls[robot][:, arrival - 1]
                 x, u = map(self.casadi.vertsplit, variables)
                 limits = self.limits[robot].tolist()
                 velocity = self.models[robot].functions.velocity(x, u, limits, self.ops)
                 pace = sum((part / self.unit) ** 2 for part in velocity)
                 yield pace, -np.inf, (float(problem.goal_speed[robot]) / self.unit) ** 2
 
-    def _contact_rows(self, contacts: Contacts, docks: IntArray) -> Iterator[Rows]:
+    def _contact_rows(self, contacts: Contacts, arrivals: IntArray) -> Iterator[Rows]:
         for (robot, body), steps in contacts.items():
             pair = [robot] if body >= self.problem.num_robots else [robot, body]
-            # Once all have docked nothing changes any more.
-            moving = steps[steps <= docks[pair].max()]
+            # Once both have arrived nothing changes any more.
+            moving = steps[steps <= arrivals[pair].max()]
             if len(moving):
                 positions = {
-                    one: self.paths[one][: self.problem.dimension, np.minimum(moving, docks[one]).tolist()]
+                    one: self.paths[one][: self.problem.dimension, np.minimum(moving, arrivals[one]).tolist()]
                     for one in pair
                 }
-                yield self._gap(robot, body, positions) / self.unit, self._reach(robot, body) / self.unit, np.inf
+                yield self._gap(robot, body, positions) / self.unit, self._min_gap(robot, body) / self.unit, np.inf
 
     def _variable_bounds(self) -> tuple[Floats, Floats]:
         """Bounds of the world on positions, and limits of every single component."""
@@ -274,9 +269,9 @@ class TeamProgram:
             for values, components, least, most in self._limited(robot):
                 for motion, end in ((low, least), (high, most)):
                     (motion.states if values is self.states[robot] else motion.controls)[:, robot, components] = end
-        reach = np.array([[self._reach(robot)] for robot in range(problem.num_robots)])
-        low.states[:, :, : problem.dimension] = problem.world.bounds[0] + reach
-        high.states[:, :, : problem.dimension] = problem.world.bounds[1] - reach
+        distances = np.array([[self._min_gap(robot)] for robot in range(problem.num_robots)])
+        low.states[:, :, : problem.dimension] = problem.world.bounds[0] + distances
+        high.states[:, :, : problem.dimension] = problem.world.bounds[1] - distances
         return self._packed(low), self._packed(high)
 
     def _packed(self, motion: CollocatedMotion) -> Floats:

@@ -43,7 +43,7 @@ class IpoptConfig(PlannerConfig):
             steps of the fastest robot at full speed; ``None`` keeps them clear of everything at every step, as in the
             paper.
         rounds: Solves per restart. As long as the rollout does not keep the margin, the next one begins where the last
-            one ended; what came near is minded too, and robots stay where they docked. The paper solves once.
+            one ended; what came near is avoided too, and robots stay where they arrived. The paper solves once.
         clearance: Added to every distance to keep, for what rounding and tolerances take away, in the same steps.
         tolerance: IPOPT's, on the scaled optimality error.
         barrier: IPOPT's first barrier parameter.
@@ -103,12 +103,12 @@ class Ipopt(Planner):
         motion = self._perturbed(search, program, state.motion)
         lookout = None if config.lookout is None else config.lookout * problem.stride
         contacts = program.contacts(motion, lookout)
-        docks = np.full(problem.num_robots, problem.horizon)
+        arrivals = np.full(problem.num_robots, problem.horizon)
         best, note, options = None, "", self._options()
         for _ in range(config.rounds):
             if best is not None and search.should_stop():
                 break
-            motion, note = program.solve(motion, contacts, docks, options, search.should_stop)
+            motion, note = program.solve(motion, contacts, arrivals, options, search.should_stop)
             candidate = evaluate_controls(search.engine, problem, motion.controls.astype(np.float32))
             if best is None or candidate.rank > best.rank:
                 best = candidate
@@ -116,8 +116,8 @@ class Ipopt(Planner):
             if best.solved or note not in FOUND:
                 break
             former, contacts = contacts, _union(contacts, program.contacts(motion, lookout))
-            standing, docks = docks, _docks(candidate)
-            if _size(contacts) == _size(former) and (docks == standing).all():
+            before, arrivals = arrivals, _arrivals(candidate)
+            if _size(contacts) == _size(former) and (arrivals == before).all():
                 break
             options["mu_init"] = min(NEARLY_SOLVED, config.barrier)
         assert best is not None
@@ -135,8 +135,8 @@ class Ipopt(Planner):
         with search.watch.paused():
             prepare_drives(problem)
         straight = evaluate_controls(search.engine, problem, straight_drives(problem).controls[:, :, 0])
-        docks = np.full(problem.num_robots, problem.horizon)
-        return program.solve(_motion(straight), {}, docks, self._options(), search.should_stop)[0]
+        arrivals = np.full(problem.num_robots, problem.horizon)
+        return program.solve(_motion(straight), {}, arrivals, self._options(), search.should_stop)[0]
 
     def _perturbed(self, search: SolveRun, program: TeamProgram, warm_start: CollocatedMotion) -> CollocatedMotion:
         random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
@@ -153,8 +153,8 @@ def _motion(candidate: Candidate) -> CollocatedMotion:
     return CollocatedMotion(candidate.trajectory.states.astype(float), candidate.controls.astype(float))
 
 
-def _docks(candidate: Candidate) -> np.ndarray:
-    """``(K,)`` steps at which the robots docked; the horizon for those that did not."""
+def _arrivals(candidate: Candidate) -> np.ndarray:
+    """``(K,)`` steps at which the robots arrived; the horizon for those that did not."""
     arrived = candidate.trajectory.arrived
     return np.where(arrived[-1], arrived.argmax(axis=0), len(arrived) - 1)
 

@@ -1,4 +1,4 @@
-"""Running IPOPT through CasADi, in a thread that is left to itself if it does not end in time.
+"""Running IPOPT through CasADi, in a thread that is abandoned if it does not end in time.
 
 A. Waechter and L. T. Biegler, "On the Implementation of an Interior-Point Filter Line-Search Algorithm for Large-Scale
 Nonlinear Programming", Mathematical Programming, 2006.
@@ -37,15 +37,10 @@ GRACE = 0.05
 
 
 class NonlinearProgram(NamedTuple):
-    """A program as CasADi takes it.
+    """A program as CasADi takes it."""
 
-    Attributes:
-        functions: Variables ``x``, cost ``f`` and constraints ``g``, each one column.
-        bounds: ``lbx``, ``ubx``, ``lbg`` and ``ubg`` of these.
-    """
-
-    functions: Mapping[str, Expression]
-    bounds: Mapping[str, Floats]
+    functions: Mapping[str, Expression]  #: Variables ``x``, cost ``f`` and constraints ``g``, each one column
+    bounds: Mapping[str, Floats]  #: ``lbx``, ``ubx``, ``lbg`` and ``ubg`` of these
 
 
 def run_ipopt(
@@ -71,7 +66,7 @@ def run_ipopt(
 
 
 def run_or_abandon(work: Callable[[Callable[[], bool]], Result], should_stop: Callable[[], bool]) -> Result | None:
-    """Run in a thread of its own what lets other threads run, and leave it to itself if it does not end in time.
+    """Run work that releases the interpreter's lock in a thread, and abandon it if it does not end in time.
 
     Ctrl-C reaches the caller at once. What was abandoned ends when it next asks; the process waits for that.
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 pyrvo: Any = LazyModule("pyrvo", "policy 'orca'", "orca")
 
 CORNERS = 16
-"""Corners of the polygons that stand for round obstacles and docked robots."""
+"""Corners of the polygons that stand for round obstacles and robots at rest."""
 
 
 Neighbors = Annotated[Whole, Field(ge=0, le=10**6)]
@@ -46,7 +46,7 @@ class OrcaConfig(CheckedSettings):
 
     Attributes:
         time_horizon: For this long the new velocities keep the robots apart [s].
-        obstacle_time_horizon: The same for obstacles, bounds and docked robots, which do not give way [s].
+        obstacle_time_horizon: The same for obstacles, bounds and arrived robots, which do not give way [s].
         neighbor_distance: Robots farther away than this are not looked at, in steps of the fastest at full speed.
         max_neighbors: So many of the nearest robots are looked at.
         clearance: Added to every robot's radius [m]; by default the problem's margin. Two robots so keep twice that
@@ -68,7 +68,7 @@ class OrcaConfig(CheckedSettings):
 class Orca(StatePolicy):
     """ORCA: every robot drives to its goal at the velocity nearest to the one it prefers that avoids all others.
 
-    All robots give way to each other by halves; docked robots, obstacles and bounds do not give way. ORCA speaks of
+    All robots give way to each other by halves; arrived robots, obstacles and bounds do not give way. ORCA speaks of
     robots that take a new velocity at once. Those of a model with inertia or a heading follow it as well as their
     limits allow, so that they may come closer than ORCA promises. It works in the plane only.
 
@@ -114,7 +114,7 @@ class Orca(StatePolicy):
     def _avoid(self, joint: JointState, preferred: FloatArray, team: IntArray) -> FloatArray:
         """``(K, 2)`` velocities of these robots, nearest to the preferred ones, that avoid everything and each other.
 
-        Those of docked robots and of others are zero.
+        Those of arrived robots and of others are zero.
         """
         problem, config = self.problem, self.config
         # Made anew at every step, so that an action depends on the present state alone.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
 from d4orm_env.scenarios import describe_scenario, list_scenarios
 from d4orm_planners.base.names import PLANNERS, POLICIES
-from d4orm_planners.base.planner_registry import default_settings, describe_planner, describe_policy, preset_names
+from d4orm_planners.base.planner_registry import default_settings, describe_policy, preset_names
 from d4orm_planners.cli.outputs import print_table
 
 
@@ -34,13 +33,13 @@ def planners(
         presets = [("preset", ", ".join(names))] if (names := preset_names(name)) else []
         print_table(name, [*settings, *presets] or [("no settings", "")])
         return
-    for title, table, describe in (("Planners", PLANNERS, describe_planner), ("Policies", POLICIES, describe_policy)):
-        print_table(title, [(name, _or_error(describe, name)) for name in table])
+    for title, table in (("Planners", PLANNERS), ("Policies", POLICIES)):
+        print_table(title, [(name, _or_error(name)) for name in table])
 
 
-def _or_error(describe: Callable[[str], str], name: str) -> str:
+def _or_error(name: str) -> str:
     """A description, or why there is none: what another package brings may be broken."""
     try:
-        return describe(name)
+        return describe_policy(name)
     except ValueError as error:
         return f"unusable: {error}"

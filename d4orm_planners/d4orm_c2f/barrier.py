@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.caching import cached_kernel
@@ -16,21 +15,19 @@ from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.envs.joint_state import JointState
 
 NEAR, STOPS = 10 / 3, 2.0
-"""Only what is this near is minded: so many radii of the largest robot, and so many of its stops from full speed."""
+"""Range of the barriers, in radii of the largest robot plus stops from full speed."""
 
 PARTING = 2.0
-"""Rate at which robots part from what is too near, per distance missing [1/s]."""
+"""Rate at which robots separate where they are too near, per missing distance [1/s]."""
 
 SWEEPS = 400
-"""Times that every barrier is met at most; by then there are no velocities that keep to all, or hardly any."""
+"""Most sweeps over all barriers; after so many there hardly are velocities that keep to all."""
 
 EXACT = 1e-6
-"""Changes of that size are none, as a share of the largest speed limit."""
+"""Largest change that counts as none, as a share of the largest speed limit."""
 
 _STEP = 1 / 150
 """Step for the direction away from an obstacle, in radii of the largest robot."""
-
-Array = NDArray[np.float64]
 
 
 def safe_velocities(
@@ -69,24 +66,17 @@ def safe_velocities(
 
 
 class Barriers(NamedTuple):
-    """``normals @ (v_one - v_other) >= least`` for velocities; -1 is no robot, and at rest.
+    """``normals @ (v_one - v_other) >= least`` for velocities; -1 is no robot, and at rest."""
 
-    Attributes:
-        one: ``(R,)`` robots.
-        other: ``(R,)`` robots.
-        normals: ``(R, d)`` unit vectors.
-        least: ``(R,)`` [m/s].
-    """
+    one: IntArray  #: ``(R,)`` robots
+    other: IntArray  #: ``(R,)`` robots
+    normals: Floats  #: ``(R, d)`` unit vectors
+    least: Floats  #: ``(R,)`` [m/s]
 
-    one: IntArray
-    other: IntArray
-    normals: Array
-    least: Array
-
-    def missing(self, velocities: Array) -> Array:
-        """``(R,)`` how much of it velocities ``(K, d)`` lack [m/s]."""
-        standing = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
-        missing: Array = self.least - (self.normals * (standing[self.one] - standing[self.other])).sum(axis=1)
+    def missing(self, velocities: Floats) -> Floats:
+        """``(R,)`` violations of the barriers by velocities ``(K, d)``, negative for none [m/s]."""
+        padded = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
+        missing: Floats = self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
         return missing
 
 
@@ -97,12 +87,12 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     acceleration, speed = (problem.team.limits[:, limit].astype(np.float64) for limit in (ACCELERATION, SPEED))
     at_once = np.array([model.first_order for model in problem.team.robot_models])
     braking = np.where(free, np.where(at_once, speed / problem.dt, acceleration), 0)
-    rows: list[tuple[int, int, Array, float]] = []
+    rows: list[tuple[int, int, Floats, float]] = []
 
-    def add(one: int, other: int, normal: Array, room: float, brakes: float, speed: float = 0.0) -> None:
+    def add(one: int, other: int, normal: Floats, room: float, brakes: float, speed: float = 0.0) -> None:
         if room > 0:
             lost = brakes * reaction
-            # Nobody has to back off as long as there is room: whoever stands keeps to everything.
+            # As long as there is room no robot has to back off: zero velocities keep to all barriers.
             least = min(speed_slack + lost - np.sqrt(2 * brakes * room + lost**2), 0.0)
         else:
             least = -PARTING * room
@@ -132,7 +122,7 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
 
 
 def _near(problem: Problem) -> float:
-    """Return the distance within which something is minded [m]."""
+    """Range of the barriers [m]."""
     speed, acceleration = (problem.team.limits[:, limit].astype(np.float64) for limit in (SPEED, ACCELERATION))
     return NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
 
@@ -171,7 +161,7 @@ def find_nearest(one: Any, other: Any, normals: Any, least: Any, velocities: Any
     return False
 
 
-def _walls(problem: Problem, positions: Array, robots: list[int], near: float) -> Iterator[tuple[int, Array, float]]:
+def _walls(problem: Problem, positions: Floats, robots: list[int], near: float) -> Iterator[tuple[int, Floats, float]]:
     """Yield what is near robots at ``positions`` ``(R, d)``: which robot, the direction away from it, the distance."""
     d, (lower, upper), shapes = problem.dimension, problem.world.bounds.astype(np.float64), problem.world.shapes
     axes = np.eye(d)

@@ -1,4 +1,4 @@
-"""The coarse guidance of D4orm-C2F: a path for the team, where on it each robot is and heads (paper, section VI)."""
+"""The coarse guidance of D4orm-C2F: a path for the team, and each robot's waypoint and subgoal (paper, section VI)."""
 
 from __future__ import annotations
 
@@ -14,30 +14,19 @@ from d4orm_planners.tracking.reference_drives import follow_reference
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseWaypoints:
-    """Path that a team follows.
+    """Path that a team follows."""
 
-    Attributes:
-        path: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m].
-        ordered: Whether the path was found on a roadmap, where precedence decides.
-    """
-
-    path: FloatArray
-    ordered: bool
+    path: FloatArray  #: ``(H+1, K, d)`` waypoints, one per time step of the control loop [m]
+    ordered: bool  #: Whether the path was found on a roadmap, where precedence decides
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarsePlan(CoarseWaypoints):
-    """A coarse plan and the path made from it.
+    """A coarse plan and the path made from it."""
 
-    Attributes:
-        problem: The coarse problem: larger time steps from where the plan begins.
-        controls: ``(H_c, K, m)`` of the coarse plan.
-        states: ``(H_c+1, K, n)``.
-    """
-
-    problem: Problem
-    controls: FloatArray
-    states: FloatArray
+    problem: Problem  #: The coarse problem: larger time steps from where the plan begins
+    controls: FloatArray  #: ``(H_c, K, m)`` of the coarse plan
+    states: FloatArray  #: ``(H_c+1, K, n)``
 
 
 def coarse_problem(problem: Problem, factor: int) -> Problem:
@@ -61,9 +50,9 @@ def interpolate(path: FloatArray, factor: int) -> FloatArray:
 
 
 def nearest_indices(path: FloatArray, positions: FloatArray, last: IntArray, window: int) -> IntArray:
-    """``(K,)`` where on ``path`` ``(H+1, K, d)`` robots at ``positions`` ``(K, d)`` are: indices of nearest waypoints.
+    """``(K,)`` indices of the waypoints on ``path`` ``(H+1, K, d)`` nearest to robots at ``positions`` ``(K, d)``.
 
-    From those found ``last`` ``(K,)`` on, because a path may cross itself, ``window`` waypoints are looked at.
+    As a path may cross itself, only ``window`` waypoints are searched, from those found ``last`` ``(K,)`` on.
     """
     index = np.minimum(np.asarray(last)[:, None] + np.arange(window + 1), len(path) - 1)
     ahead = path[index, np.arange(len(index))[:, None]]
@@ -74,8 +63,8 @@ def subgoal_indices(indices: IntArray, mean: int, offset: int, lag: int, last: i
     """``(K,)`` the waypoint, at most the ``last``, that every robot heads for (paper, Algorithm 4, line 7).
 
     The paper's is the same for all robots: the ``mean`` of their ``indices`` ``(K,)`` and an ``offset``. A robot that
-    was held up, by more than ``lag`` waypoints, would then leave its path, straight into whatever the path leads
-    around; it keeps to its own instead.
+    lags by more than ``lag`` waypoints would then leave its path, straight into obstacles that the path avoids; its
+    subgoal stays behind with it instead.
     """
     return np.minimum(np.minimum(mean, indices + lag) + offset, last)
 
@@ -89,7 +78,7 @@ def rest_of(guidance: CoarsePlan, index: int, factor: int) -> tuple[Problem, Flo
 
 
 LEAST = 5
-"""Waypoints that a subgoal is ahead all the same: nearer ones hardly pull."""
+"""Least number of waypoints that a subgoal is ahead: nearer ones hardly attract."""
 
 _SHARES = np.linspace(0, 1, 9)[1:]
 """Shares of the straight line at which its clearance from obstacles is looked at."""
@@ -99,60 +88,62 @@ def visible_subgoals(
     problem: Problem, positions: FloatArray, path: FloatArray, indices: IntArray, targets: IntArray, arrived: BoolArray,
     walls: bool,
 ) -> IntArray:  # fmt: skip
-    """``(K,)`` the furthest waypoints up to its subgoal that each robot can drive to straight, past what is at rest.
+    """``(K,)`` the furthest waypoint up to its subgoal that each robot can drive to straight, past all that is at rest.
 
-    A subgoal behind a corner, or behind a robot that has docked, would hold it there. Robots at ``positions``
-    ``(K, d)`` are at the waypoints ``indices`` ``(K,)`` of ``path`` ``(H+1, K, d)`` [m] and head for ``targets``
-    ``(K,)``; those ``arrived`` ``(K,)`` are at rest, and with ``walls`` obstacles count too.
+    A robot would get stuck on its way to a subgoal behind a corner, or behind a robot that has arrived.
+
+    Args:
+        problem: The problem.
+        positions: ``(K, d)`` of the robots [m].
+        path: ``(H+1, K, d)`` waypoints [m].
+        indices: ``(K,)`` the robots' own.
+        targets: ``(K,)`` their subgoals.
+        arrived: ``(K,)`` robots at rest.
+        walls: Whether obstacles count too.
     """
-    radius, standing = np.asarray(problem.team.radius), np.flatnonzero(arrived)
+    radius, resting = np.asarray(problem.team.radius), np.flatnonzero(arrived)
     result = targets.copy()
     waiting = np.flatnonzero(~arrived & (targets > indices + LEAST))
     while len(waiting):
         offset = path[result[waiting], waiting] - positions[waiting]
-        blocked = _meets_standing(
-            positions[waiting], offset, radius[waiting] + problem.margin / 2, positions[standing], radius[standing]
-        )
+        width = radius[waiting] + problem.margin / 2
+        blocked = _meets_resting(positions[waiting], offset, width, positions[resting], radius[resting])
         if walls:
             points = positions[waiting] + _SHARES[:, None, None] * offset
             clearance = problem.world.clearance(points.reshape(-1, points.shape[-1])).reshape(points.shape[:-1])
-            blocked |= (clearance <= radius[waiting] + problem.margin / 2).any(axis=0)
+            blocked |= (clearance <= width).any(axis=0)
         waiting = waiting[blocked]
         result[waiting] -= 1
         waiting = waiting[result[waiting] > indices[waiting] + LEAST]
     return result
 
 
-def _meets_standing(
-    begin: FloatArray, offset: FloatArray, safety_distance: FloatArray, others: FloatArray, radius: FloatArray
+def _meets_resting(
+    begin: FloatArray, offset: FloatArray, width: FloatArray, others: FloatArray, radius: FloatArray
 ) -> BoolArray:
-    """``(N,)`` whether the straight path from ``begin`` by ``offset`` comes within reach of one of the others."""
+    """``(N,)`` whether a straight path from ``begin`` by ``offset``, so wide to either side, meets another robot."""
     gap = others - begin[:, None]
     square = (offset**2).sum(axis=1)[:, None]
     share = np.clip((gap * offset[:, None]).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)
     away = ((gap - share[:, :, None] * offset[:, None]) ** 2).sum(axis=2)
-    meets: BoolArray = (away <= (safety_distance[:, None] + radius) ** 2).any(axis=1)
+    meets: BoolArray = (away <= (width[:, None] + radius) ** 2).any(axis=1)
     return meets
 
 
 STUCK_WITHIN, STUCK_AFTER = 3, 25
-"""Progress without which a robot is stuck: so many waypoints in so many time steps."""
-
+"""Waypoints that a robot must pass in so many time steps, or else is stuck."""
 BARRED_AFTER = 8
-"""The same for robots whose paths lead through those at rest for good."""
-
+"""The same number of steps for robots whose paths lead through others at rest for good."""
 WAITING_WITHIN = 1.0
-"""A robot this near to where it should be by now waits, in radii of the largest one."""
-
+"""Distance from its present waypoint within which a robot waits, in radii of the largest one."""
 CAREFUL_FOR = 30
 """Steps for which a robot that was stuck follows its path."""
-
 CATCHING_UP = 2.0
-"""Share of its lag that a robot makes good in a second [1/s]."""
+"""Share of its lag that a robot makes up for in a second [1/s]."""
 
 
 class StagnationMonitor:
-    """Watches an episode for robots that do not get on along their paths.
+    """Detects robots that make no progress along their paths.
 
     Args:
         joint: Their first state.
@@ -164,12 +155,12 @@ class StagnationMonitor:
         self._careful_until = np.full(len(joint.goals), joint.steps)
 
     def observe(self, step: int, indices: IntArray, waiting: BoolArray) -> tuple[IntArray, BoolArray]:
-        """``(K,)`` steps without progress, and robots that are stuck, or were not long ago, and so follow their paths.
+        """``(K,)`` steps without progress, and ``(K,)`` robots that are stuck or were so recently.
 
         Args:
             step: Time step.
             indices: ``(K,)`` waypoints that the robots are at; lower ones than before are of another path.
-            waiting: ``(K,)`` robots that are where they should be by now, or ahead of the team.
+            waiting: ``(K,)`` robots that are on time, or ahead of the team.
         """
         moved = (indices >= self._indices + STUCK_WITHIN) | (indices < self._indices) | waiting
         self._indices[moved], self._since[moved] = indices[moved], step
@@ -179,7 +170,7 @@ class StagnationMonitor:
 
 
 def keep_time(problem: Problem, joint: JointState, path: FloatArray, indices: IntArray, horizon: int) -> FloatArray:
-    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time, as if none docked.
+    """``(horizon, K, m)`` controls that take every robot along its path in the path's own time, as if it had no goal.
 
     Of ``path`` ``(H+1, K, d)``, which has a waypoint per time step of the problem [m], they should be at ``indices``
     ``(K,)`` now; from elsewhere they catch up.

@@ -1,4 +1,4 @@
-"""The coarse plan that a team follows, where on it the team is, and when it is planned anew or made better."""
+"""Tracking of the coarse plan: progress along it, replanning and refinement."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.joint_state import JointState
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import (
     BARRED_AFTER,
     STUCK_AFTER,
@@ -55,8 +55,8 @@ class CoarsePlanTracker:
         problem: The problem, with the limits that the robots are believed to have now.
         guidance: Coarse plan that is followed at present.
         index: Waypoint at which the team is.
-        rerouted: ``(K,)`` robots that are sent another way than before, until :meth:`fresh_start` has reported it.
-        stuck: ``(K,)`` robots that do not get on, or did not until a short while ago.
+        rerouted: ``(K,)`` robots with a new path, until :meth:`fresh_start` has given them its controls.
+        stuck: ``(K,)`` robots that make no progress, or made none until recently.
     """
 
     guidance: CoarseWaypoints
@@ -83,15 +83,15 @@ class CoarsePlanTracker:
 
     def begin(self, joint: JointState, arrived: BoolArray) -> None:
         """Plan for the episode, in which those ``arrived`` ``(K,)`` stay where they are."""
-        everybody = np.ones(self.problem.num_robots, bool)
-        self._patience, self.stuck = StagnationMonitor(joint), ~everybody
+        all_robots = np.ones(self.problem.num_robots, bool)
+        self._stagnation, self.stuck = StagnationMonitor(joint), ~all_robots
         warm = self._planning.warm_start(self.problem, joint)
         self.guidance = self._planning.plan(self.problem, joint, arrived, warm, self._config.coarse_iterations)
         self.index = 0
-        self._follow(joint, self._relayed(joint, everybody) or self.guidance, everybody)
+        self._follow(joint, self._relayed(joint, all_robots) or self.guidance, all_robots)
 
     def _follow(self, joint: JointState, guidance: CoarseWaypoints, rerouted: BoolArray) -> None:
-        """Begin at the beginning of a guidance, which sends robots ``rerouted`` ``(K,)`` another way than before."""
+        """Begin a new guidance, in which robots ``rerouted`` ``(K,)`` have new paths."""
         self.rerouted = rerouted
         self.guidance = guidance
         self.index, self._indices = 0, np.zeros(len(joint.goals), int)
@@ -127,18 +127,18 @@ class CoarsePlanTracker:
         return clock if self._config.max_lag is None else np.minimum(clock, self._indices + self._config.max_lag)
 
     def fresh_start(self, base: FloatArray) -> None:
-        """Have those that are sent another way begin ``base`` ``(H_predict, K, m)`` with the coarse plan's controls."""
+        """Begin ``base`` ``(H_predict, K, m)`` of robots with new paths with the coarse plan's controls."""
         if self.rerouted.any() and isinstance(self.guidance, CoarsePlan):
-            # Each is held for as long as it stands for.
+            # A coarse control is held for all its fine steps.
             held = np.repeat(self.guidance.controls, self._config.coarse_factor, axis=0)[: len(base)]
             base[:, self.rerouted] = 0
             base[: len(held), self.rerouted] = held[:, self.rerouted]
             self.rerouted = np.zeros_like(self.rerouted)
 
     def replan_if_needed(self, joint: JointState, arrived: BoolArray) -> bool:
-        """Plan anew for robots with new goals or stuck, for a team that lost the guidance or has come to its end.
+        """Replan for robots with new goals or stuck, and for a team that has lost the guidance or is at its end.
 
-        With a deadline that is done beside the control loops: the team goes on with the old plan until then.
+        With a deadline a thread of its own does that: the team goes on with the old plan until then.
         """
         if self._late is not None:
             done, late = self._replanning.result()
@@ -177,13 +177,13 @@ class CoarsePlanTracker:
         return False
 
     def _idle_for_long(self, joint: JointState, arrived: BoolArray) -> BoolArray:
-        """``(K,)`` robots that have got nowhere on this path for so long that they need another; notes the stuck."""
-        idle, self.stuck = self._patience.observe(joint.steps, self._indices, self._waiting(joint))
+        """``(K,)`` robots without progress for so long that they need another path; also updates :attr:`stuck`."""
+        idle, self.stuck = self._stagnation.observe(joint.steps, self._indices, self._waiting(joint))
         barred = self._barred(joint, arrived, idle > BARRED_AFTER)
         return np.minimum(idle, joint.steps - self._began) > np.where(barred, BARRED_AFTER, STUCK_AFTER)
 
     def _relayed(self, joint: JointState, changed: BoolArray) -> CoarseWaypoints | None:
-        """Paths on the roadmap for those ``changed`` ``(K,)``, around all others on theirs, where goals are many."""
+        """Paths on the roadmap for robots ``changed`` ``(K,)``, around all others, in lifelong mode; else ``None``."""
         if not (self._lifelong and self.guidance.ordered):
             return None
         factor, seed = self._config.coarse_factor, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
@@ -192,9 +192,9 @@ class CoarsePlanTracker:
         return None if paths is None else CoarseWaypoints(path=interpolate(paths, factor), ordered=True)
 
     def _beginning(self, joint: JointState, keep: BoolArray) -> FloatArray | None:
-        """``(H_c, K, m)`` straight drives, but for those that ``keep`` ``(K,)`` back to and along their paths.
+        """``(H_c, K, m)`` straight drives, and for robots that ``keep`` ``(K,)`` drives along their paths.
 
-        ``None`` among walls: there the whole team's paths are found anew on the roadmap.
+        ``None`` among walls, where the paths of the whole team are found anew on the roadmap.
         """
         if self.guidance.ordered or not isinstance(self.guidance, CoarsePlan):
             return None
@@ -218,7 +218,7 @@ class CoarsePlanTracker:
         return barred
 
     def _waiting(self, joint: JointState) -> BoolArray:
-        """``(K,)`` robots that are where they should be by now, or ahead of the team, and so have to wait."""
+        """``(K,)`` robots that are on time, or ahead of the team, and so have to wait."""
         due = self.guidance.path[min(self.index, len(self.guidance.path) - 1)]
         away = np.linalg.norm(joint.states[:, : self.problem.dimension] - due, axis=1)
         waiting: BoolArray = (away < WAITING_WITHIN * self.problem.team.largest_radius) | (self._indices > self.index)
@@ -237,7 +237,7 @@ class CoarsePlanTracker:
         )
 
     def _away(self, joint: JointState) -> FloatArray:
-        """``(K,)`` how far the robots are from their waypoints [m]."""
+        """``(K,)`` distances of the robots from their waypoints [m]."""
         positions = joint.states[:, : self.problem.dimension]
         away: FloatArray = np.linalg.norm(
             positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1
@@ -245,7 +245,7 @@ class CoarsePlanTracker:
         return away
 
     def refine(self, step: int, due: bool) -> bool:
-        """Take over what the refinement has done meanwhile, and give it more to do if that is ``due``."""
+        """Accept a finished refinement, and begin another if that is ``due``; whether one was accepted."""
         index = self.index + self._config.subgoal_offset
         guidance, over = self.guidance, index >= len(self.guidance.path) - 1
         if self._config.refine == "off" or over or not isinstance(guidance, CoarsePlan):
@@ -264,7 +264,7 @@ class CoarsePlanTracker:
         return self.guidance is refined
 
     def _refined(self, guidance: CoarsePlan, index: int, seed: int) -> CoarsePlan:
-        """The guidance with what is left of it from a waypoint on made better, if that succeeds (line 4)."""
+        """The guidance, improved from a waypoint on if that succeeds (line 4)."""
         left, controls = rest_of(guidance, index, self._config.coarse_factor)
         search = SolveRun(self._planning.planner, left, seed, controls, self._refiner)
         search.advance()

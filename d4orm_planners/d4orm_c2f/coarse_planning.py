@@ -9,9 +9,9 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.base.episode import open_env
+from d4orm_planners.base.episode import open_env, run_episode
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.planner_registry import make_policy
 from d4orm_planners.base.solve import SolveRun
@@ -37,16 +37,23 @@ class CoarsePlanning:
 
     def __init__(self, config: D4ormC2FConfig, seed: int, last_step: int | None) -> None:
         self._config, self._seed, self._last_step = config, seed, last_step
-        # Paths that fit between others to the centimetre are no guidance: fine plans cannot keep to them. But where
-        # the team does not get on there may be no other paths.
+        # Fine plans cannot keep to paths that fit between others to the centimetre. But where the team is stuck there
+        # may be no others.
         self.planner, self._thorough = (_coarse_planner(config, reroute=reroute) for reroute in (False, True))
 
     def warm_start(self, problem: Problem, joint: JointState) -> FloatArray | None:
-        """``(H_c, K, m)`` what a policy does from where the team is, if the coarse plan is to begin with that."""
+        """``(H_c, K, m)`` controls of a policy's episode from here, if the coarse plan is to begin with these.
+
+        Raises:
+            ValueError: If there is no such policy, or it cannot drive there.
+            ImportError: If it needs a library that is not installed.
+        """
         if self._config.warm_start is None:
             return None
         coarse = coarse_problem(problem.with_state(joint.states, joint.goals), self._config.coarse_factor)
-        return episode_of(self._config.warm_start, coarse, derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps))
+        policy = make_policy(self._config.warm_start)
+        seed = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
+        return run_episode(open_env(coarse, policy=policy), policy, seed).controls
 
     def plan(
         self,
@@ -58,7 +65,7 @@ class CoarsePlanning:
         thorough: bool = False,
     ) -> CoarsePlan:
         """Plan for the whole team from where it is, until a plan passes the checks."""
-        # Whoever has docked at the rim of its goal could leave it within a coarse step.
+        # A robot that has arrived at the rim of its goal could leave it within a coarse step.
         goals = np.where(arrived[:, None], joint.states[:, : problem.dimension], joint.goals)
         coarse = coarse_problem(problem.with_state(joint.states, goals), self._config.coarse_factor)
         chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
@@ -87,9 +94,8 @@ class CoarsePlanning:
             search.advance()
             if number == 0:
                 ordered = isinstance(search.state, RoadmapSolution)
-            chosen = search.current if search.current.rank >= search.best.rank else search.best
-            if not search.current.failed.any():
-                chosen = search.current
+            accepted = not search.current.failed.any() or search.current.rank >= search.best.rank
+            chosen = search.current if accepted else search.best
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
         return chosen, CoarsePlan(
@@ -109,29 +115,3 @@ def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> Planner:
     if config.coarse_preset is None:
         return Hybrid(HybridConfig(**given, reroute=reroute, improver="denoising"))
     return D4ormD(D4ormDConfig(**{**D4ormD.presets[config.coarse_preset], **given}))
-
-
-def episode_of(policy: str, problem: Problem, seed: int) -> FloatArray:
-    """``(H, K, m)`` controls of an episode, zero once all have arrived.
-
-    Args:
-        policy: Name of a policy.
-        problem: Its problem.
-        seed: Of the policy.
-
-    Raises:
-        ValueError: If there is no such policy, or it cannot drive there.
-        ImportError: If it needs a library that is not installed.
-    """
-    driver = make_policy(policy)
-    env = open_env(problem, policy=driver)
-    observations, _ = env.reset(seed=seed)
-    driver.reset(env, seed=seed)
-    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
-    for executed in controls:
-        if not env.agents:
-            break
-        observations, *_ = env.step(driver.act(observations, env.state()))
-        executed[:] = split_state(problem, env.state()).controls
-    env.close()
-    return controls

@@ -1,17 +1,17 @@
-"""Deviation of robots from where they are expected, the margin inflation that it calls for, and a filter of states."""
+"""Deviation of robots from the model, the margin inflation that it calls for, and a filter of states."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.engine.types import Engine
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.d4orm_c2f.direct_final_approach import docking_radius
+from d4orm_planners.d4orm_c2f.direct_final_approach import arrival_radius
 from d4orm_planners.d4orm_c2f.estimators import (
+    DECAY,
     ActuatorGainEstimator,
     LatencyEstimator,
     PacketLossEstimator,
@@ -20,17 +20,12 @@ from d4orm_planners.d4orm_c2f.estimators import (
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round
 
-DECAY = 0.98
-"""Share of what was seen that is left after a time step."""
-
-ENOUGH = 40
-"""Differences that it takes to say how noisy a component is."""
-
-LEAST_SHARE = 0.1
-"""Share of the variance of differences that has to come from measurements for these to be filtered."""
-
-LEAST_GAIN = 0.1
-"""No measurement counts less than this."""
+MIN_DIFFERENCES = 40
+"""Number of differences needed to estimate how noisy a component is."""
+MIN_NOISE_SHARE = 0.1
+"""Least share of the variance of differences that comes from measurements for these to be filtered."""
+MIN_FILTER_GAIN = 0.1
+"""Least gain of a measurement."""
 
 
 class StateFilter:
@@ -50,18 +45,18 @@ class StateFilter:
         shape = len(self._models), problem.state_size
         self._variance, self._covariance = np.zeros((2, *shape))
         self._count = np.zeros(len(self._models))
-        self._before: NDArray[np.float64] | None = None
+        self._before: Floats | None = None
 
-    def gains(self) -> NDArray[np.float64]:
-        """``(models, n)`` how much of a difference is believed."""
+    def gains(self) -> Floats:
+        """``(models, n)`` gains of the measurements."""
         count = np.maximum(self._count, 1)[:, None]
         total = self._variance / count
         noise = np.maximum(-self._covariance / count, 0)
         walk = np.maximum(total - 2 * noise, 0)
         ahead = (walk + np.sqrt(walk**2 + 4 * walk * noise)) / 2
-        believed = np.maximum(ahead / np.maximum(ahead + noise, np.finfo(np.float64).tiny), LEAST_GAIN)
-        known = (count >= ENOUGH) & (noise > LEAST_SHARE * total)
-        gains: NDArray[np.float64] = np.where(known, believed, 1.0)
+        believed = np.maximum(ahead / np.maximum(ahead + noise, np.finfo(np.float64).tiny), MIN_FILTER_GAIN)
+        known = (count >= MIN_DIFFERENCES) & (noise > MIN_NOISE_SHARE * total)
+        gains: Floats = np.where(known, believed, 1.0)
         return gains
 
     def update(self, measured: FloatArray, led_to: FloatArray, expected: FloatArray, going: BoolArray) -> FloatArray:
@@ -71,7 +66,7 @@ class StateFilter:
             measured: ``(K, n)`` the states as seen.
             led_to: ``(K, n)`` what those seen a time step ago lead to.
             expected: ``(K, n)`` what those estimated a time step ago lead to.
-            going: ``(K,)`` robots that have not docked.
+            going: ``(K,)`` robots that have not arrived.
         """
         seen = np.asarray(measured, np.float64)
         difference = short_way_round(self._problem, seen - led_to)
@@ -94,67 +89,63 @@ class StateFilter:
         return states
 
 
-MOST = 1.0
-"""No more room than this is called for, in radii of the largest robot."""
-
-RUN = 5
-"""Time steps whose changes of velocity add up before a robot is seen to have reacted."""
-
-STEADY = 0.02
-"""Changes of velocity that add up to no more are none, as a share of the largest speed limit."""
-
-AT_ONCE = 1.5
-"""Factor by which the largest change in a single step may exceed that."""
-
-FASTEST = 0.4
-"""Changes are not believed to come to more, as a share of the largest speed limit."""
+MAX_INFLATION = 1.0
+"""Largest margin inflation, in radii of the largest robot."""
+REACTION_STEPS = 5
+"""Time steps over which changes of velocity add up before a robot is seen to have reacted."""
+DRIFT_DEADBAND = 0.02
+"""Drift that counts as none, as a share of the largest speed limit."""
+SINGLE_STEP_FACTOR = 1.5
+"""Weight of the largest change of velocity in a single step."""
+MAX_SPEED_SLACK = 0.4
+"""Largest drift that is believed, as a share of the largest speed limit."""
 
 
 class Deviation:
-    """Watches how well an episode follows the model.
+    """Compares an episode with the model.
 
     Args:
         problem: The robots.
         engine: Engine for rollouts.
-        config: To be found out: how late commands and how noisy states are, which robots are weak or do not obey.
-        docks: Whether robots dock at their goals, rather than drive through them to others.
+        config: The settings, which say what is estimated.
+        docks: Whether robots stay at their goals, rather than drive through them to others.
 
     Attributes:
-        speed: ``(K,)`` the largest deviation of each robot in a time step, over its length, of late [m/s].
-        drift: The largest change of a robot's velocity from what was expected within a few steps of late [m/s].
+        speed: ``(K,)`` the largest recent deviation of each robot in a time step, over its length [m/s].
+        drift: The largest recent change of a robot's velocity from the expected one within a few steps [m/s].
         problem: The robots with the limits that they are believed to have now.
         latency: Estimator of the latency of commands.
-        packet_loss: Estimator of the share of commands that are lost.
-        standing: Robots that have stalled.
+        packet_loss: Estimator of lost commands, or ``None``.
+        stall: Estimator of stalled robots, or ``None``.
     """
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:
         self.problem, self._engine, self._docks = problem, engine, docks
         self.latency = LatencyEstimator(problem.team, config.delay)
         self.packet_loss = PacketLossEstimator(problem) if config.expect_losses else None
-        self._weakness = ActuatorGainEstimator(problem) if config.learn_limits else None
-        self.standing = StallEstimator(problem) if config.stalls else None
+        self._gain = ActuatorGainEstimator(problem) if config.learn_limits else None
+        self.stall = StallEstimator(problem) if config.stalls else None
         self._filter = StateFilter(problem) if config.filter_states else None
         self._measured: JointState | None = None
         self._estimated: JointState | None = None
         self._expected: tuple[FloatArray, FloatArray] | None = None
-        self._changes = np.zeros((RUN, problem.num_robots, problem.dimension), np.float32)
+        self._changes = np.zeros((REACTION_STEPS, problem.num_robots, problem.dimension), np.float32)
         self.speed = np.zeros(problem.num_robots)
         self._first_order = np.array([model.first_order for model in problem.team.robot_models])
         self.drift, self._speed = 0.0, float(problem.team.max_speed.max())
 
     def observe(self, joint: JointState) -> JointState:
-        """Compare where the robots are with where they were expected; where they will be once commands arrive."""
+        """Compare the robots with the model, and return their state when the next command arrives."""
         commanded = self.latency.observe(joint.controls, ~joint.arrived)
         joint = self._filtered(joint)
-        going = ~joint.arrived if self.standing is None else ~joint.arrived & ~self.standing.robots
+        going = ~joint.arrived if self.stall is None else ~joint.arrived & ~self.stall.robots
         if self.packet_loss is not None:
             going &= ~self.packet_loss.observe(commanded, joint.controls, going)
-        if self._weakness is not None:
-            self._weakness.observe(commanded, joint.controls, going)
-            self.problem = self._weakness.problem
-        if self.standing is not None:
-            joint = self.standing.observe(joint, commanded)
+        if self._gain is not None:
+            self._gain.observe(commanded, joint.controls, going)
+            self.problem = self._gain.problem
+        if self.stall is not None:
+            joint = self.stall.observe(joint, commanded)
         if self._expected is not None:
             self._compare(joint, *self._expected)
         self._seen = joint
@@ -170,7 +161,7 @@ class Deviation:
         change = np.where(going, present_velocities(self.problem, joint.states, joint.controls) - velocities, 0)
         self._changes = np.concatenate([change[None], self._changes[:-1]])
         sums = np.linalg.norm(np.cumsum(self._changes, axis=0), axis=2)
-        self.drift = max(DECAY * self.drift, float(sums.max()), AT_ONCE * float(sums[0].max()))
+        self.drift = max(DECAY * self.drift, float(sums.max()), SINGLE_STEP_FACTOR * float(sums[0].max()))
 
     def _filtered(self, joint: JointState) -> JointState:
         """The joint state with less noise on it, where measurements are noisy."""
@@ -196,8 +187,8 @@ class Deviation:
         self._expected = states[:, : self.problem.dimension], present_velocities(self.problem, states, now)
 
     def arrays(self, joint: JointState) -> ProblemArrays:
-        """Return the arrays to step on from there: with the limits that robots are believed to have now."""
-        radius = docking_radius(self.problem, self._docks)
+        """The problem from this state on, with the limits that robots are believed to have now, as arrays."""
+        radius = arrival_radius(self.problem, self._docks)
         return self.problem.with_state(joint.states, joint.goals, goal_radius=radius).arrays
 
     def _moved(self, joint: JointState, controls: FloatArray) -> JointState:
@@ -210,14 +201,14 @@ class Deviation:
 
     @property
     def speed_slack(self) -> float:
-        """Speed by which a robot may soon be too fast, whichever way it goes [m/s]."""
-        return 0.0 if self.drift < STEADY * self._speed else min(self.drift, FASTEST * self._speed)
+        """Largest speed that disturbances may soon add to a robot, in any direction [m/s]."""
+        return 0.0 if self.drift < DRIFT_DEADBAND * self._speed else min(self.drift, MAX_SPEED_SLACK * self._speed)
 
-    def room(self, reaction_time: float) -> float:
-        """Return how far robots get from where they are expected within so many seconds [m].
+    def margin_inflation(self, reaction_time: float) -> float:
+        """Return the distance by which robots deviate within a reaction time [s], at most :data:`MAX_INFLATION` [m].
 
-        What makes a robot of first order stray is over with the next command to arrive.
+        A robot of first order deviates until the next command arrives only.
         """
         next_command = min((1 + len(self.latency.under_way)) * self.problem.dt, reaction_time)
         within = np.where(self._first_order, next_command, reaction_time)
-        return min(float((within * self.speed).max()), MOST * self.problem.team.largest_radius)
+        return min(float((within * self.speed).max()), MAX_INFLATION * self.problem.team.largest_radius)

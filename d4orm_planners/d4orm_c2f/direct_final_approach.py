@@ -1,4 +1,4 @@
-"""Final approach: robots near their goals drive straight to them, or away and come again."""
+"""Final approach: robots near their goals drive straight to them, or manoeuvre."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.engine.types import Engine
-from d4orm_planners.tracking.steering import NEAR_VIA, drives, standing, straight_drives
+from d4orm_planners.tracking.steering import NEAR_VIA, at_rest, drives, straight_drives
 
 PASSING = 1 / 75_000
-"""Share of the goal radius that is one of robots that drive through a place and do not dock there."""
+"""Share of the goal radius that is the arrival radius of robots that drive through their goals."""
 
 NEARBY = 3.0
-"""Within how many radii of its turning circle of its goal a robot that cannot turn in place looks for a manoeuvre."""
+"""Distance from its goal within which a robot that cannot turn in place looks for a manoeuvre, in turning radii."""
 
 DIRECTIONS, BEYOND = 16, (0.25, 1.0, 2.0)
-"""Number of directions of a manoeuvre at first, and its distances, in radii of the turning circle."""
+"""Number of first directions of manoeuvres, and their distances, in turning radii."""
 
 LENGTH, RESERVE = 8.0, 2.0
-"""Most length, in radii of the turning circle, and most time beyond that at full speed [s]."""
+"""Largest length of a manoeuvre, in turning radii, and its longest time beyond that at full speed [s]."""
 
 
-def docking_radius(problem: Problem, docks: bool) -> float:
-    """The goal radius for rollouts of an episode [m]; a robot that does not dock drives on to its next goal."""
+def arrival_radius(problem: Problem, docks: bool) -> float:
+    """The goal radius for rollouts of an episode [m]; a robot that does not stay drives on to its next goal."""
     return problem.goal_radius if docks else PASSING * problem.goal_radius
 
 
 def direct_final_approach(
     window: Problem, engine: Engine, controls: FloatArray, near: BoolArray, arrived: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
-    """The controls, but straight drives for robots that dock by these no later, or manoeuvres (:func:`come_again`).
+    """The controls, with straight drives for robots that arrive by these no later, or manoeuvres.
 
     Samples head for a goal only roughly, and a robot that misses it at full speed has to turn.
 
@@ -41,7 +41,7 @@ def direct_final_approach(
         window: The robots from where they are to their goals, over the prediction horizon.
         engine: Engine for rollouts.
         controls: ``(H_predict, K, m)``.
-        near: ``(K,)`` whose drives are tried.
+        near: ``(K,)`` robots whose straight drives are tried.
         arrived: ``(K,)`` robots at rest for good.
 
     Returns:
@@ -52,45 +52,45 @@ def direct_final_approach(
     speed, acceleration = (window.team.limits[:, limit, None] for limit in (SPEED, ACCELERATION))
     circle = window.team.turning_radius
     turning = (circle > 0) & np.isfinite(circle) & (window.dimension == 2)
-    beside = turning & ~arrived & (away[:, 0] < NEARBY * circle)
+    close = turning & ~arrived & (away[:, 0] < NEARBY * circle)
     near = near & (away <= speed * window.dt * window.horizon)[:, 0]
-    home = np.zeros_like(near)
-    if not (near | beside).any():
-        return controls, home
-    latest = np.minimum(_docking_times(engine.rollout(window, controls)), window.horizon)
+    final = np.zeros_like(near)
+    if not (near | close).any():
+        return controls, final
+    latest = np.minimum(_arrival_times(engine.rollout(window, controls)), window.horizon)
     # Past the goal at full speed where that meets it and stops them; else so that robots could stop there.
     overrun = np.where(np.isinf(window.goal_speed)[:, None], speed**2 / (2 * acceleration), 0)
     for beyond in (overrun, np.zeros_like(speed)):
-        if not (near & ~home).any():
+        if not (near & ~final).any():
             break
         aimed = window.goal + beyond * offsets / np.maximum(away, window.goal_radius)
-        passing = window.with_state(window.start, aimed, goal_radius=docking_radius(window, docks=False))
+        passing = window.with_state(window.start, aimed, goal_radius=arrival_radius(window, docks=False))
         straight = straight_drives(passing).controls[:, :, 0]
         trajectory = engine.rollout(window, straight)
-        sooner = near & ~home & (_docking_times(trajectory) <= latest)
+        sooner = near & ~final & (_arrival_times(trajectory) <= latest)
         if (asked := np.flatnonzero(sooner & turning)).size:
             sooner[asked] = _keeps_clear(window, trajectory.positions[:, asked, None], asked, arrived)[:, 0]
         controls = np.where(sooner[:, None], straight, controls)
-        home |= sooner
-    beside &= ~home & (latest == window.horizon)
-    controls, coming = come_again(window, controls, np.flatnonzero(beside), arrived)
-    return controls, home | coming
+        final |= sooner
+    close &= ~final & (latest == window.horizon)
+    controls, manoeuvring = approach_by_manoeuvres(window, controls, np.flatnonzero(close), arrived)
+    return controls, final | manoeuvring
 
 
-def come_again(
+def approach_by_manoeuvres(
     window: Problem, controls: FloatArray, robots: IntArray, arrived: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
-    """The controls, but manoeuvres for robots ``(R,)`` that cannot turn in place and are beside their goals.
+    """The controls, with manoeuvres for robots ``(R,)`` that cannot turn in place and are close to their goals.
 
-    What lies within a robot's turning circles it reaches by driving away from it first, which samples that are paid for
-    being near do not do. Among drives by points all around, forwards or in reverse, that one is chosen which is home
-    first and keeps clear of all at rest.
+    A robot reaches a point within its turning circles by driving away from it first, which samples do not do, as they
+    are rewarded for being near. Of drives by points all around, forwards or in reverse, the one is chosen that arrives
+    first and keeps clear of all robots at rest.
 
     The other arguments, and what is returned, are as for :func:`direct_final_approach`.
     """
-    coming = np.zeros_like(arrived)
+    manoeuvring = np.zeros_like(arrived)
     if not len(robots):
-        return controls, coming
+        return controls, manoeuvring
     circle, speed = window.team.turning_radius[robots], window.team.limits[robots, SPEED]
     steps = round(float((LENGTH * circle / speed).max() + RESERVE) / window.dt)
     alone = window.with_state(window.start, window.goal, horizon=steps).select(robots.tolist())
@@ -100,7 +100,7 @@ def come_again(
     away = np.float32(NEAR_VIA * alone.team.largest_radius) + circle[:, None] * np.array(BEYOND)
     vias = alone.start[:, None, None, :2] + away[:, :, None, None] * directions
     vias = vias.reshape(len(robots), -1, 1, 2).astype(np.float32)
-    rollouts = drives(alone, *standing(alone), np.zeros(vias.shape[:2], int), vias)
+    rollouts = drives(alone, *at_rest(alone), np.zeros(vias.shape[:2], int), vias)
     clear = _keeps_clear(window, rollouts.positions, robots, arrived)
     moves = (rollouts.states[1:] != rollouts.states[:-1]).any(axis=3)
     # The last step in which it moves.
@@ -111,12 +111,12 @@ def come_again(
     chosen = rollouts.controls[: len(controls), every, best]
     controls = controls.copy()
     controls[:, robots[found], : chosen.shape[2]] = chosen[:, found]
-    coming[robots[found]] = True
-    return controls, coming
+    manoeuvring[robots[found]] = True
+    return controls, manoeuvring
 
 
 def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, arrived: BoolArray) -> BoolArray:
-    """``(R, V)`` whether paths ``(T, R, V, d)`` keep the margin to all at rest, or come no nearer than at first."""
+    """``(R, V)`` bool: paths ``(T, R, V, d)`` that keep the margin to all at rest, or come no nearer than at first."""
     radius = np.asarray(window.team.radius, np.float64)
     room = window.world.clearance(positions) - radius[robots, None]
     clear = _no_nearer(room, window)
@@ -127,12 +127,12 @@ def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, arriv
 
 
 def _no_nearer(gaps: Floats, window: Problem) -> BoolArray:
-    """``(...)`` whether no gap of ``(T, ...)`` is less than the margin, or than the first one if that is less [m]."""
+    """``(...)`` bool: no gap of ``(T, ...)`` is less than the margin, or than the first one if that is less [m]."""
     keeps: BoolArray = (gaps >= np.minimum(gaps[0] - window.rounding, window.margin)).all(axis=0)
     return keeps
 
 
-def _docking_times(trajectory: Trajectory) -> IntArray:
-    """``(K,)`` time steps until each docks; one more than there are for those that do not."""
+def _arrival_times(trajectory: Trajectory) -> IntArray:
+    """``(K,)`` time steps until each robot arrives; ``H + 1`` for one that does not."""
     steps: IntArray = (~trajectory.arrived).sum(axis=0)
     return steps

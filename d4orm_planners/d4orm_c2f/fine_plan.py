@@ -1,4 +1,4 @@
-"""A fine plan over the prediction horizon, and its followers: the sampling of one control loop (Algorithm 4)."""
+"""The fine plan over the prediction horizon: the sampling of one control loop (Algorithm 4)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach, docking_radius
+from d4orm_planners.d4orm_c2f.direct_final_approach import arrival_radius, direct_final_approach
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine, SamplingRules, SamplingTask
 from d4orm_planners.tracking.reference_drives import follow_reference
@@ -22,41 +22,24 @@ NEAREST = 256
 
 
 class Prediction(NamedTuple):
-    """Prediction of a control loop.
+    """Prediction of a control loop."""
 
-    Attributes:
-        controls: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take.
-        positions: ``(1 + H_predict + S, K, d)`` where they lead, with the present place first [m].
-        gap: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot.
-    """
-
-    controls: FloatArray
-    positions: FloatArray
-    gap: float
+    controls: FloatArray  #: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take
+    positions: FloatArray  #: ``(1 + H_predict + S, K, d)`` where they lead, with the present position first [m]
+    gap: float  #: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot
 
 
 class Situation(NamedTuple):
-    """State at the beginning of a control loop.
+    """State at the beginning of a control loop."""
 
-    Attributes:
-        joint: State of the robots.
-        arrived: ``(K,)`` robots that stay there.
-        subgoals: ``(K, d)`` [m].
-        base: ``(H_predict, K, m)`` controls to deform.
-        left: ``(T, K, m)`` controls that the robots had in mind, with the stop after them.
-        careful: ``(H_predict, K, m)`` controls for robots that are stuck, if any are.
-        stuck: ``(K,)`` robots that are; they may come as near as half of the margin.
-        room: Added to the margin of the samples [m].
-    """
-
-    joint: JointState
-    arrived: BoolArray
-    subgoals: FloatArray
-    base: FloatArray
-    left: FloatArray
-    careful: FloatArray | None
-    stuck: BoolArray
-    room: float
+    joint: JointState  #: State of the robots
+    arrived: BoolArray  #: ``(K,)`` robots that stay there
+    subgoals: FloatArray  #: ``(K, d)`` [m]
+    base: FloatArray  #: ``(H_predict, K, m)`` controls to deform
+    left: FloatArray  #: ``(T, K, m)`` what is left of the last plan, with the stop after it
+    careful: FloatArray | None  #: ``(H_predict, K, m)`` controls for robots that are stuck, if any are
+    stuck: BoolArray  #: ``(K,)`` robots that are; they may come as near as half of the margin
+    inflation: float  #: Margin inflation of the samples [m]
 
 
 class Window:
@@ -66,7 +49,7 @@ class Window:
         problem: The problem of the episode.
         config: The settings.
         engine: Engine for rollouts and samples.
-        docks: Whether robots dock at their goals, rather than drive through them to others.
+        docks: Whether robots stay at their goals, rather than drive through them to others.
 
     Attributes:
         problem: The problem, with the limits that the robots are believed to have now.
@@ -99,37 +82,37 @@ class Window:
         )
         sampled = np.clip(now.base + result.mean, *problem.team.control_bounds).astype(np.float32)
         controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
-        radius = docking_radius(problem, self._docks)
+        radius = arrival_radius(problem, self._docks)
         joint, horizon = now.joint, config.predict_horizon
         truth = problem.with_state(joint.states, joint.goals, horizon=horizon, goal_radius=radius)
         if not config.safe_mix:
             positions = self._engine.rollout(truth, controls).positions
             return Prediction(controls, positions, least_gap(truth, positions[1:]))
-        special = now.stuck
+        not_sampled = now.stuck
         if config.direct_final_approach and self._docks:
-            # Who is not held at its goal keeps itself there.
+            # Where goals are not absorbing, robots hold themselves there.
             near = self._near_goals(now) & ~(now.arrived & problem.docks) & ~now.stuck
-            controls, home = direct_final_approach(truth, self._engine, controls, near, now.arrived)
-            special = special | home
-        return self._safe_mix(truth, controls, special, sampled, now)
+            controls, final = direct_final_approach(truth, self._engine, controls, near, now.arrived)
+            not_sampled = not_sampled | final
+        return self._safe_mix(truth, controls, not_sampled, sampled, now)
 
     def _near_goals(self, now: Situation) -> BoolArray:
-        """``(K,)`` whose subgoal is as good as the goal."""
+        """``(K,)`` robots whose subgoal is within the goal radius of the goal."""
         near: BoolArray = np.linalg.norm(now.subgoals - now.joint.goals, axis=1) <= self.problem.goal_radius
         return near
 
     def _task(self, now: Situation) -> SamplingTask:
-        """Deform the base so that all head for their subgoals, or goals where these are near."""
+        """The deformation of the base towards the subgoals, or towards goals where these are near."""
         problem, config, goals = self.problem, self._config, now.joint.goals
         near = self._near_goals(now)
         window = problem.with_state(
             now.joint.states,
             np.where((near | now.arrived)[:, None], goals, now.subgoals),
             horizon=config.predict_horizon,
-            margin=problem.margin + config.extra_margin + now.room,
-            goal_radius=docking_radius(problem, self._docks and bool(near.any())),
+            margin=problem.margin + config.extra_margin + now.inflation,
+            goal_radius=arrival_radius(problem, self._docks and bool(near.any())),
         )
-        reach = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
+        farthest = problem.dt * config.subgoal_offset * float(np.max(np.asarray(problem.team.max_speed)))
         return SamplingTask(
             window,
             now.base,
@@ -137,7 +120,7 @@ class Window:
             moving=self._bodies(now.joint, config.predict_horizon),
             arrived=now.arrived,
             penalty=config.penalty,
-            reference_distance=None if config.normalise_distance else reach,
+            reference_distance=None if config.normalise_distance else farthest,
         )
 
     def _bodies(self, joint: JointState, horizon: int) -> MovingObstacles | None:
@@ -170,14 +153,14 @@ class Window:
         return self._with_stop(present, nothing, present.start[None], 0)
 
     def _safe_mix(
-        self, window: Problem, fresh: FloatArray, special: BoolArray, sampled: FloatArray, now: Situation
+        self, window: Problem, fresh: FloatArray, not_sampled: BoolArray, sampled: FloatArray, now: Situation
     ) -> Prediction:
-        """Fresh controls where they keep everyone apart; where not, robots stop earlier, or do as they had in mind.
+        """Fresh controls where they keep the margin; elsewhere robots stop earlier, or go on with their last plan.
 
-        Those whose controls are ``special`` ``(K,)`` do as sampled before they stop.
+        Robots whose controls were ``not_sampled`` ``(K,)`` take the sampled ones before they stop.
 
-        What they had in mind was free of violations, and ends at rest. So without disturbances there always is a mix
-        that is free of them too: in the last resort all do as before.
+        The last plan was free of violations and ends at rest. So without disturbances there always is a mix that is
+        free of them too: at worst all go on with their last plans.
         """
         horizon = len(fresh)
         before = np.zeros((horizon + self._stop_steps, *fresh.shape[1:]), np.float32)
@@ -188,7 +171,7 @@ class Window:
         # After how many fresh steps each robot stops.
         steps = np.full(window.num_robots, horizon)
         trajectory, violated = self._violations(window_to_rest, controls, now)
-        if (held := violated & special).any():
+        if (held := violated & not_sampled).any():
             fresh = np.where(held[:, None], sampled, fresh)
             states = self._states(window, fresh)
             controls[:, held] = self._with_stop(window, fresh, states, horizon)[:, held]
@@ -225,13 +208,13 @@ class Window:
         if bodies is None:
             return np.zeros(self.problem.num_robots, bool)
         away = np.linalg.norm(trajectory.positions[1:, :, None] - bodies.positions[:, None], axis=3)
-        reach = np.asarray(self.problem.team.radius)[:, None] + bodies.radius + margin
-        meets: BoolArray = (away <= reach).any(axis=(0, 2))
+        safety_distance = np.asarray(self.problem.team.radius)[:, None] + bodies.radius + margin
+        meets: BoolArray = (away <= safety_distance).any(axis=(0, 2))
         return meets
 
     def touching(self, joint: JointState, arrived: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
         """``(K,)`` robots within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
-        radius = docking_radius(self.problem, self._docks)
+        radius = arrival_radius(self.problem, self._docks)
         present = self.problem.with_state(
             joint.states, joint.goals, horizon=len(controls), margin=gap, goal_radius=radius
         )

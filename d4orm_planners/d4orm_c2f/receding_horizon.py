@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -12,9 +13,9 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.base.settings import CheckedSettings
-from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, CoarseWaypoints
 from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
@@ -69,8 +70,8 @@ class D4ormC2F(StatePolicy):
         config: The settings.
         loops: A :class:`LoopRecord` per control loop of the present episode, of the last :data:`REMEMBERED`.
         coarse_time: Time that the first coarse plan took [s].
-        subgoals: ``(K, d)`` where the last control loop headed for [m]; the start before the first.
-        predicted: ``(1 + T, K, d)`` where its plan led, robots that brake or evade in the last resort apart [m].
+        subgoals: ``(K, d)`` subgoals of the last control loop [m]; the start before the first.
+        predicted: ``(1 + T, K, d)`` path of its plan, without braking and evading in the last resort [m].
     """
 
     name = "d4orm-c2f"
@@ -94,7 +95,7 @@ class D4ormC2F(StatePolicy):
     @property
     def guidance(self) -> CoarseWaypoints:
         """Coarse plan that is followed at present."""
-        return self._guide.guidance
+        return self._tracker.guidance
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         self._seed = seed
@@ -111,31 +112,31 @@ class D4ormC2F(StatePolicy):
         self._plan, self._next = self._window.no_controls(), 0
         self.subgoals: FloatArray = joint.states[:, : self.problem.dimension]
         self.predicted: FloatArray = self.subgoals[None]
-        self._homes = np.full_like(joint.goals, np.nan)
-        self._see_docked(joint)
+        self._reached = np.full_like(joint.goals, np.nan)
+        self._note_arrivals(joint)
         begin = time.perf_counter()
         last_step = env.unwrapped.max_cycles
-        self._guide = CoarsePlanTracker(
+        self._tracker = CoarsePlanTracker(
             self.problem, self.config, seed, self._refiner, self._refinement, self._replanning, lifelong, last_step
         )
-        self._guide.begin(joint, self._docked)
+        self._tracker.begin(joint, self._arrived)
         self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)
         self.coarse_time = time.perf_counter() - begin
 
     def _controls(self, joint: JointState) -> FloatArray:
         goals = joint.goals
         joint = self._deviation.observe(joint)
-        self._see_docked(joint)
-        believed = self._window.problem = self._guide.problem = self._deviation.problem
+        self._note_arrivals(joint)
+        believed = self._window.problem = self._tracker.problem = self._deviation.problem
         if not self.loops or self._next >= self.config.execute_horizon:
             self._loop(joint)
         controls = self._plan[min(self._next, len(self._plan) - 1)]
         if self.config.last_resort:
             controls = self._evading(joint, controls)
         self._next += 1
-        if (standing := self._deviation.standing) is not None and standing.robots.any():
+        if (stall := self._deviation.stall) is not None and stall.robots.any():
             probe = PROBE * drive_to_goal(believed, joint.states, goals)
-            controls = np.where(standing.robots[:, None], probe, controls)
+            controls = np.where(stall.robots[:, None], probe, controls)
         if self.config.control_noise_std:
             noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
             controls = np.clip(controls + noise, *self.problem.team.control_bounds).astype(np.float32)
@@ -143,8 +144,8 @@ class D4ormC2F(StatePolicy):
         return controls
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
-        """The controls ``(K, m)``, but for robots that might come to touch something: these brake, or evade."""
-        problem, arrived = self._deviation.problem, self._docked
+        """The controls ``(K, m)``, changed for robots that might come to touch something: these brake, or evade."""
+        problem, arrived = self._deviation.problem, self._arrived
         gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
         touching = self._window.touching(joint, arrived, self._plan[now:], gap)
         speed_slack = self._deviation.speed_slack
@@ -154,11 +155,11 @@ class D4ormC2F(StatePolicy):
             # A late loop may still be reading the plan.
             self._plan = self._plan.copy()
             self._plan[now:, touching] = self._window.stop(joint)[: len(self._plan) - now, touching]
-        # Now they are told all that they may be able to do, whatever they are believed to be.
+        # In the last resort they brake as their own limits allow, not as they are believed to.
         braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
         controls = np.where(touching[:, None], braking, controls)
         run = 0 if (packet_loss := self._deviation.packet_loss) is None else packet_loss.run
-        # Also in between, for there may be a corner to get around; and again, for one answer may be another's question.
+        # Look in between too, for there may be a corner, and twice, for a robot that evades may get in another's way.
         for steps in 2 * (1 + run, 1 + run // 2, 1) if run else (1,):
             controls = self._braking_in_time(joint, controls, gap, speed_slack if steps == 1 else 0.0, steps)
         return controls
@@ -166,14 +167,14 @@ class D4ormC2F(StatePolicy):
     def _braking_in_time(
         self, joint: JointState, controls: FloatArray, gap: float, speed_slack: float, steps: int
     ) -> FloatArray:
-        """The controls ``(K, m)``, but for robots that could not brake in time any more after so many steps of them."""
-        problem, arrived, states = self._deviation.problem, self._docked, joint.states
+        """The controls ``(K, m)``, changed for robots that after so many steps of them could not brake in time."""
+        problem, arrived, states = self._deviation.problem, self._arrived, joint.states
         arrays = self._deviation.arrays(joint)
         for _ in range(steps):
             ahead = self._engine.step(arrays, states, arrived, controls)
             states = ahead.states
         wanted = present_velocities(problem, states, ahead.controls)
-        # Other velocities are reached by the next step, by which everybody will be elsewhere.
+        # Velocities take effect by the next step, so that positions after the present one count.
         safe = safe_velocities(problem, joint._replace(states=states), wanted, ~arrived, gap, speed_slack)
         evading = np.abs(safe - wanted).max(axis=1) > NEARLY * problem.team.max_speed
         if steps > 1:
@@ -184,32 +185,24 @@ class D4ormC2F(StatePolicy):
     def _loop(self, joint: JointState) -> None:
         """One control loop (Algorithm 4, lines 6 to 9)."""
         begin = time.perf_counter()
-        guide, arrived = self._guide, self._docked
-        replanned = guide.replan_if_needed(joint, arrived)
-        refined = not replanned and guide.refine(joint.steps, due=self._begun % self.config.refine_every == 0)
+        tracker, arrived = self._tracker, self._arrived
+        replanned = tracker.replan_if_needed(joint, arrived)
+        refined = not replanned and tracker.refine(joint.steps, due=self._begun % self.config.refine_every == 0)
         self._begun += 1
-        targets = guide.subgoals(joint, arrived)
-        self.subgoals = subgoals = guide.guidance.path[targets, np.arange(len(targets))]
+        targets = tracker.subgoals(joint, arrived)
+        self.subgoals = subgoals = tracker.guidance.path[targets, np.arange(len(targets))]
         left, base = self._plan[self._next :], self._base(joint)
         seed = derived_seed(self._seed, Stream.CONTROL_LOOP, joint.steps)
-        stuck = guide.stuck & ~arrived
-        careful = guide.followed(joint, len(base)) if stuck.any() else None
-        room = self._deviation.room(self.config.reaction_time)
-        now = Situation(joint, arrived, subgoals, base, left, careful, stuck, room)
-
-        def predict() -> Prediction:
-            return self._window.predict(now, seed)
-
-        result: Prediction | None
-        if self.config.deadline is None:
-            result = predict()
-        else:
-            result = self._control.run(predict, self.config.deadline - (time.perf_counter() - begin))
+        stuck = tracker.stuck & ~arrived
+        careful = tracker.followed(joint, len(base)) if stuck.any() else None
+        inflation, limit = self._deviation.margin_inflation(self.config.reaction_time), self.config.deadline
+        now = Situation(joint, arrived, subgoals, base, left, careful, stuck, inflation)
+        work = partial(self._window.predict, now, seed)
+        result = self._control.run(work, None if limit is None else limit - (time.perf_counter() - begin))
+        margin, missed = float("nan"), result is None
         if result is not None:
-            self._plan, self._next, self.predicted = result.controls, 0, result.positions
-        margin = float("nan") if result is None else result.gap
+            self._plan, self._next, self.predicted, margin = result.controls, 0, result.positions, result.gap
         used = time.perf_counter() - begin
-        missed = result is None
         self.loops.append(LoopRecord(joint.steps, used, int(targets.max()), margin, missed, replanned, refined))
 
     def _base(self, joint: JointState) -> FloatArray:
@@ -218,17 +211,17 @@ class D4ormC2F(StatePolicy):
         Where precedence decides, the coarse plan's own pace is kept instead.
         """
         horizon = self.config.predict_horizon
-        if self._guide.guidance.ordered:
-            return self._guide.timed(joint, horizon)
+        if self._tracker.guidance.ordered:
+            return self._tracker.timed(joint, horizon)
         base = self._window.no_controls()
         ahead = self._plan[self._next : horizon]
         base[: len(ahead)] = ahead
-        self._guide.fresh_start(base)
+        self._tracker.fresh_start(base)
         return base
 
-    def _see_docked(self, joint: JointState) -> None:
-        """Note the robots that have arrived where they have to be: noise on measurements sends none off again."""
+    def _note_arrivals(self, joint: JointState) -> None:
+        """Note the robots that have arrived at their present goals: noise on measurements sends none off again."""
         gap = np.linalg.norm(joint.goals - joint.states[:, : self.problem.dimension], axis=1)
-        here = joint.arrived & (gap <= self.problem.goal_radius)
-        self._homes = np.where(here[:, None], joint.goals, self._homes)
-        self._docked: BoolArray = joint.arrived & (joint.goals == self._homes).all(axis=1)
+        at_goal = joint.arrived & (gap <= self.problem.goal_radius)
+        self._reached = np.where(at_goal[:, None], joint.goals, self._reached)
+        self._arrived: BoolArray = joint.arrived & (joint.goals == self._reached).all(axis=1)

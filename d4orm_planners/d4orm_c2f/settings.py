@@ -48,7 +48,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     Attributes:
         engine: ``"auto"``, ``"cpu"`` or ``"jax"``.
         coarse_factor: ``f``, fine time steps per coarse one.
-        check_interval: ``o``: the coarse plan must keep the margin at every so-manyth coarse step.
+        check_interval: ``o``: coarse steps from one check of the coarse plan's margin to the next.
         coarse_samples: ``M`` of the coarse plan.
         coarse_steps: ``N`` of the coarse plan.
         coarse_repair_steps: The same of repairs of the coarse plan.
@@ -64,7 +64,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
             any number: the subgoals of all are always those of one moment, as in the paper.
         mean_of_all: Whether the team is where all robots are on average, as in the paper, not those under way: robots
             that have arrived then hold the subgoals of others back.
-        line_of_sight: Whether a subgoal behind robots at rest is exchanged for the furthest in sight before it.
+        line_of_sight: Whether a subgoal behind robots at rest is replaced by the furthest visible one before it.
         num_samples: ``M`` of a control loop.
         num_steps: ``N`` of a control loop.
         credit: ``"robot"`` or ``"team"``: whose reward weights the samples of a control loop.
@@ -74,8 +74,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         safe_mix: Whether robots follow a fine plan only as far as it keeps the margin.
         direct_final_approach: Whether robots that dock no later if they drive straight to their goals do so.
         extra_margin: Added to the problem's margin in control loops, as room for disturbances [m].
-        reaction_time: The margin in control loops grows by how far robots come within so many seconds from where they
-            were expected, by the largest deviation of late: nothing while they do as they are told [s].
+        reaction_time: Time over which the largest recent deviation of robots from the model is added to the margin in
+            control loops; nothing while they do as they are told [s].
         delay: Steps late that commands are executed: control loops begin where those under way lead. ``None`` finds out
             from what the robots report to have executed.
         filter_states: Whether states that are seen to be noisy are filtered.
@@ -87,12 +87,12 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         last_resort: Whether robots whose plan would end in contact are told to brake or to evade instead.
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
             control loops, which gives the same controls every time, or ``"off"``.
-        refine_every: At most every so-manyth control loop a refinement begins: it takes time from control loops.
+        refine_every: Least number of control loops between refinements, which take time from the loops.
         replan: Whether the guidance is planned anew for robots that are stuck or astray, and for a team that has lost
             it or has come to its end; for robots with new goals it always is.
         replan_distance: The guidance is planned anew for robots this far from it, and for all if they are so on
             average, in steps of the fastest at full speed.
-        patience: Or when they have come no nearer to their goals for so many steps.
+        patience: Steps without progress towards the goals after which the guidance is planned anew too.
         deadline: Seconds that a control loop may take; one that takes longer is left behind, and the last plan goes on.
             ``None`` waits for every loop.
         control_noise_std: Gaussian noise that the controller adds to its controls, in their units.

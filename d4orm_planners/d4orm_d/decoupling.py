@@ -24,13 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class GroupRuns:
-    """The state of the search by groups.
+    """The state of the search by groups."""
 
-    Attributes:
-        grouping: Groups of the last iteration by groups, or ``None`` before the first.
-    """
-
-    grouping: Grouping | None = None
+    grouping: Grouping | None = None  #: Groups of the last iteration by groups, or ``None`` before the first
 
     def replan(self, team: DeformedPlan) -> GroupRuns:
         """Replan every group with a failed robot in turn, the robots outside it as moving obstacles."""
@@ -57,21 +53,13 @@ def grouping_of(search: SolveRun, previous: Grouping | None) -> Grouping:
 
 @dataclass(frozen=True, eq=False)
 class JointRun:
-    """The state of the search by joint runs.
+    """The state of the search by joint runs."""
 
-    Attributes:
-        penalties: ``(K,)`` factors of the problem's collision penalty.
-        resets: Whether the next run starts from zero controls.
-        grouping: Groups of the last run, or ``None`` before the first.
-        labels: ``(K,)`` each robot's failure before the last run, see :func:`failure_labels`.
-        repeats: ``(K,)`` how often in a row each had that failure again.
-    """
-
-    penalties: FloatArray
-    resets: bool
-    grouping: Grouping | None
-    labels: IntArray
-    repeats: IntArray
+    penalties: FloatArray  #: ``(K,)`` factors of the problem's collision penalty
+    resets: bool  #: Whether the next run starts from zero controls
+    grouping: Grouping | None  #: Groups of the last run, or ``None`` before the first
+    labels: IntArray  #: ``(K,)`` each robot's failure before the last run, see :func:`failure_labels`
+    repeats: IntArray  #: ``(K,)`` how often in a row each had that failure again
 
     @classmethod
     def of(cls, num_robots: int, penalty: float, resets: bool) -> JointRun:

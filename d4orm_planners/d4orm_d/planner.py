@@ -94,7 +94,7 @@ class D4ormD(DeformingPlanner):
         return state.improve(team), replace(iteration, controls=team.controls)
 
     def is_big(self, problem: Problem) -> bool:
-        """Return whether the team is a big one."""
+        """Check whether the team is a big one."""
         return self.config.big_team is not None and problem.num_robots > self.config.big_team
 
     def num_samples(self, search: SolveRun) -> int:
@@ -102,7 +102,7 @@ class D4ormD(DeformingPlanner):
 
     def task(self, search: SolveRun, base: FloatArray) -> SamplingTask:
         task = super().task(search, base)
-        # Only who starts from nothing is yet to find out who meets whom; a plan that is made better has to keep apart.
+        # Only a first plan may ignore collisions, to find out which robots meet; later ones keep robots apart.
         from_zero = search.iteration == 0 and not base.any()
         if self.config.first_collisions or not from_zero:
             return task
@@ -112,13 +112,12 @@ class D4ormD(DeformingPlanner):
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""
         if self.config.start == "auto":
-            return straight_start(problem) if self.is_big(problem) else None
+            return straight_if_sparse(problem) if self.is_big(problem) else None
         return straight_drives(problem).controls[:, :, 0] if self.config.start == "straight" else None
 
 
-def straight_start(problem: Problem) -> FloatArray | None:
-    """Controls ``(H, K, m)`` straight to the goals; ``None`` where robots so meet half of the others."""
+def straight_if_sparse(problem: Problem) -> FloatArray | None:
+    """Controls ``(H, K, m)`` straight to the goals; ``None`` where robots would meet half of the others on average."""
     drives = straight_drives(problem)
     graph = conflicts(drives.positions[:, :, 0], problem.team.radius, problem.margin)
-    # As many as when everybody meets half of the team.
     return None if 2 * sum(map(len, graph)) >= problem.num_robots**2 else drives.controls[:, :, 0]

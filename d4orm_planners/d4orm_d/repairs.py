@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
@@ -23,20 +22,19 @@ from d4orm_planners.engine.sampling_types import SamplingTask, moving_robots
 from d4orm_planners.sampling.d4orm import DeformingPlanner
 
 NOISE_FACTORS = (1.0, 2.0)
-"""On the noise of successive repairs: what ordinary noise does not get around, wider noise may."""
+"""Noise factors of successive repairs: wider noise may get around what ordinary noise does not."""
 SLACK = 40
-"""Steps beyond the latest arrival of the robots repaired that their repair looks at. Farther on there is nothing to
-search, and what happens there would dilute the rewards."""
+"""Steps of a repair beyond the latest arrival of its robots. Later ones have nothing to search, and would dilute the
+rewards."""
 RECENCY_GAIN, RECENCY_DECAY = 0.3, 0.7
-"""Increase of a robot's recency by a repair, for the least recently repaired go first, and share of it that is left
-after an iteration."""
+"""Increase of a robot's recency by a repair, and its decay per iteration; the least recent are repaired first."""
 CROWDING = 0.2
 """Priority of a robot for every robot that it meets: it blocks the most."""
 JOINT_INTERVAL, JOINT_FAILURES, JOINT_ROBOTS = 3, 2, 3
-"""Every so many iterations robots may be repaired jointly, each by their team's reward, if so many repairs in a row
-failed for each and they are so few: robots that only together can get out of each other's way."""
+"""Iterations between joint repairs by the team's reward, failed repairs in a row of each robot before one, and largest
+number of robots: some can get out of each other's way only together."""
 SHORTENINGS = 2
-"""Number of times in turn that robots look for shorter final approaches."""
+"""Number of successive searches for shorter final approaches."""
 
 
 class DeformedPlan(WorkingPlan):
@@ -80,10 +78,8 @@ class DeformedPlan(WorkingPlan):
             penalty_per_pair=planner.config.penalty_per_pair, **scoring,
         )  # fmt: skip
         self._runs += 1
-        start, seed = (
-            planner.start(search, base, part.team, self._runs),
-            search.iteration_seed(Stream.REPAIR, self._runs),
-        )
+        start = planner.start(search, base, part.team, self._runs)
+        seed = search.iteration_seed(Stream.REPAIR, self._runs)
         result = search.denoise(task, planner.rules(), start, noise_scale, num_samples, seed)
         self._denoising_steps += len(result.rewards)
         self._excluded += result.excluded
@@ -98,15 +94,10 @@ class DeformedPlan(WorkingPlan):
 
 @dataclass(frozen=True, eq=False)
 class Repairs:
-    """The state of the search by independent repairs.
+    """The state of the search by independent repairs."""
 
-    Attributes:
-        failures: ``(K,)`` failed repairs in a row of each robot.
-        recency: ``(K,)`` how often each was repaired, decaying with every iteration.
-    """
-
-    failures: IntArray
-    recency: NDArray[np.float64]
+    failures: IntArray  #: ``(K,)`` failed repairs in a row of each robot
+    recency: Floats  #: ``(K,)`` how often each was repaired, decaying with every iteration
 
     @classmethod
     def of(cls, num_robots: int) -> Repairs:
@@ -114,7 +105,7 @@ class Repairs:
         return cls(np.zeros(num_robots, int), np.zeros(num_robots))
 
     def repair(self, team: DeformedPlan, config: D4ormDConfig) -> Repairs:
-        """Deform some of the failed robots' controls, and take over what is no worse."""
+        """Deform the controls of some robots that fail, and accept what is no worse."""
         repair = _Repair(team, self)
         repair.run(config)
         return Repairs(repair.failures, repair.recency)
@@ -141,7 +132,7 @@ class _Repair:
             self.deform(np.flatnonzero(failed), config)
             failed, _ = self.team.faults(everybody)
         if not failed.any():
-            # The detours that got robots out of each other's way are longer than they need be.
+            # Detours are longer than necessary at first.
             self.improve()
 
     def deform(self, failed: IntArray, config: D4ormDConfig) -> None:
@@ -159,7 +150,7 @@ class _Repair:
             config.noise_scale(config.repair_steps) * np.float32(wider),
             credit=credit,
             penalty=config.repair_penalty,
-            # A robot that starts next to its goal has little to lose by making way, but would lose it many times over.
+            # Else a robot that starts next to its goal would lose far more by yielding than others.
             reference_distance=float(max(distance.mean(), problem.goal_radius)),
         )
         self.accept(robots, part, trajectory)
@@ -173,11 +164,10 @@ class _Repair:
             self.accept(range(self.problem.num_robots), self.problem, trajectory)
 
     def next_robots(self, failed: IntArray) -> tuple[tuple[int, ...], str]:
-        """Choose the robots to repair, and whose reward to use.
+        """Choose the robots to repair, and the credit.
 
-        Of those that fail some without conflicts among them, those that were not repaired lately first, each by its
-        own reward.
-        Now and then a few robots that only together can get out of each other's way, by their team's.
+        They are robots that fail and have no conflicts among them, the least recently repaired first, each by its own
+        reward. Every :data:`JOINT_INTERVAL` iterations a group of stuck robots is repaired by its team's reward.
         """
         search, graph = self.search, self.team.conflicts()
         degree = np.array([len(neighbours) for neighbours in graph])
@@ -198,7 +188,7 @@ class _Repair:
         return robots, "robot"
 
     def accept(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
-        """Let robots do as in the trajectory, or turn to their goals in time, and count the failures."""
+        """Give robots their motions in the trajectory, or turns to their goals, and count the failures."""
         index = np.array(robots)
         approach_goals(self.team, index, part, trajectory, or_longer=True)
         faults, _ = self.team.faults(index)

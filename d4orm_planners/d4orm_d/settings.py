@@ -20,7 +20,7 @@ class JointRunSettings(CheckedSettings):
         penalty_rise: What is added to a robot's ``penalty`` after every run that leaves it in contact; 0.5 in their
             code. One without contact falls back.
         penalty_limit: Most that it rises to.
-        reset_after_probe: Whether all controls go back to zero after the first iteration, if that minds no collisions,
+        reset_after_probe: Whether all controls go back to zero after the first iteration, if that ignores collisions,
             or after straight drives: only the groups stay.
         clip_after: Repeats of a failure, by itself or in a group of one number, after which a robot's controls are
             clipped to its limits; 6 in their code, ``None`` for never.
@@ -47,9 +47,9 @@ class D4ormDConfig(JointRunSettings, DeformationConfig):
             around all others, and takes over only what is no worse. ``"joint"`` replans all robots that fail in one
             run, each by the reward of its group; a first iteration without collisions is by each robot's own.
         start: First iteration without initial controls. ``"team"`` deforms the whole team at once;
-            ``"straight"`` sends everybody straight to its goal and leaves the rest to repairs; ``"auto"`` does the
+            ``"straight"`` sends all robots straight to their goals and leaves the rest to repairs; ``"auto"`` does the
             second in big teams where robots so meet less than half of the others on average.
-        first_collisions: Whether an iteration that starts from zero controls minds collisions.
+        first_collisions: Whether an iteration that starts from zero controls penalises collisions.
         repair_samples: ``M`` of an independent repair. A few may be better than many: their error is a search of
             its own.
         repair_steps: ``N`` of an independent repair.
@@ -80,6 +80,6 @@ class D4ormDConfig(JointRunSettings, DeformationConfig):
             )
         if self.reset_after_probe and self.first_collisions and self.start != "straight":
             raise ValueError(
-                "reset_after_probe is True, but the first iteration is no probe: it minds collisions; set "
+                "reset_after_probe is True, but the first iteration is no probe: it penalises collisions; set "
                 "first_collisions=False, or start='straight'"
             )

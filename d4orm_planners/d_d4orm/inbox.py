@@ -1,7 +1,6 @@
-"""Messages that a node has received: the newest candidate of every other node, evaluated, and a count of the rest; and
-rules to choose what to go on from, pure functions (paper, Algorithm 5, lines 4 to 6).
+"""A node's inbox, with the newest candidate of every other node, and rules of selection (Algorithm 5, lines 4-6).
 
-The nodes of one process share an evaluator: candidates are evaluated once, and it has the word to stop.
+The nodes of one process share an evaluator, which evaluates every candidate once and tells them to stop.
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
@@ -33,7 +32,7 @@ class Stopped(Exception):
 
 
 class Evaluator:
-    """Judges candidates, and remembers some.
+    """Evaluates candidates, and remembers some.
 
     Args:
         engine: Engine for rollouts.
@@ -53,7 +52,7 @@ class Evaluator:
         self._lock = threading.Lock()
 
     def own(self, controls: FloatArray) -> Candidate:
-        """Judge what a node of this process has made.
+        """Evaluate the controls of a node of this process.
 
         Raises:
             Stopped: If it is no longer wanted.
@@ -71,7 +70,7 @@ class Evaluator:
         return candidate
 
     def received(self, controls: FloatArray) -> Candidate:
-        """Judge what has arrived; the very controls that a node of this process has made are known already."""
+        """Evaluate received controls; those that a node of this process has made are known already."""
         return self._known.get(controls.tobytes()) or evaluate_controls(self.engine, self.problem, controls)
 
 
@@ -265,7 +264,7 @@ def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, genera
     return among[int(generator.integers(len(among)))]
 
 
-def _square_distances(points: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+def _square_distances(points: Floats, centres: Floats) -> Floats:
     """``(n, c)``."""
-    gap2: NDArray[np.float64] = ((points[:, None] - centres[None]) ** 2).sum(axis=2)
+    gap2: Floats = ((points[:, None] - centres[None]) ** 2).sum(axis=2)
     return gap2

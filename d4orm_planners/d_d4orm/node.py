@@ -30,27 +30,16 @@ RESEND = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """Something that a node did.
+    """Something that a node did."""
 
-    Attributes:
-        node: The node that did it.
-        kind: One of :data:`KINDS`.
-        begin: Time at which it began to, by :func:`time.perf_counter` [s].
-        end: Time at which it was done, likewise. Messages take no time here.
-        of: The node that the candidate came from.
-        sequence: Number among that node's messages, from 1; 0 for one that was not sent yet.
-        candidate: The candidate, as evaluated by ``node``.
-        size: Bytes of the message that was sent, else 0.
-    """
-
-    node: int
-    kind: str
-    begin: float
-    end: float
-    of: int
-    sequence: int
-    candidate: Candidate
-    size: int = 0
+    node: int  #: The node that did it
+    kind: str  #: One of :data:`KINDS`
+    begin: float  #: Time at which it began to, by :func:`time.perf_counter` [s]
+    end: float  #: Time at which it was done, likewise. Messages take no time here.
+    of: int  #: The node that the candidate came from
+    sequence: int  #: Number among that node's messages, from 1; 0 for one that was not sent yet
+    candidate: Candidate  #: The candidate, as evaluated by ``node``
+    size: int = 0  #: Bytes of the message that was sent, else 0
 
 
 Observer = Callable[[Event], object]
@@ -63,23 +52,14 @@ def node_seed(seed: int, node: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class PlanningTask:
-    """Common task of the nodes of one solve.
+    """Common task of the nodes of one solve."""
 
-    Attributes:
-        num_nodes: Number of nodes.
-        seed: That of the whole solve.
-        controls: ``(H, K, m)`` to start from; ``None`` for zeros.
-        selection: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.inbox.choose`.
-        k: Number of candidates that it draws from.
-        links: ``(N, N)`` bool: which nodes each one hears; ``None`` for all.
-    """
-
-    num_nodes: int
-    seed: int
-    controls: FloatArray | None
-    selection: str
-    k: int
-    links: BoolArray | None = None
+    num_nodes: int  #: Number of nodes
+    seed: int  #: That of the whole solve
+    controls: FloatArray | None  #: ``(H, K, m)`` to start from; ``None`` for zeros
+    selection: str  #: Rule by which a node chooses a candidate; see :func:`~d4orm_planners.d_d4orm.inbox.choose`
+    k: int  #: Number of candidates that it draws from
+    links: BoolArray | None = None  #: ``(N, N)`` bool: which nodes each one hears; ``None`` for all
 
     def heard_by(self, node: int) -> set[int]:
         """Return the nodes that a node hears."""
@@ -154,7 +134,7 @@ class Node:
             pass
 
     def step(self, stop: threading.Event, timeout: float, improve: bool) -> bool:
-        """One round of :meth:`run`; whether there is to be another one."""
+        """One round of :meth:`run`; True if there is to be another one."""
         self.refine()
         if stop.is_set() or self.search.time_left == 0 or (self.search.best.solved and not improve):
             return False
@@ -175,7 +155,7 @@ class Node:
             )
 
     def settle(self, seconds: float) -> bool:
-        """Send the best candidate again and again, until all others have one as good or the seconds are over.
+        """Send the best candidate repeatedly, until all others have one as good or the time is over.
 
         Without a solution it only takes what has arrived.
 
@@ -206,12 +186,9 @@ class Node:
 
     def _all_have(self, candidate: Candidate) -> bool:
         """Check whether each of the others has sent a solution as good as this one."""
-        reward = candidate.trajectory.rewards.mean() - TOLERANCE
-        reports = self.inbox.newest
+        found = {node: report.candidate for node, report in self.inbox.newest.items()}
         return all(
-            node in reports
-            and reports[node].candidate.solved
-            and reports[node].candidate.trajectory.rewards.mean() >= reward
+            node in found and found[node].solved and found[node].reward >= candidate.reward - TOLERANCE
             for node in self._others
         )
 
@@ -228,7 +205,7 @@ class Node:
             if rest <= 0:
                 break
             heard |= self._gather(rest)
-        # Who is silent, maybe for ever, is awaited again only when heard from.
+        # A silent node is awaited again only once it was heard from.
         self._awaited = heard
 
     def _gather(self, timeout: float = 0.0) -> set[int]:
@@ -248,7 +225,7 @@ class Node:
         candidates = [received[node][1] for node in nodes]
         chosen = choose(
             self._task.selection,
-            [candidate.trajectory.rewards.mean() for candidate in candidates],
+            [candidate.reward for candidate in candidates],
             np.stack([candidate.controls for candidate in candidates]),
             self._task.k,
             np.random.default_rng(self.search.iteration_seed(Stream.CHOICE)),

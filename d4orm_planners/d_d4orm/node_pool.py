@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+from d4orm_env.core.errors import describe
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.base.planner import Iteration
@@ -23,7 +24,7 @@ logger = logging.getLogger(__name__)
 MODES = ("sync", "async")
 
 LAST_WAIT = 30.0
-"""Seconds that the end of the process waits for a thread that nothing else waited for: native code must not be cut."""
+"""Seconds that the end of the process waits for an abandoned thread: native code must not be interrupted."""
 
 
 class ThreadJob:
@@ -109,7 +110,7 @@ class NodePool(ABC):
         self._error: Exception | None = None
         self._reported: Counter[str] = Counter()
         self._spent = self._excluded = 0
-        self._read: Counter[Node] = Counter()
+        self._read = dict.fromkeys(nodes, 0)
         self._seconds = self._waited = 0.0
 
     def iterate(self, search: SolveRun) -> Iteration:
@@ -141,9 +142,9 @@ class NodePool(ABC):
         return self._iteration(best)
 
     def close(self) -> Candidate:
-        """Part the nodes, and give the best candidate that they have seen.
+        """Stop the nodes, and return the best candidate that they have seen.
 
-        A thread leaves what it is at where it can, and it is waited for no longer than the timeout.
+        Threads are waited for no longer than the timeout.
         """
         self._evaluator.stop.set()
         for node in self._nodes:
@@ -158,14 +159,10 @@ class NodePool(ABC):
         return max((node.search.best for node in self._nodes), key=lambda candidate: candidate.rank)
 
     def metrics(self) -> dict[str, float]:
-        """Return the messages sent by all nodes, and the share of their time that they waited for each other.
-
-        To be asked for once closed.
-        """
-        meters = [node.transport for node in self._nodes]
+        """Messages sent by all nodes, and the share of their time that they waited for each other; once closed."""
         return {
-            "messages": sum(meter.messages for meter in meters),
-            "message_bytes": sum(meter.message_bytes for meter in meters),
+            "messages": sum(node.transport.messages for node in self._nodes),
+            "message_bytes": sum(node.transport.message_bytes for node in self._nodes),
             "waiting_share": self._waited / self._seconds if self._seconds else 0.0,
         }
 
@@ -188,7 +185,7 @@ class NodePool(ABC):
     def _lose_failed(self, job: ThreadJob) -> None:
         assert job.error is not None
         self._error = job.error
-        self._lose(job, f"failed ({type(job.error).__name__}: {' '.join(str(job.error).split())})")
+        self._lose(job, f"failed ({describe(job.error)})")
 
     def _check_alive(self) -> None:
         if not self.alive and self._error is not None:
@@ -218,7 +215,7 @@ class NodePool(ABC):
         """Return records of the nodes' iterations since the last call."""
         new = []
         for node in self._nodes:
-            records = node.search.history[self._read[node] :]
+            records = node.search.history[self._read[node] :]  # which may grow meanwhile
             self._read[node] += len(records)
             new += records
         return new
@@ -230,7 +227,7 @@ class SyncNodePool(NodePool):
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
         self._all(Node.refine, time_left)
         candidates = [node.candidate for node in self.alive]
-        # Judging what others claim to be solutions takes its time, and after the last round nobody goes on from it.
+        # Evaluating the candidates of others takes time, and after the last round no node goes on from them.
         left = time_left()
         in_time = left is None or left > 0
         if in_time and (improve or not any(candidate.solved for candidate in candidates)):

@@ -1,4 +1,4 @@
-"""Pools of nodes that run at their own pace: all in threads of this process, or one of them on a network."""
+"""Pools of nodes without common rounds: all in threads of this process, or one of them on a network."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GLANCE = 0.05
 
 
 class AsyncNodePool(NodePool):
-    """Every node runs on by itself; a round is over when each was heard from, or the timeout passed after the first."""
+    """Nodes run by themselves; a round is over when each was heard from, or the timeout has passed after the first."""
 
     def __init__(
         self,

@@ -79,10 +79,9 @@ class DD4orm(Planner):
         return DD4orm(replace(self.config, communication_range=communication_range))
 
     def _links(self, problem: Problem) -> BoolArray | None:
-        """Return which nodes hear each other; ``None`` for all."""
-        reach = self.config.communication_range
-        starts = problem.start[:, : problem.dimension]
-        return None if reach is None else communication_links(problem, starts, reach, line_of_sight=False)
+        """``(N, N)`` bool: nodes that hear each other; ``None`` for all."""
+        limit, starts = self.config.communication_range, problem.start[:, : problem.dimension]
+        return None if limit is None else communication_links(problem, starts, limit, line_of_sight=False)
 
     def iterate(self, search: SolveRun, state: RunningNodes) -> tuple[RunningNodes, Iteration]:
         """See :meth:`Planner.iterate`: one round of all nodes, and the best candidate that they made in it."""

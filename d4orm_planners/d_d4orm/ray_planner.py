@@ -15,7 +15,8 @@ from math import ceil
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from d4orm_env.core.errors import first_line
+from d4orm_env.core.errors import describe, first_line
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.base.candidate import evaluate_controls
@@ -28,8 +29,6 @@ TIMEOUT = 10.0
 """Seconds to wait for the head of a cluster to answer."""
 
 LOOPBACK = ("127.0.0.1", "::1")
-
-
 RESTARTS = 3
 """Number of times that a lost actor is started again, before its node is done without."""
 START = 120.0
@@ -40,11 +39,7 @@ GLANCE = 0.1
 
 def import_ray(what: str) -> ModuleType:
     """Ray, or an ``ImportError`` that says what needs it and how to install it."""
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError(f"{what} needs ray; install it with: pip install 'd4orm-env[distributed]'") from error
-    return ray
+    return load(LazyModule("ray", what, "distributed"))
 
 
 class RayConnection:
@@ -74,10 +69,9 @@ class RayConnection:
             elif self._owner:
                 self.ray.init(address=address, log_to_driver=False)
         except Exception as error:  # Ray raises errors of many kinds
-            text = " ".join(str(error).split())
             raise ConnectionError(
-                f"Ray cluster {address!r} cannot be reached ({type(error).__name__}: {text}); "
-                "start one with `ray start --head`, or leave the address out to run on this machine"
+                f"Ray cluster {address!r} cannot be reached ({describe(error)}); start one with `ray start --head`, or "
+                "leave the address out to run on this machine"
             ) from error
 
     def _start_here(self) -> None:
@@ -121,21 +115,13 @@ def host_and_port(address: str) -> tuple[str, int]:
 
 
 class ActorOutcome(NamedTuple):
-    """Outcome of an actor's iteration.
+    """Outcome of an actor's iteration."""
 
-    Attributes:
-        data: The candidate, a message.
-        denoising_steps: Spent on it.
-        excluded: See :class:`~d4orm_planners.base.planner.Iteration`.
-        compiling: Seconds of it that went into compiling.
-        process: The process that did it.
-    """
-
-    data: bytes
-    denoising_steps: int
-    excluded: int
-    compiling: float
-    process: int
+    data: bytes  #: The candidate, a message
+    denoising_steps: int  #: Spent on it
+    excluded: int  #: See :class:`~d4orm_planners.base.planner.Iteration`
+    compiling: float  #: Seconds of it that went into compiling
+    process: int  #: The process that did it
 
 
 class Worker:

@@ -32,7 +32,7 @@ MOST_NODES = 1024
 
 @dataclass(frozen=True, kw_only=True)
 class DD4ormConfig(PlannerConfig):
-    """Settings of D-D4orm. :func:`~d4orm_planners.make_planner` takes those of ``refinement`` beside the others.
+    """Settings of D-D4orm. :func:`~d4orm_planners.make_planner` takes those of ``refinement`` as well.
 
     There, ``planner`` says what every node refines its candidate with, ``"d4orm"`` (the default), ``"d4orm-d"`` or
     ``"hybrid"``.

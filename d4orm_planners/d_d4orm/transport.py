@@ -19,7 +19,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.candidate import PLAN_REACH
+from d4orm_planners.base.candidate import MOST_OF_LIMIT
 
 MAGIC = b"D4DC"
 VERSION = 1
@@ -38,21 +38,13 @@ _CHECKSUM = struct.Struct("<I")
 
 @dataclass(frozen=True, eq=False)
 class Message:
-    """A candidate as a node claims it to be.
+    """A candidate as a node claims it to be."""
 
-    Attributes:
-        node: Its sender, from 0.
-        sequence: Number of the candidate, from 1.
-        controls: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would.
-        reward: Mean reward.
-        feasible: Whether it is a solution.
-    """
-
-    node: int
-    sequence: int
-    controls: FloatArray
-    reward: float
-    feasible: bool
+    node: int  #: Its sender, from 0
+    sequence: int  #: Number of the candidate, from 1
+    controls: FloatArray  #: ``(H, K, m)`` as planned, for the receiver to go on from as the sender would
+    reward: float  #: Mean reward
+    feasible: bool  #: Whether it is a solution
 
 
 class MessageError(ValueError):
@@ -91,7 +83,7 @@ def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
 
     Raises:
         MessageError: If it is anything but a message of this version with finite controls, none beyond
-            :data:`~d4orm_planners.base.candidate.PLAN_REACH`, for this problem from one of the nodes.
+            :data:`~d4orm_planners.base.candidate.MOST_OF_LIMIT` times its limit, for this problem, from a node.
     """
     if len(data) > MAX_BYTES:
         raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")
@@ -128,8 +120,8 @@ def _checked(controls: FloatArray, shape: tuple[int, ...], reward: float, proble
     if not (np.isfinite(controls).all() and np.isfinite(reward)):
         raise MessageError("not_finite", "a control or the reward is not finite")
     controls = controls.reshape(shape)
-    if (np.abs(controls) > PLAN_REACH * problem.team.control_limits).any():
-        raise MessageError("limits", f"a control is more than {PLAN_REACH:g} times its limit")
+    if (np.abs(controls) > MOST_OF_LIMIT * problem.team.control_limits).any():
+        raise MessageError("limits", f"a control is more than {MOST_OF_LIMIT:g} times its limit")
     return controls
 
 
@@ -173,7 +165,7 @@ class Mailbox:
             self._changed.notify_all()
 
     def collect(self, timeout: float = 0.0) -> list[bytes]:
-        """Return what has arrived, see :meth:`Transport.collect`."""
+        """See :meth:`Transport.collect`."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._arrived, timeout)
             messages = [] if self.closed else list(self._arrived)

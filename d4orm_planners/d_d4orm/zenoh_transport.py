@@ -10,15 +10,17 @@ import logging
 import re
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
-from d4orm_env.core.arrays import duration
-from d4orm_env.core.errors import no_setting
+from pydantic import AfterValidator, BeforeValidator
+
 from d4orm_env.core.files import require_file
 from d4orm_env.core.lazy import LazyModule, load
+from d4orm_planners.base.settings import CheckedSettings, PathText, Seconds
 from d4orm_planners.d_d4orm.transport import MAX_BYTES, WAITING, Mailbox
 
 _zenoh: Any = LazyModule("zenoh", "transport 'zenoh'", "zenoh")
@@ -57,8 +59,27 @@ _ENDPOINT = re.compile(rf"({'|'.join(PROTOCOLS)})/(?P<host>\[[0-9A-Fa-f:.%]+\]|[
 _NAMESPACE = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 
 
+def _namespace(name: str) -> str:
+    if not _NAMESPACE.fullmatch(name):
+        raise ValueError(f"{name!r} is not of letters, digits, '_', '.' and '-', with '/' between, as team/1")
+    return name
+
+
+def _endpoints(endpoints: object, least_port: int = 0) -> tuple[str, ...]:
+    if isinstance(endpoints, str) or not isinstance(endpoints, (list, tuple)):
+        raise ValueError(f"must be a list of endpoints, as [tcp/192.168.1.10:7447], not {endpoints!r}")
+    for endpoint in endpoints:
+        match = _ENDPOINT.fullmatch(endpoint) if isinstance(endpoint, str) else None
+        if match is None or not least_port <= int(match["port"]) <= 65535:
+            raise ValueError(
+                f"has {endpoint!r}; an endpoint is of the form PROTOCOL/HOST:PORT, as tcp/192.168.1.10:7447, with one "
+                f"of {', '.join(PROTOCOLS)}"
+            )
+    return tuple(endpoints)
+
+
 @dataclass(frozen=True, kw_only=True)
-class ZenohSettings:
+class ZenohSettings(CheckedSettings):
     """Network of the nodes. By default that is this machine only, and no port is open beyond loopback.
 
     Attributes:
@@ -74,25 +95,12 @@ class ZenohSettings:
         grace_period: Seconds that a node with a solution goes on telling it, until all others have one as good.
     """
 
-    namespace: str = "d4orm"
-    listen: tuple[str, ...] = LOOPBACK
-    connect: tuple[str, ...] = ()
+    namespace: Annotated[str, AfterValidator(_namespace)] = "d4orm"
+    listen: Annotated[tuple[str, ...], BeforeValidator(_endpoints)] = LOOPBACK
+    connect: Annotated[tuple[str, ...], BeforeValidator(partial(_endpoints, least_port=1))] = ()
     multicast: bool = False
-    config_file: str | None = None
-    grace_period: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.namespace, str) or not _NAMESPACE.fullmatch(self.namespace):
-            raise ValueError(
-                f"namespace {self.namespace!r} is not of letters, digits, '_', '.' and '-', with '/' between, as team/1"
-            )
-        for name in ("listen", "connect"):
-            object.__setattr__(self, name, _endpoints(name, getattr(self, name)))
-        if not isinstance(self.multicast, bool):
-            raise ValueError(f"multicast must be true or false, not {self.multicast!r}")
-        if self.config_file is not None:
-            object.__setattr__(self, "config_file", str(self.config_file))
-        object.__setattr__(self, "grace_period", duration(self.grace_period, "grace_period", zero_allowed=True))
+    config_file: PathText | None = None
+    grace_period: Seconds = 2.0
 
     @classmethod
     def of(cls, settings: object) -> ZenohSettings:
@@ -103,13 +111,10 @@ class ZenohSettings:
         """
         if isinstance(settings, cls):
             return settings
-        known = [field.name for field in fields(cls)]
         if not isinstance(settings, Mapping):
-            raise ValueError(f"the settings of zenoh must be a mapping of {', '.join(known)}, not {settings!r}")
-        for name in settings:
-            if name not in known:
-                raise no_setting(name, "zenoh", known)
-        return cls(**settings)
+            names = ", ".join(cls.setting_names())
+            raise ValueError(f"the settings of zenoh must be a mapping of {names}, not {settings!r}")
+        return cls.from_keywords(settings, "zenoh")
 
     @property
     def on_loopback(self) -> bool:
@@ -209,19 +214,6 @@ def zenoh_config(zenoh: ModuleType, settings: ZenohSettings) -> object:
     return config
 
 
-def _endpoints(name: str, endpoints: object) -> tuple[str, ...]:
-    if isinstance(endpoints, str) or not isinstance(endpoints, (list, tuple)):
-        raise ValueError(f"{name} must be a list of endpoints, as [tcp/192.168.1.10:7447], not {endpoints!r}")
-    for endpoint in endpoints:
-        match = _ENDPOINT.fullmatch(endpoint) if isinstance(endpoint, str) else None
-        if match is None or not (name == "connect") <= int(match["port"]) <= 65535:
-            raise ValueError(
-                f"{name} has {endpoint!r}; an endpoint is of the form PROTOCOL/HOST:PORT, as tcp/192.168.1.10:7447, "
-                f"with one of {', '.join(PROTOCOLS)}"
-            )
-    return tuple(endpoints)
-
-
 def _is_loopback(endpoint: str) -> bool:
     match = _ENDPOINT.fullmatch(endpoint)
     assert match is not None
@@ -233,5 +225,5 @@ def _is_loopback(endpoint: str) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """Return zenoh's message, on one line and without the places in its sources."""
+    """Return zenoh's message, on one line and without positions in its sources."""
     return " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())

@@ -53,7 +53,7 @@ class CpuSamplingEngine(CpuEngine):
         watcher: StepWatcher | None = None,
     ) -> SamplingResult:
         """See :meth:`d4orm_planners.engine.sampling_types.SamplingEngine.denoise`."""
-        run = Sampling(task, rules, num_samples, seed, self._threads)
+        run = Sampling(task, num_samples, seed, self._threads)
         factor, units = task.first_factor, task.problem.team.control_units
         mean_rewards = np.empty(len(noise_scale), np.float32)
         done = excluded = 0
@@ -109,7 +109,7 @@ def make_bodies(moving: MovingObstacles, margin: np.float32) -> Bodies:
     # Copies, for which one compilation serves: read-only arrays are of another type.
     positions, radius = (np.array(values, np.float32, order="C") for values in (moving.positions, moving.radius))
     num_steps, num_blocks = len(positions), -(-len(positions) // BLOCK)
-    # A last block that is short goes on with its last place.
+    # A last block that is short goes on with its last position.
     blocks = positions[np.minimum(np.arange(num_blocks * BLOCK), num_steps - 1)]
     blocks = blocks.reshape(num_blocks, BLOCK, *positions.shape[1:])
     boxes = _widened(blocks.min(axis=1) - radius[:, None], blocks.max(axis=1) + radius[:, None], margin)
@@ -125,7 +125,7 @@ def _widened(low: FloatArray, high: FloatArray, margin: np.float32) -> FloatArra
 class Sampling:
     """One denoising run: its arrays and the threads that share its tiles."""
 
-    def __init__(self, task: SamplingTask, rules: SamplingRules, num_samples: int, seed: int, threads: Threads) -> None:
+    def __init__(self, task: SamplingTask, num_samples: int, seed: int, threads: Threads) -> None:
         problem = task.problem
         worth = task.base.shape[0] * problem.num_robots * num_samples // WORTH_A_THREAD
         self.task, self.threads = task, Threads(min(threads.num_threads, max(worth, 1)))

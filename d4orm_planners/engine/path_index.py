@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Ints, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -72,26 +72,22 @@ class PathIndex:
         met = np.sort(np.concatenate(list(parts.values())))
         return np.stack(np.divmod(met, num_robots), axis=1)
 
-    def count_meetings(
-        self, robots: ArrayLike, states: FloatArray, until: ArrayLike | None = None
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Count the others that robots would meet on each of some paths, if nobody else's changed.
+    def count_meetings(self, robots: ArrayLike, states: FloatArray) -> tuple[Ints, Ints]:
+        """Count the others that robots would meet on each of some paths, if only that one changed.
 
         Args:
             robots: ``(R,)``.
-            states: ``(R, V, H+1, n)`` states, or just places.
-            until: ``(R,)`` the last step that counts, or ``None`` for the horizon.
+            states: ``(R, V, H+1, n)`` states, or just positions.
 
         Returns:
             ``(R, V)``, and the first step at which each meets one, ``H+1`` if it meets none.
         """
         index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(states, np.float32)
-        last = np.full(len(index), paths.shape[2]) if until is None else np.asarray(until, np.int64)
         counts, when = np.empty((2, *paths.shape[:2]), np.int32)
 
         def count(part: IntArray) -> None:
             met = np.empty((paths.shape[1], self.table.positions.shape[1]), np.bool_)
-            _count_meetings(self.table, index, paths, last, part, met, counts, when)
+            _count_meetings(self.table, index, paths, part, met, counts, when)
 
         self._threads.over(len(index), count)
         return counts, when
@@ -160,29 +156,22 @@ def _pairs(table: PathTable, robot_range: IntArray) -> IntArray:
 
 @cached_kernel(**WITHOUT_ARRAYS)
 def _count_meetings(
-    table: PathTable,
-    robots: IntArray,
-    paths: FloatArray,
-    until: IntArray,
-    robot_range: IntArray,
-    met: BoolArray,
-    counts: Ints,
+    table: PathTable, robots: IntArray, paths: FloatArray, robot_range: IntArray, met: BoolArray, counts: Ints,
     when: Ints,
-) -> None:
+) -> None:  # fmt: skip
     """See :meth:`PathIndex.count_meetings`; ``met`` ``(V, K)`` is overwritten."""
     table = borrow(table)
-    num_paths, num_blocks = paths.shape[1], table.first.shape[0]
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
         met[:], met[:, robot] = False, True
         counts[r], when[r] = 0, paths.shape[2]
         # Time in the outer loop: paths of one robot look into the same cells.
-        for block in range(min(num_blocks, until[r] // BLOCK + 1)):
+        for block in range(table.first.shape[0]):
             first, last = steps_of(table, block)
-            for v in range(num_paths):
+            for v in range(paths.shape[1]):
                 middle, spread = enclose(paths[r, v], table.positions.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
-                    continue  # Nothing is other than it was in the block before.
+                    continue  # Nothing has moved since the block before.
                 count, soonest = _mark_near(table, robot, paths[r, v], middle, spread, block, met[v])
                 counts[r, v], when[r, v] = counts[r, v] + count, min(when[r, v], soonest)
 
@@ -192,13 +181,13 @@ _DOUBT, _ROUNDING = 1 / 750, 64 * 2.0**-23
 farther than :mod:`d4orm_env.verify.docking` has it."""
 
 
-def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) -> NDArray[np.int32]:
+def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) -> Ints:
     """Check some robots' paths without looking at the others.
 
     Args:
         arrays: The problem.
         robots: ``(R,)``.
-        states: ``(R, V, H+1, n)`` states, or just places.
+        states: ``(R, V, H+1, n)`` states, or just positions.
 
     Returns:
         ``(3, R, V)`` steps: the first after the start within the margin of an obstacle or the bounds; the last that
@@ -223,7 +212,7 @@ def _check_alone(
             path, last, touching, unsure = paths[r, v], never - 1, never, never
             while last > 0 and _is_same_position(path, dimension, last):
                 last -= 1
-            # Where it stands from then on it is no nearer to anything.
+            # From then on it is at rest, and no nearer to anything.
             for t in range(max(last, 1), 0, -1):
                 if closed and touches_static(arrays, safety_distance, path[t, :dimension]):
                     touching = t
@@ -242,7 +231,7 @@ def _is_same_position(path: FloatArray, dimension: int, t: int) -> bool:
 
 @inlined
 def is_unsure(arrays: ProblemArrays, position: FloatArray, goal: FloatArray) -> bool:
-    """Check whether rounding may decide, here or where the plan is judged, if a robot at this place is at its goal."""
+    """Check whether rounding may decide, here or in the verification, if a robot at this position is at its goal."""
     gap2, extent = 0.0, 0.0
     for axis in range(goal.shape[0]):
         gap = np.float64(position[axis]) - np.float64(goal[axis])

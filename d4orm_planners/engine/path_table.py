@@ -1,8 +1,8 @@
-"""Table of a team's positions at every step, as compiled code reads it: near robots without looking at every pair.
+"""Table of a team's positions at every step, as compiled code reads it, to find near robots without all pairs.
 
-Time is cut into blocks of a few steps, in which robots get not far. In every block the robots are chained in the
-buckets of a hash table, by the cell of a grid that the middle of each one's path through the block is in. A robot that
-comes near a path is in one of the few cells around it. Memory and time grow with the robots, not with the pairs.
+Time is cut into blocks of a few steps, in which robots move little. In every block the robots are chained in the
+buckets of a hash table, by the grid cell that holds the middle of each one's path through the block. Robots near a path
+are in the few cells around it. Memory and time grow with the robots, not with the pairs.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, IntArray, Whole
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.compiling import compiled, inlined
 
 BLOCK = 8
@@ -24,35 +23,20 @@ _WIDER = 1 + 2.0**-20
 
 
 class PathTable(NamedTuple):
-    """The index as kernels read it. Steps are counted from the first after the start.
+    """The index as kernels read it. Steps are counted from the first after the start."""
 
-    Attributes:
-        block: :data:`BLOCK`.
-        positions: ``(H+1, K, d)`` float32 [m].
-        radius: ``(K,)`` float64 [m].
-        margin: ``()`` float64 [m].
-        safety_distance: ``()`` float64 the largest distance at which two robots are near [m].
-        scale: ``()`` float64 cells in a metre.
-        middle: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
-        spread: ``(B, K)`` float64 and how far from there it gets [m].
-        widest: ``(1,)`` float64 the largest spread there has been.
-        moving: ``(1,)`` int64 the last block in which any robot has moved.
-        first: ``(B, N)`` int32 the first robot in each bucket of each block.
-        following: ``(B, K)`` int32 the robot after each in its bucket.
-    """
-
-    block: int
-    positions: FloatArray
-    radius: NDArray[np.float64]
-    margin: np.float64
-    safety_distance: np.float64
-    scale: np.float64
-    middle: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    widest: NDArray[np.float64]
-    moving: IntArray
-    first: NDArray[np.int32]
-    following: NDArray[np.int32]
+    block: int  #: :data:`BLOCK`
+    positions: FloatArray  #: ``(H+1, K, d)`` float32 [m]
+    radius: Floats  #: ``(K,)`` float64 [m]
+    margin: np.float64  #: ``()`` float64 [m]
+    safety_distance: np.float64  #: ``()`` float64 the largest distance at which two robots are near [m]
+    scale: np.float64  #: ``()`` float64 cells in a metre
+    middle: Floats  #: ``(B, K, 3)`` float64 where each robot is in each block, more or less [m],
+    spread: Floats  #: ``(B, K)`` float64 and how far from there it gets [m]
+    widest: Floats  #: ``(1,)`` float64 the largest spread there has been
+    moving: IntArray  #: ``(1,)`` int64 the last block in which any robot has moved
+    first: Ints  #: ``(B, N)`` int32 the first robot in each bucket of each block
+    following: Ints  #: ``(B, K)`` int32 the robot after each in its bucket
 
 
 @inlined
@@ -137,16 +121,12 @@ def first_near(
 ) -> int:
     """The first step of a block at which a robot is within the margin of another, in float64; 0 if at none.
 
-    Its path begins with its place at step ``begin``.
+    Its path begins with its position at step ``begin``.
     """
     safety_distance = table.radius[robot] + table.radius[other] + table.margin
     x, y, z = table.middle[block, other]
-    x, y, z, far = (
-        x - middle[0],
-        y - middle[1],
-        z - middle[2],
-        _WIDER * (safety_distance + spread + table.spread[block, other]),
-    )
+    x, y, z = x - middle[0], y - middle[1], z - middle[2]
+    far = _WIDER * (safety_distance + spread + table.spread[block, other])
     if x * x + y * y + z * z > far * far:
         return 0
     first, last = steps_of(table, block)

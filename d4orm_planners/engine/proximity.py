@@ -48,42 +48,28 @@ _CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
 
 
 class Scratch(NamedTuple):
-    """Scratch of a tile of ``K`` robots.
+    """Scratch of a tile of ``K`` robots."""
 
-    Attributes:
-        boxes: ``(K d BOX,)`` where the robots are within a block, see :func:`~d4orm_env.engine.simd.enclose`, widened
-            so that what is within the margin of each other touches.
-        num_robots: ``(K,)`` how many robots before it each may touch,
-        robots: ``(K, K)`` and which.
-        near: ``(DIGITS, K, BLOCK)`` how many robots and bodies are near at a step of the block: a bit for every sample
-            of each binary digit, the lowest first. The last digit in use is set for all that does not fit.
-        buffer: ``(2 TILE,)`` two rows to overwrite.
-    """
-
+    #: ``(K d BOX,)`` where the robots are within a block, see :func:`~d4orm_env.engine.simd.enclose`, widened so that
+    #: what is within the margin of each other touches
     boxes: FloatArray
-    num_robots: Ints
-    robots: Ints
+    num_robots: Ints  #: ``(K,)`` how many robots before it each may touch,
+    robots: Ints  #: ``(K, K)`` and which
+    #: ``(DIGITS, K, BLOCK)`` how many robots and bodies are near at a step of the block: a bit for every sample of each
+    #: binary digit, the lowest first. The last digit in use is set for all that does not fit.
     near: NDArray[np.uint64]
-    buffer: FloatArray
+    buffer: FloatArray  #: ``(2 TILE,)`` two rows to overwrite
 
 
 class Bodies(NamedTuple):
-    """Bodies that move among the robots.
+    """Bodies that move among the robots."""
 
-    Attributes:
-        positions: ``(H, O, d)`` after every step.
-        radius: ``(O,)``.
-        boxes: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the
-            margin.
-        footprints: Theirs, or ``None`` where all bodies and robots are discs.
-        headings: ``(H, F)`` of their bodies and trailers, or ``(H, 0)`` where all are discs.
-    """
-
-    positions: FloatArray
-    radius: FloatArray
+    positions: FloatArray  #: ``(H, O, d)`` after every step
+    radius: FloatArray  #: ``(O,)``
+    #: ``(B, O, d, 2)`` ends of the boxes round them in each of the blocks of a horizon, widened by half of the margin
     boxes: FloatArray
-    footprints: FootprintArrays | None
-    headings: FloatArray
+    footprints: FootprintArrays | None  #: Theirs, or ``None`` where all bodies and robots are discs
+    headings: FloatArray  #: ``(H, F)`` of their bodies and trailers, or ``(H, 0)`` where all are discs
 
 
 def make_scratch(num_robots: int, dimension: int) -> Scratch:
@@ -97,7 +83,7 @@ def make_scratch(num_robots: int, dimension: int) -> Scratch:
 
 @inlined
 def position_of(k: Whole, step: int, dimension: int) -> Whole:
-    """Return where the rows of robot ``k``'s positions after a step of the block begin: a row an axis."""
+    """First element of robot ``k``'s positions after a step of the block, which have a row per axis."""
     return (k * BLOCK + step) * dimension * TILE
 
 
@@ -107,22 +93,22 @@ POSES = BLOCK * POSE * TILE
 
 @inlined
 def pose_of(step: int) -> Whole:
-    """Return where the rows of a body's pose after a step of the block begin, among its :data:`POSES`."""
+    """First element of a body's pose after a step of the block, among its :data:`POSES`."""
     return step * POSE * TILE
 
 
 @inlined
 def box_of(thing: Whole, dimension: int) -> Whole:
-    """Return where the rows of a thing's boxes begin."""
+    """First element of the boxes of a robot or body."""
     return thing * dimension * BOX
 
 
 @inlined
-def enclose(k: int, radius_sum: np.float32, dimension: int, positions: FloatArray, boxes: FloatArray) -> None:
-    """Make the boxes of robot ``k`` in this block, for its radius and half of the margin as reach."""
+def enclose(k: int, half_width: np.float32, dimension: int, positions: FloatArray, boxes: FloatArray) -> None:
+    """Make the boxes round robot ``k`` in this block, wider to every side by its radius and half of the margin."""
     for axis in range(dimension):
         first, begin = position_of(k, 0, dimension) + axis * TILE, box_of(k, dimension) + axis * BOX
-        simd.enclose(positions, first, dimension * TILE, WIDER * radius_sum, boxes, begin)
+        simd.enclose(positions, first, dimension * TILE, WIDER * half_width, boxes, begin)
 
 
 @inlined
@@ -142,11 +128,11 @@ def _samples_overlap(a: Whole, b: Whole, dimension: int, boxes: FloatArray) -> n
 
 
 @inlined
-def _near_pair(radius_sum: np.float32, a: Whole, b: Whole, dimension: int, positions: FloatArray) -> np.uint64:
-    """Return where two centres are within reach, of the first ``CHUNK`` samples in the rows from ``a`` and ``b`` on."""
+def _near_pair(safety_distance: np.float32, a: Whole, b: Whole, dimension: int, positions: FloatArray) -> np.uint64:
+    """The samples, of the first ``CHUNK`` in the rows from ``a`` and ``b`` on, in which two centres are too near."""
     if dimension == 2:
-        return chunk_within_2(positions, a, b, radius_sum * radius_sum)
-    return chunk_within_3(positions, a, b, radius_sum * radius_sum)
+        return chunk_within_2(positions, a, b, safety_distance * safety_distance)
+    return chunk_within_3(positions, a, b, safety_distance * safety_distance)
 
 
 @inlined
@@ -193,14 +179,14 @@ def _mark_listed(arrays: ProblemArrays, digits: int, positions: FloatArray, pose
     for k in range(radius.shape[0]):
         for i in range(s.num_robots[k]):
             other = np.int64(np.uint32(s.robots[k, i]))
-            radius_sum = radius[k] + radius[other] + margin
+            safety_distance = radius[k] + radius[other] + margin
             samples = _samples_overlap(k, other, dimension, s.boxes)
             for chunk in range(0, TILE, CHUNK):
                 if (samples >> np.uint64(chunk)) & _CHUNK_BITS == NOWHERE:
                     continue
                 for step in range(BLOCK):
                     a, b = position_of(k, step, dimension) + chunk, position_of(other, step, dimension) + chunk
-                    touch = _near_pair(radius_sum, a, b, dimension, positions)
+                    touch = _near_pair(safety_distance, a, b, dimension, positions)
                     f, begin = arrays.footprints, pose_of(step) + chunk
                     touch = _undecided(f, digits, s.near[0, k, step] & s.near[0, other, step], chunk, touch)
                     touch = refine_chunk(
@@ -223,11 +209,12 @@ def _mark_bodies(
     for k in range(radius.shape[0]):
         for body in range(num_bodies):
             if _meets(k, before + body, dimension, s.boxes, limits):
-                radius_sum = radius[k] + bodies.radius[body] + margin
+                safety_distance = radius[k] + bodies.radius[body] + margin
                 for step in range(count):
                     begin = position_of(k, step, dimension)
                     rows = positions[begin : position_of(k, step + 1, dimension)]
-                    touch = near_round(radius_sum, bodies.positions[first + step, body], dimension, rows, s.buffer)
+                    centre = bodies.positions[first + step, body]
+                    touch = near_round(safety_distance, centre, dimension, rows, s.buffer)
                     f, begin = arrays.footprints, pose_of(step)
                     touch = _refine_body(
                         f, bodies.footprints, arrays, bodies, body, first + step, k, touch, rows, poses, begin, s
@@ -240,7 +227,7 @@ def _refine_body(
     f: FootprintArrays | None, others: Any, arrays: ProblemArrays, bodies: Bodies, body: int, t: int,
     k: int, near: np.uint64, rows: FloatArray, poses: FloatArray, begin: Whole, s: Scratch,
 ) -> np.uint64:  # fmt: skip
-    """Return where, of the samples ``near``, robot ``k`` is within the margin of a body at time ``t``."""
+    """The samples, of those ``near``, in which robot ``k`` is within the margin of a body at time ``t``."""
     if f is None:
         return near
     sure, dimension = near, arrays.goal.shape[1]
@@ -272,7 +259,7 @@ def mark_robots(
         digits: Binary digits to count in.
         first: Time of the block's first step.
         count: Steps in the block; of later ones the flags mean nothing.
-        positions: Rows of places, see :func:`position_of`.
+        positions: Rows of positions, see :func:`position_of`.
         poses: Rows of poses, see :func:`pose_of`; of size zero where all bodies are discs.
         s: Scratch with the boxes of the robots in this block.
     """
@@ -291,12 +278,10 @@ def near_static(arrays: ProblemArrays, k: int, bounds: FloatArray, boxes: FloatA
     """
     dimension, limits, touch = arrays.goal.shape[1], bounds.reshape(-1), False
     if arrays.grid.clearance.shape[0] > 0:
-        # The boxes are wider than the places by the radius and half of the margin.
-        radius_sum, half = (
-            arrays.radius[k] + arrays.margin,
-            WIDER * (arrays.radius[k] + np.float32(0.5) * arrays.margin),
-        )
-        touch = may_touch(arrays.grid, radius_sum, half, boxes, box_of(k, dimension) + 2 * TILE, BOX, buffer)
+        # The boxes are wider than the positions by the radius and half of the margin.
+        safety_distance = arrays.radius[k] + arrays.margin
+        half_width = WIDER * (arrays.radius[k] + np.float32(0.5) * arrays.margin)
+        touch = may_touch(arrays.grid, safety_distance, half_width, boxes, box_of(k, dimension) + 2 * TILE, BOX, buffer)
     for bound in range(bounds.shape[0]):
         touch |= _meets(k, bound, dimension, boxes, limits)
     return touch

@@ -83,12 +83,12 @@ def runner(name: str) -> Callable[..., None]:
         for i in range(offset.shape[0]):
             u = controls[i * CONTROL_ROWS * TILE : (i + 1) * CONTROL_ROWS * TILE]
             for s in range(TILE):
-                standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
-                x = move(standing, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, h)
+                at_rest = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
+                x = move(at_rest, read_x(w, STATE * TILE, s), read_u(u, 0, s), limits, h)
                 write_x(moved, 0, s, x)
             for s in range(TILE):
-                standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
-                x, gap2, arrived = dock(standing, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
+                at_rest = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
+                x, gap2, arrived = dock(at_rest, read_x(moved, 0, s), read_u(u, 0, s), limits, goal, docking)
                 write_x(w, STATE * TILE, s, x)
                 w[ARRIVED * TILE + s] = ONE if arrived else ZERO
                 w[TOTAL * TILE + s] += transition.step_reward(np.sqrt(gap2), inverse, (ZERO, ZERO, ZERO), ZERO, ONE)
@@ -100,7 +100,7 @@ def runner(name: str) -> Callable[..., None]:
 
 
 @inlined
-def add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: FloatArray) -> None:
+def add_rest_rewards(goal: FloatArray, inverse: np.float32, count: np.float32, w: FloatArray) -> None:
     """Add the reward, violations aside, of ``count`` steps in which the robot does not move."""
     for s in range(TILE):
         gap2 = ZERO
@@ -111,7 +111,7 @@ def add_standing(goal: FloatArray, inverse: np.float32, count: np.float32, w: Fl
 
 
 @inlined
-def all_docked(w: FloatArray) -> bool:
+def all_arrived(w: FloatArray) -> bool:
     if w[ARRIVED * TILE] == ZERO:
         return False
     total = ZERO
@@ -134,7 +134,7 @@ def begin_tile(arrays: ProblemArrays, arrived: BoolArray, w: FloatArray) -> None
 def stay(
     dimension: int, f: FootprintArrays | None, k: int, w: FloatArray, positions: FloatArray, poses: FloatArray
 ) -> None:
-    """Fill the places and the poses of every step of a block with where the robot is."""
+    """Fill the positions and the poses of every step of a block with the present ones."""
     for step in range(BLOCK):
         _copy(w[: dimension * TILE], positions[step * dimension * TILE : (step + 1) * dimension * TILE])
     if f is not None:

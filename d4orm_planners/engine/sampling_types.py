@@ -1,4 +1,4 @@
-"""Sampling engines by name: what a denoising run is asked for, and what it answers."""
+"""Sampling engines by name, their requests and their answers."""
 
 from __future__ import annotations
 
@@ -25,18 +25,12 @@ else:
 
 
 class MovingObstacles(NamedTuple):
-    """Bodies that move along known paths, such as the robots outside a group that is replanned.
+    """Bodies that move along known paths, such as the robots outside a group that is replanned."""
 
-    Attributes:
-        positions: ``(H, O, d)`` where each body is after every step [m].
-        radius: ``(O,)`` [m]; outer radii of bodies that are no discs.
-        footprints: Theirs; ``None`` where all are discs.
-        headings: ``(H, F)`` what turns them and their trailers [rad], or ``None`` where all are discs.
-    """
-
-    positions: FloatArray
-    radius: FloatArray
-    footprints: FootprintArrays | None = None
+    positions: FloatArray  #: ``(H, O, d)`` where each body is after every step [m]
+    radius: FloatArray  #: ``(O,)`` [m]; outer radii of bodies that are no discs
+    footprints: FootprintArrays | None = None  #: Theirs; ``None`` where all are discs
+    #: ``(H, F)`` what turns them and their trailers [rad], or ``None`` where all are discs
     headings: FloatArray | None = None
 
 
@@ -80,7 +74,7 @@ class SamplingTask:
 
     @property
     def penalties(self) -> FloatArray:
-        """``(K,)`` what a violation costs each robot per step."""
+        """``(K,)`` cost of a violation to each robot per step."""
         penalties = np.asarray(self.penalty, np.float64) * self.problem.collision_penalty
         return np.full(self.problem.num_robots, penalties, np.float32)
 
@@ -101,7 +95,7 @@ class SamplingTask:
 
 
 Rule: TypeAlias = Callable[..., Any]
-"""It returns what the array library makes of its arrays."""
+"""It returns arrays of the library of its arguments."""
 
 
 class SamplingRules(NamedTuple):

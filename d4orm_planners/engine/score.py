@@ -45,8 +45,8 @@ from d4orm_planners.engine.sample_rollout import (
     CONTROL_ROWS,
     STRIDE,
     TOTAL,
-    add_standing,
-    all_docked,
+    add_rest_rewards,
+    all_arrived,
     begin_tile,
     runner,
     stay,
@@ -56,49 +56,28 @@ HALF = np.float32(0.5)
 
 
 class Workspace(NamedTuple):
-    """Per-thread workspace to score tiles of ``K`` robots over ``H`` steps.
+    """Per-thread workspace to score tiles of ``K`` robots over ``H`` steps."""
 
-    Attributes:
-        w: ``(K STRIDE,)`` the robots.
-        positions: Their places in a block, see :func:`~d4orm_planners.engine.proximity.position_of`.
-        draws: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block.
-        controls: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block.
-        moved: ``(ARRIVED TILE,)`` one robot's states, moved and not docked yet.
-        keys: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each.
-        standing: ``(K,)`` whether a robot has docked in all samples.
-        scratch: Scratch of :mod:`~d4orm_planners.engine.proximity`.
-        poses: ``(F POSES,)`` poses of the ``F`` bodies in a block, or of size zero where all are discs.
-    """
-
-    w: FloatArray
-    positions: FloatArray
-    draws: FloatArray
-    controls: FloatArray
-    moved: FloatArray
-    keys: NDArray[np.uint32]
-    standing: BoolArray
-    scratch: Scratch
-    poses: FloatArray
+    w: FloatArray  #: ``(K STRIDE,)`` the robots
+    positions: FloatArray  #: Their positions in a block, see :func:`~d4orm_planners.engine.proximity.position_of`
+    draws: FloatArray  #: ``(BLOCK 4 DRAWS,)`` one robot's noise in a block
+    controls: FloatArray  #: ``(BLOCK CONTROL_ROWS TILE,)`` one robot's controls in a block
+    moved: FloatArray  #: ``(ARRIVED TILE,)`` one robot's states, moved, before arrivals
+    keys: NDArray[np.uint32]  #: ``(2, K H P)`` keys of the noise streams, ``P`` pairs of components each
+    at_rest: BoolArray  #: ``(K,)`` whether a robot has arrived in all samples
+    scratch: Scratch  #: Scratch of :mod:`~d4orm_planners.engine.proximity`
+    poses: FloatArray  #: ``(F POSES,)`` poses of the ``F`` bodies in a block, or of size zero where all are discs
 
 
 class Scoring(NamedTuple):
-    """Rules by which samples are scored, in all steps of a run.
+    """Rules by which samples are scored, in all steps of a run."""
 
-    Attributes:
-        arrived: ``(K,)`` bool, docked from the beginning.
-        collisions: Whether robots count when near each other or near a moving body.
-        bodies: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`.
-        bounds: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`.
-        penalties: ``(K,)`` what a violation costs per step.
-        per_pair: Whether it costs so much for every robot and body that is near.
-    """
-
-    arrived: BoolArray
-    collisions: bool
-    bodies: Bodies
-    bounds: FloatArray
-    penalties: FloatArray
-    per_pair: bool
+    arrived: BoolArray  #: ``(K,)`` bool, arrived from the beginning
+    collisions: bool  #: Whether robots count when near each other or near a moving body
+    bodies: Bodies  #: Dynamic obstacles, :class:`~d4orm_planners.engine.proximity.Bodies`
+    bounds: FloatArray  #: ``(S, d, 2)`` boxes beyond them, see :func:`~d4orm_planners.engine.proximity.bound_boxes`
+    penalties: FloatArray  #: ``(K,)`` what a violation costs per step
+    per_pair: bool  #: Whether it costs so much for every robot and body that is near
 
 
 Score: TypeAlias = Kernel[[ProblemArrays, Scoring, Drawing, IntArray, Workspace, FloatArray, FloatArray], None]
@@ -153,18 +132,15 @@ def _advance_robot(
 ) -> None:  # fmt: skip
     """Move robot ``k`` for ``count`` steps of a block from ``first`` on, and reward it, but for what moves as well."""
     num_steps, _, num_controls = drawing.offset.shape
-    num_pairs, dimension, safety_distance = (
-        (num_controls + 1) // 2,
-        arrays.goal.shape[1],
-        arrays.radius[k] + HALF * arrays.margin,
-    )
-    # The noise of a robot that stands counts in the mean all the same.
+    num_pairs, dimension = (num_controls + 1) // 2, arrays.goal.shape[1]
+    half_width = arrays.radius[k] + HALF * arrays.margin
+    # The noise of a robot at rest counts in the mean all the same.
     draw_block(space.keys, counter, (k * num_steps + first) * num_pairs, count, num_pairs, kept, space.draws)
     robot, footprints = space.w[k * STRIDE : (k + 1) * STRIDE], arrays.footprints
     positions = space.positions[position_of(k, 0, dimension) : position_of(k + 1, 0, dimension)]
-    if space.standing[k]:
+    if space.at_rest[k]:
         stay(dimension, footprints, k, robot, positions, space.poses)
-        enclose(k, safety_distance, dimension, space.positions, space.scratch.boxes)
+        enclose(k, half_width, dimension, space.positions, space.scratch.boxes)
         return
     goals, last = arrays.goal, first + count
     goal = (goals[k, 0], goals[k, 1], goals[k, dimension - 1])
@@ -173,14 +149,13 @@ def _advance_robot(
         drawing.offset[first:last, k], drawing.scale[first:last, k], space.draws, space.controls, space.moved,
         positions, footprints, k, space.poses, robot,
     )  # fmt: skip
-    # Once a robot stands in every sample nothing about it changes any more: neither its place nor its flags towards
-    # static obstacles.
+    # Once a robot has arrived in every sample, neither its position nor its contacts with obstacles change any more.
     rest = 0
-    if arrays.docks and all_docked(robot):
-        space.standing[k] = True
+    if arrays.docks and all_arrived(robot):
+        space.at_rest[k] = True
         rest = num_steps - last
-        add_standing(goals[k], arrays.inverse_initial_distance[k], np.float32(rest), robot)
-    enclose(k, safety_distance, dimension, space.positions, space.scratch.boxes)
+        add_rest_rewards(goals[k], arrays.inverse_initial_distance[k], np.float32(rest), robot)
+    enclose(k, half_width, dimension, space.positions, space.scratch.boxes)
     _punish_static(arrays, scoring, k, count, rest, positions, space.poses, space.scratch, robot)
 
 
@@ -193,7 +168,7 @@ def _score_tile(
     penalties, digits = scoring.penalties, DIGITS if scoring.per_pair else 1
     h = TimeStep(arrays.time_step[0], arrays.time_step[1], arrays.time_step[2], arrays.time_step[3])
     num_steps, num_robots, _ = drawing.offset.shape
-    space.standing[:] = False
+    space.at_rest[:] = False
     begin_tile(arrays, scoring.arrived, space.w)
     for first in range(0, num_steps, BLOCK):
         count = min(BLOCK, num_steps - first)
@@ -211,10 +186,10 @@ def score_kernel(models: tuple[str, ...]) -> Score:
     arguments:
 
     - ``arrays``: The problem.
-    - ``scoring``: What samples are scored by, a :class:`Scoring`.
-    - ``drawing``: What they are drawn from, a :class:`Drawing`.
+    - ``scoring``: The rules of the scores.
+    - ``drawing``: The distribution of the samples.
     - ``tile_range``: First tile and the one after the last.
-    - ``space``: This thread's.
+    - ``space``: This thread's workspace.
     - ``kept``: ``(T, K, H, P, 2, DRAWS)`` the noise of ``T`` tiles, in ``P`` pairs of components, output.
     - ``rewards``: Output.
     """

@@ -26,7 +26,7 @@ from d4orm_planners.engine.path_index import PathIndex, check_alone
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.sampling.weights import SoftmaxWeights
-from d4orm_planners.tracking.steering import prepare_drives, standing
+from d4orm_planners.tracking.steering import at_rest, prepare_drives
 
 _RULES = SamplingRules(weights=SoftmaxWeights(1.0))
 
@@ -76,7 +76,7 @@ def average_once(models: tuple[str, ...]) -> None:
     """Weigh and average samples, which a process that scores them needs last."""
     problem = smallest_problem(models)
     rewards = np.zeros((1, 2), np.float32)
-    run = Sampling(SamplingTask(problem, no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
+    run = Sampling(SamplingTask(problem, no_controls(problem)), rewards.size, 0, Threads(1))
     run.moments(_RULES.weights(rewards, np), with_second=False)
 
 
@@ -91,7 +91,7 @@ def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
 
 def _index_paths(problem: Problem) -> None:
     """Look for meetings and faults of robots that stay where they are."""
-    states, robots = standing(problem)[0], np.arange(problem.num_robots)
+    states, robots = at_rest(problem)[0], np.arange(problem.num_robots)
     index = PathIndex(states[..., : problem.dimension], problem.team.radius, problem.margin)
     index.pairs()
     index.move(robots, index.positions)

@@ -13,7 +13,7 @@ from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.settings import Positive, one_of
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.d4orm_d.planner import D4ormD, straight_start
+from d4orm_planners.d4orm_d.planner import D4ormD, straight_if_sparse
 from d4orm_planners.d4orm_d.planner import State as DecouplingState
 from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
@@ -90,7 +90,7 @@ class Hybrid(Planner):
 
     @property
     def improves_by_lns(self) -> bool:
-        """Return whether solutions become better by large-neighbourhood search."""
+        """True if solutions are improved by large-neighbourhood search."""
         return self.config.improver == "lns"
 
     def iterate(self, search: SolveRun, state: State) -> tuple[State, Iteration]:
@@ -127,7 +127,7 @@ class Hybrid(Planner):
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""
-        return straight_start(problem) if self.config.start == "auto" else self.denoiser.straight_start(problem)
+        return straight_if_sparse(problem) if self.config.start == "auto" else self.denoiser.straight_start(problem)
 
     def repair(self, team: DeformedPlan, state: Repairs) -> Repairs:
         """Search for paths around others for robots that fail, and deform those that fail nevertheless."""
@@ -147,7 +147,7 @@ class Hybrid(Planner):
         return state, replace(iteration, controls=team.controls)
 
     def follow(self, search: SolveRun, solution: RoadmapSolution) -> Iteration:
-        """Return the team's controls on a roadmap solution, a little improved if that is all that is left to do."""
+        """The team's controls on a roadmap solution, improved a little if it is a solution of the problem."""
         iteration = roadmap_iteration(search, solution)
         if not self.improves_by_lns:
             return iteration
@@ -170,12 +170,12 @@ class Hybrid(Planner):
         return solution, roadmap_iteration(search, solution)
 
     def finds_manoeuvres(self, search: SolveRun) -> bool:
-        """Return whether this iteration is to find manoeuvres: the first, if they are what the team needs."""
+        """Check whether this iteration is to find manoeuvres: the first one, for a team that needs them."""
         from_nothing = search.iteration == 0 and not search.current.controls.any()
         return from_nothing and self.config.start == "auto" and can_plan(search.problem)
 
     def finds_paths(self, search: SolveRun) -> bool:
-        """Return whether this iteration is to find paths: the first, or one after some without a solution."""
+        """Check whether this iteration is to find paths: the first, or one after some without a solution."""
         start = self.config.start
         if search.iteration == 0:
             if search.current.controls.any() or start not in ("auto", "mapf"):

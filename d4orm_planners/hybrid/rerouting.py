@@ -13,42 +13,40 @@ from d4orm_planners.engine.path_table import BLOCK
 from d4orm_planners.mapf.beam import BeamRules, OtherAgents
 from d4orm_planners.mapf.beams import find_paths
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives
-from d4orm_planners.tracking.steering import drives, standing
+from d4orm_planners.tracking.steering import at_rest, drives
 
 SWEEPS, BATCH = 6, 16
-"""Times in turn that robots which fail look for a path in an iteration, and robots that do so at the same time, not
-minding each other's paths: so that all cores have work."""
+"""Sweeps over the robots that fail in an iteration, and robots that search at the same time without regard to each
+other, so that all cores have work."""
 WIDTH = 32
 """Paths that a search keeps after each block of steps."""
 CONTACT, CONTACT_GROWTH = 1.25, 2.0
-"""Cost of being near another robot for a block of steps in the first sweep [s]: waiting that long is cheaper; and times
-as much that it costs in the next: what cannot be had for little may be had for more."""
+"""Cost of being near another robot for a block of steps in the first sweep [s], and its growth from sweep to sweep."""
 DEDUP_DISTANCE = 1.0
-"""Least distance between paths that are kept, in radii of the largest robot, or else twice as much in speed [1/s]."""
+"""Least distance between paths that are kept, in radii of the largest robot; or in speed, twice as much [1/s]."""
 EARLIER = (2, 5)
-"""Blocks before a robot's first fault at which its new path begins: from one number to the other, which doubles with
-each sweep."""
+"""Least and largest number of blocks before a robot's first fault at which its new path begins; the largest doubles
+with each sweep."""
 ANGLES, SWING = np.array([30.0, 60.0, 90.0, 135.0, 180.0]), 14.0
-"""By which a robot turns off from the path to its goal, in space up and down as well, and by how much all of them
-change at most from one sweep to the next [degrees]."""
+"""Angles between a robot's heading and the direction of its goal, in space up and down as well, and their largest
+common change from sweep to sweep [degrees]."""
 PACES = (1.0, 0.5, 0.0)
-"""Shares of its speed with which a robot heads for its goal: waiting has no direction."""
-STANDING = 4
-"""Blocks for which, of two robots that meet only each other, the second is taken to stay where it starts while the
-first looks for a path."""
+"""Speeds with which a robot heads for its goal, as shares of its limit."""
+STARTING = 4
+"""Blocks for which the second of two robots that meet only each other stays at its start while the first searches."""
 DETOURS = 32
 """Random points by which a robot tries to drive if it has found no path."""
 AWAY = np.float32(1e6)
-"""Position of a robot that is in nobody's way [m]."""
+"""Coordinate of a robot that is out of the way of all others [m]."""
 SPREAD = 20 / 3
 """Deviation of detours' points from straight paths, beyond half of their lengths, in radii of the largest robot."""
 
 
 def reroute(team: WorkingPlan) -> None:
-    """Let the robots that fail look for other paths, some times in turn, those that meet most others first.
+    """Replan the paths of robots that fail, in several sweeps, those that meet most others first.
 
-    As prioritised planning does, but robots that have no path yet are in the way of others all the same, at a cost: one
-    that cannot get past all of them gets past most (MAPF-LNS2, Li et al., AAAI 2022).
+    This is prioritised planning in which contact has a cost: a robot that cannot get past all others gets past most
+    (MAPF-LNS2, Li et al., AAAI 2022).
     """
     everybody = np.arange(team.problem.num_robots)
     for sweep in range(SWEEPS):
@@ -63,7 +61,7 @@ def reroute(team: WorkingPlan) -> None:
             if team.search.should_stop():
                 return
             robots = failed[first : first + BATCH]
-            # Some may have been helped by others before them.
+            # Others' new paths may have helped some of them.
             faults, begin = team.faults(robots)
             least, most = EARLIER
             earlier = random.integers(least, most << sweep, len(robots), endpoint=True)
@@ -83,17 +81,17 @@ def reroute(team: WorkingPlan) -> None:
 
 
 def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitives, rules: BeamRules) -> None:
-    """Let two that meet only each other look for paths from the start, one after the other, if that is better.
+    """Replan two robots that meet only each other from the start, one after the other, if that is better.
 
-    Where they face each other at once, nothing that one of them does helps while the other comes on.
+    Where they face each other at the start, replanning one of them does not help while the other comes on.
     """
     problem = team.problem
     faults, radius = team.faults(pair)[0].sum(), np.asarray(problem.team.radius, np.float64)
     present = team.controls[:, pair], team.states[:, pair], team.arrived[pair]
     for first, second in (pair, pair[::-1]):
-        # Who goes second stays where it is as long as the first may need to get away.
+        # The second one stays where it is as long as the first may need to get away.
         extra = np.full((1, 1, problem.horizon + 1, problem.dimension), AWAY, np.float32)
-        extra[:, :, : STANDING * BLOCK + 1] = problem.start[second, : problem.dimension]
+        extra[:, :, : STARTING * BLOCK + 1] = problem.start[second, : problem.dimension]
         paths = []
         for robot, other in ((first, second), (second, first)):
             others = OtherAgents(pair[None], extra, radius[[[other]]])
@@ -115,4 +113,4 @@ def _try_detours(team: WorkingPlan, robots: IntArray, random: np.random.Generato
     spread = 0.5 * np.linalg.norm(goal - start, axis=2, keepdims=True) + SPREAD * part.team.largest_radius
     vias = start + random.random((*size, 1)) * (goal - start)
     vias = vias + spread * portable.standard_normal(random, (*size, part.dimension))
-    team.take_best(robots, drives(part, *standing(part), np.zeros(size, int), vias[:, :, None]))
+    team.take_best(robots, drives(part, *at_rest(part), np.zeros(size, int), vias[:, :, None]))

@@ -16,8 +16,8 @@ from d4orm_planners.sampling.loop import DenoisingPlanner, standard_normal
 from d4orm_planners.sampling.settings import PAPER, TUNED, ContinuationSettings, Credit, DenoisingConfig
 
 FALLBACK_PERIOD, FALLBACK_SAMPLE_FACTOR = 8, 4
-"""Iterations without a solution after which ``"alternate"`` weights by the team's reward for as many, in turn; and how
-many times as many samples it draws meanwhile."""
+"""Iterations without a solution after which ``"alternate"`` weights by the team's reward for as many, in turn, and the
+factor of its number of samples meanwhile."""
 
 PAPER_DEFORMATION = {**PAPER, "credit": "team", "penalty": 1.0, "late_samples": 1.0, "random_start": False}
 
@@ -112,6 +112,6 @@ class D4orm(DeformingPlanner):
         return super().stages(search)
 
     def in_fallback(self, search: SolveRun) -> bool:
-        """Return whether ``"alternate"`` has stagnated, and draws more samples for the team's reward."""
+        """True if ``"alternate"`` has stagnated, and draws more samples for the team's reward."""
         alternating = self.config.credit == "alternate"
         return alternating and search.iteration // FALLBACK_PERIOD % 2 == 1 and not search.best.solved

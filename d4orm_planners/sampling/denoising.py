@@ -1,4 +1,4 @@
-"""Watching a plan come about: where the candidates of the denoising steps lead, and some of the samples behind them."""
+"""A film of a solve: the paths of the candidates of its denoising steps, and of some samples."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class DenoisingFilm:
         denoising = film.developed()
 
     Steps of parts of the team, such as D4orm-D's repairs, are left out. It keeps controls only, some 100 kB a step for
-    16 robots; where they lead is found out when it is developed.
+    16 robots, and rolls them out when it is developed.
 
     Args:
         problem: The problem that is solved.

@@ -29,20 +29,20 @@ from d4orm_planners.sampling.settings import DenoisingConfig, SamplingConfig, al
 from d4orm_planners.sampling.weights import GroupWeights
 
 SHORT = 5.0
-"""Times the distance that two robots keep between their centres: paths of less are short."""
+"""Length below which paths are short, in distances that two robots keep between their centres."""
 SLACK, SLACK_GROWTH = 2.0, 0.2
-"""Times the drive that samples look ahead at first, and how much more with every iteration: it may take longer."""
+"""Horizon of the samples at first, in times of the drive, and its growth with every iteration."""
 
 
 def on_short_paths(task: SamplingTask, search: SolveRun) -> SamplingTask:
     """The task itself, unless all robots' paths are short: then one of fewer steps, with rewards for such paths.
 
-    A robot that evades another makes a detour. On a path that is long next to the robots it costs next to nothing; on a
-    short one nearly as much as driving through the other, by a reward that counts distances relative to the path and
-    most of whose steps come after the arrival. There samples look no farther ahead than driving and evading take, and
-    distances count relative to a path on which evading is cheap.
+    A detour round another robot costs little on a long path. On a short one it costs nearly as much as driving through
+    the other, as the reward counts distances relative to the path, and most steps come after the arrival. Samples of
+    short paths therefore look no farther ahead than driving and evading take, and distances count relative to a path on
+    which evading is cheap.
 
-    Where robots do not stay at their goals by themselves all steps count, and it is the task itself too.
+    Where goals are not absorbing all steps count, and it is the task itself too.
     """
     problem = task.problem
     reference = SHORT * (2 * float(np.max(problem.team.radius)) + problem.margin)
@@ -75,15 +75,10 @@ def drive_times(problem: Problem, lengths: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class NextStep:
-    """State from which a run of the sampling loop would go on.
+    """State from which a run of the sampling loop would go on."""
 
-    Attributes:
-        mean: ``(H, K, m)`` mean of the samples.
-        noise_factor: ``(H, K, m)`` factors on their standard deviation.
-    """
-
-    mean: FloatArray
-    noise_factor: FloatArray
+    mean: FloatArray  #: ``(H, K, m)`` mean of the samples
+    noise_factor: FloatArray  #: ``(H, K, m)`` factors on their standard deviation
 
 
 class SamplingPlanner(Planner):
@@ -169,19 +164,14 @@ class SamplingPlanner(Planner):
         """``(H, K, m)`` the controls, with final approaches where robots must slow down for their goals."""
         if not self.config.final_approach or np.isinf(search.problem.goal_speed).all():
             return controls
-        return with_final_approaches(search, controls)
-
-
-def with_final_approaches(search: SolveRun, controls: FloatArray) -> FloatArray:
-    """``(H, K, m)`` controls with which robots turn straight to their goals, where that is no worse."""
-    trajectory = search.engine.rollout(search.problem, controls)
-    team = WorkingPlan(search, trajectory)
-    approach_goals(team, np.arange(search.problem.num_robots), search.problem, trajectory)
-    return team.controls
+        trajectory = search.engine.rollout(search.problem, controls)
+        team = WorkingPlan(search, trajectory)
+        approach_goals(team, np.arange(search.problem.num_robots), search.problem, trajectory)
+        return team.controls
 
 
 def conflict_groups(search: SolveRun) -> Groups:
-    """The robots that are in conflict with each other in the present candidate, directly or by others."""
+    """Groups of robots that conflict with each other in the present candidate, directly or through others."""
     problem = search.problem
     positions = search.current.trajectory.positions
     return components(conflicts(positions, problem.team.radius, problem.margin))

@@ -41,15 +41,10 @@ class MBDConfig(DenoisingConfig):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A run that is under way.
+    """A run that is under way."""
 
-    Attributes:
-        mean: ``(H, K, m)`` mean of the next step's samples.
-        done: Steps done.
-    """
-
-    mean: FloatArray
-    done: int
+    mean: FloatArray  #: ``(H, K, m)`` mean of the next step's samples
+    done: int  #: Steps done
 
 
 class MBD(ControlDenoiser):

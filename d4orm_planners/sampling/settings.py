@@ -90,8 +90,8 @@ class SamplingConfig(PlannerConfig):
             part of a sample by the robot's own reward, which keeps the signal from diluting with the number of robots;
             ``"alternate"`` does the second in the first iteration, the first in the next, and so on; ``"group"``
             weights by the reward of those that a robot was in conflict with, directly or by others, in the last plan.
-        penalty: Factor of the problem's collision penalty, 1 in the paper. A robot's own reward does not tell what
-            touching it costs the other, so that going through can be cheaper than making way; 2 makes up for that.
+        penalty: Factor of the problem's collision penalty, 1 in the paper. A robot's own reward leaves out what contact
+            costs the other, so that driving through can be cheaper than yielding; 2 makes up for that.
         penalty_per_pair: Whether it is taken for every robot that a robot is too close to, as in the authors' published
             code, rather than once, as in the paper. All obstacles together count once.
         short_paths: Whether robots whose paths are all short next to their size are sampled over the steps that evading
@@ -160,7 +160,7 @@ class ContinuationSettings(CheckedSettings):
 
     Attributes:
         clip_between_iterations: Start the next iteration from the controls as executed, inside the limits, rather than
-            as the last one left them. Either way they are zero once docked.
+            as the last one left them. Either way they are zero after arrival.
     """
 
     clip_between_iterations: bool = False

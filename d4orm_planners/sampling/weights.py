@@ -20,14 +20,10 @@ class SoftmaxWeights:
     """``exp(normalised reward / temperature)``, normalised to sum to one (paper, Eq. for the Monte Carlo estimate).
 
     Rewards are normalised to mean zero and standard deviation one over the samples (paper, section III-C).
-
-    Attributes:
-        temperature: ``lambda``; smaller values follow the best samples more closely.
-        cutoff: Weights below this share of the largest are dropped. What they would add is less than the sampling
-            error.
     """
 
-    temperature: float
+    temperature: float  #: ``lambda``; smaller values follow the best samples more closely
+    #: Weights below this share of the largest are dropped. What they would add is less than the sampling error.
     cutoff: float = 0.0
 
     def __call__(self, rewards: Array, xp: ModuleType, log_ratio: Array | None = None) -> Array:
@@ -56,15 +52,10 @@ class SoftmaxWeights:
 
 @dataclass(frozen=True)
 class GroupWeights:
-    """Weights of each robot's part of a sample by what the robot's group gained by it.
+    """Weights of each robot's part of a sample by what the robot's group gained by it."""
 
-    Attributes:
-        rule: Function that makes weights of rewards.
-        groups: Disjoint groups of robots, all robots together.
-    """
-
-    rule: Callable[..., Array]
-    groups: tuple[tuple[int, ...], ...]
+    rule: Callable[..., Array]  #: Function that makes weights of rewards
+    groups: tuple[tuple[int, ...], ...]  #: Disjoint groups of robots, all robots together
 
     def __call__(self, rewards: Array, xp: ModuleType, log_ratio: Array | None = None) -> Array:
         """Weights ``(K, M)`` of the robots' own ``rewards`` ``(K, M)``; see :class:`SoftmaxWeights`."""
@@ -80,13 +71,9 @@ class GroupWeights:
 
 @dataclass(frozen=True)
 class EliteWeights:
-    """Equal weights for the best samples, none for the rest (the cross-entropy method).
+    """Equal weights for the best samples, none for the rest (the cross-entropy method)."""
 
-    Attributes:
-        fraction: Share of samples that are elite.
-    """
-
-    fraction: float
+    fraction: float  #: Share of samples that are elite
 
     def __call__(self, rewards: Array, xp: ModuleType) -> Array:
         """Weights of ``rewards`` ``(..., M)``; a sample at minus infinity is never elite."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -35,7 +36,7 @@ from d4orm_planners.tracking import ros_messages as ros
 
 NODE = "d4orm"
 DRIVING, BRAKING, PLANNING, WAITING, STOPPED = "driving", "braking", "planning", "waiting", "stopped"
-"""States of the server. It drives; brakes to plan again; stands and plans; stands as robots are silent; stands after an
+"""States of the server: robots drive; brake for replanning; are at rest for planning, for a silent robot, or after an
 emergency stop.
 """
 LEVELS = {DRIVING: 0, BRAKING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
@@ -48,26 +49,17 @@ TELL = 1.0
 
 @dataclass
 class FleetRobot:
-    """A robot as it was last heard.
+    """A robot as it was last heard."""
 
-    Attributes:
-        name: Name of its topics.
-        heard: When it was last heard, by this process's clock [s].
-        state: ``(n,)`` as last heard; not a number before.
-        heading: As last heard [rad].
-        stand: ``(d,)`` where it is to stand, or is on its way to that, while nobody drives [m].
-        command: ``geometry_msgs/Twist`` that it was given last.
-        velocity: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s].
-        posed: Time by the robot's clock [s] and ``(3,)`` position of the later one [m].
-    """
-
-    name: str
-    state: FloatArray
-    heard: float = -np.inf
-    heading: float = 0.0
-    stand: Floats | None = None
-    command: Any = None
+    name: str  #: Name of its topics
+    state: FloatArray  #: ``(n,)`` as last heard; not a number before
+    heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
+    heading: float = 0.0  #: As last heard [rad]
+    stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]
+    command: Any = None  #: ``geometry_msgs/Twist`` that it was given last
+    #: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s]
     velocity: Floats = field(default_factory=lambda: np.zeros(3))
+    #: Time by the robot's clock [s] and ``(3,)`` position of the later one [m]
     posed: tuple[float, Floats] | None = None
 
     def take_pose(self, stamped: Any, base: float) -> None:
@@ -88,10 +80,10 @@ class FleetServer:
     (``geometry_msgs/Twist``) and ``/NAME/setpoint`` (``trajectory_msgs/MultiDOFJointTrajectory`` of one point); and
     ``/diagnostics``.
 
-    Nobody moves before all have been heard, nor while one has been silent for longer than the deadline, nor after an
-    emergency stop (passed on as it comes) until it is taken back. When that is over the controller begins anew from
-    where robots are. So it does for a new goal, after all have braked: each goes on along its arc, slower by the same
-    share as all others, so that who would have passed whom still does, and a lost command changes little.
+    Robots move only while all were heard within the deadline, and no emergency stop is in force, which takes effect at
+    once. Afterwards the controller begins anew from where the robots are. For a new goal it does so after all have
+    braked: each goes on along its arc, slower by the same share as all others, so that the order in which they pass
+    each other stays, and a lost command changes little.
 
     Args:
         session: The network.
@@ -163,7 +155,7 @@ class FleetServer:
                 for robot in self._robots:
                     robot.stand = None
             self._drive(self._controller.step(self._states(now), now))
-            # The horizon is over, and somebody has not arrived.
+            # The horizon is over, and a robot has not arrived.
             self._replan |= self._controller.over and not self._controller.arrived.all()
         elif self.state == BRAKING:
             with self._commanding:
@@ -181,7 +173,7 @@ class FleetServer:
         if self._begun is not None and self._begun.done():
             self._begun.result()
             self._begun = None
-            # Somebody may have been pushed, and goals may have changed, while it was planned.
+            # Meanwhile a robot may have been pushed, and goals may have changed.
             return PLANNING if self._replan else DRIVING
         if self._begun is None and (self._replan or self.state != DRIVING):
             if self.state in (DRIVING, BRAKING) and self._pace > 0:
@@ -192,23 +184,26 @@ class FleetServer:
         return DRIVING if self._begun is None else PLANNING
 
     def _read(self, now: float) -> None:
-        for topic, message in self._odometry.take():
-            self._hear(topic, message.pose.pose, position_of(message.twist.twist.linear), now)
-        for topic, message in self._poses.take():
-            number = self._by_name.get(topic.partition("/")[0])
-            if number is not None and np.isfinite(position_of(message.pose.position)).all():
+        for number, message in self._taken(self._odometry):
+            self._hear(number, message.pose.pose, position_of(message.twist.twist.linear), now)
+        for number, message in self._taken(self._poses):
+            if np.isfinite(position_of(message.pose.position)).all():
                 robot = self._robots[number]
                 robot.take_pose(message, BASE * self._problem.dt)
                 own = turned(robot.velocity, -heading_of(message.pose.orientation))
-                self._hear(topic, message.pose, own, now)
-        for topic, message in self._goal.take():
-            number = self._by_name.get(topic.partition("/")[0])
-            if number is not None:
-                self._take_goal(number, message.pose.position)
+                self._hear(number, message.pose, own, now)
+        for number, message in self._taken(self._goal):
+            self._take_goal(number, message.pose.position)
         self._mind(self._e_stop)
 
+    def _taken(self, subscriber: Subscriber) -> Iterator[tuple[int, Any]]:
+        """Yield new messages about robots of the team, each with the robot's number."""
+        for topic, message in subscriber.take():
+            if (number := self._by_name.get(topic.partition("/")[0])) is not None:
+                yield number, message
+
     def _mind(self, e_stop: Subscriber) -> None:
-        """Stop everybody as soon as that is asked for, whatever the loop is at; it finds them standing then."""
+        """Stop all robots at once on an emergency stop, whatever the loop is doing."""
         with self._commanding:
             for _, message in e_stop.take():
                 self._emergency = bool(message.data)
@@ -216,10 +211,7 @@ class FleetServer:
                     self._replan, self._pace = True, 0.0
                     self._stand()
 
-    def _hear(self, topic: str, pose: Any, velocity: Floats, now: float) -> None:
-        number = self._by_name.get(topic.partition("/")[0])
-        if number is None:
-            return
+    def _hear(self, number: int, pose: Any, velocity: Floats, now: float) -> None:
         state, robot = state_from(self._problem, number, pose, velocity), self._robots[number]
         if np.isfinite(state).all():
             robot.state, robot.heading, robot.heard = state, heading_of(pose.orientation), now
@@ -257,9 +249,9 @@ class FleetServer:
                 self._setpoints[number].publish(full_state(robot.name, *point))
 
     def _brake(self) -> None:
-        """Have everybody go on as it last did, slower by the same share than a period ago."""
+        """Slow all robots down on their last arcs, by the same share."""
         last, before, dt = self._setpoint, self._pace, self._problem.dt
-        assert last is not None  # nobody brakes who has not driven
+        assert last is not None  # braking comes after driving
         self._pace = max(before - self._braking, 0.0)
         for number, robot in enumerate(self._robots):
             own, turn_rate = robot.command.linear, robot.command.angular.z
@@ -271,7 +263,7 @@ class FleetServer:
             self._commands[number].publish(ros.twist(self._pace * position_of(own), self._pace * turn_rate))
 
     def _stand(self) -> None:
-        """Have everybody stand where it was when that began."""
+        """Hold all robots where they were when they were stopped."""
         still, d = np.zeros(self._problem.dimension), self._problem.dimension
         with self._commanding:
             for robot, command, setpoint in zip(self._robots, self._commands, self._setpoints):
@@ -294,7 +286,7 @@ class FleetServer:
 
 
 def _braking(problem: Problem) -> float:
-    """The share of its largest speed that the weakest robot brakes away in a step; all, where nobody has inertia."""
+    """Share of its largest speed by which the weakest robot brakes in a step; all of it where none has inertia."""
     team, inertia = problem.team, [not model.first_order for model in problem.team.robot_models]
     shares = team.max_acceleration[inertia] / team.max_speed[inertia] * problem.dt
     return float(min(shares, default=1.0))

@@ -39,19 +39,13 @@ AXES = ("x", "y", "z", "yaw")
 
 @dataclass(frozen=True, eq=False)
 class Polynomials:
-    """Pieces of equal duration.
+    """Pieces of equal duration."""
 
-    Attributes:
-        durations: ``(P,)`` [s].
-        coefficients: ``(P, K, 4, 8)`` of x, y, z [m] and yaw [rad], from the constant up, by the time in the piece.
-        deviation: Largest distance from the motion [m].
-        report: What the verification of the polynomials found.
-    """
-
-    durations: Floats
+    durations: Floats  #: ``(P,)`` [s]
+    #: ``(P, K, 4, 8)`` of x, y, z [m] and yaw [rad], from the constant up, by the time in the piece
     coefficients: Floats
-    deviation: float
-    report: VerificationReport
+    deviation: float  #: Largest distance from the motion [m]
+    report: VerificationReport  #: What the verification of the polynomials found
 
     @property
     def num_bytes(self) -> int:
@@ -126,8 +120,8 @@ class ExportReport:
         deviation: Largest distance from the plan at its steps [m].
         min_separation: Least gap between two robots [m].
         min_clearance: Least gap to an obstacle or bound [m].
-        min_overhead: Least height of a robot above the centre of another, no farther beside it than both radii and the
-            margin [m]; infinite where none flies over another, or the team moves in the plane.
+        min_overhead: Least height of a robot above another that it flies over, within both radii and the margin in the
+            plane [m]; infinite where none does, or the team moves in the plane.
         heights: Lowest and highest z of any robot [m].
         pieces: Polynomials a robot, or ``None``.
     """
@@ -232,13 +226,13 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
 
 def _least_overhead(problem: Problem, positions: Floats) -> float:
     """See :attr:`ExportReport.min_overhead`; ``positions`` are ``(T, K, d)`` [m]."""
-    least, reach = np.inf, problem.team.radius.astype(np.float64)
+    least, radius = np.inf, problem.team.radius.astype(np.float64)
     if problem.dimension == 2:
         return least
     for robot in range(1, problem.num_robots):
-        apart = np.abs(positions[:, :robot] - positions[:, robot, None])
-        beside = np.hypot(apart[..., 0], apart[..., 1]) <= reach[:robot] + reach[robot] + problem.margin
-        least = min(least, float(apart[..., 2][beside].min(initial=np.inf)))
+        gaps = np.abs(positions[:, :robot] - positions[:, robot, None])
+        overlaps = np.hypot(gaps[..., 0], gaps[..., 1]) <= radius[:robot] + radius[robot] + problem.margin
+        least = min(least, float(gaps[..., 2][overlaps].min(initial=np.inf)))
     return least
 
 

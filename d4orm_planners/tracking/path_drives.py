@@ -26,44 +26,26 @@ from d4orm_planners.tracking.tracker import tracker
 
 
 class Route(NamedTuple):
-    """One robot's path as a row of points.
+    """One robot's path as a row of points."""
 
-    Attributes:
-        points: ``(P, 3)`` float64 [m].
-        times: ``(P,)`` float64 when each is passed, of which only the order counts.
-        bends: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero at sharp
-            corners.
-    """
-
-    points: Floats
-    times: Floats
+    points: Floats  #: ``(P, 3)`` float64 [m]
+    times: Floats  #: ``(P,)`` float64 when each is passed, of which only the order counts
+    #: ``(P,)`` float64 radius of the bend at each point [m]; infinite on straight stretches, zero at sharp corners
     bends: Floats
 
 
 class Routes(NamedTuple):
-    """Every robot's route, and the robots that it waits for.
+    """Every robot's route, and the robots that it waits for."""
 
-    Attributes:
-        points: ``(T, 3)`` float64 points of all routes, one robot's after another's [m].
-        times: ``(T,)`` float64, see :class:`Route`.
-        bends: ``(T,)`` float64.
-        first: ``(K + 1,)`` int64 where each robot's begin.
-        arcs: ``(T,)`` float64 length of the route up to each point [m].
-        wait_first: ``(K + 1,)`` int64 where each robot's waits begin.
-        wait_at: int64 points, counted from the robot's first, that it may not come to ...
-        wait_for: ... before this robot ...
-        wait_until: ... has come to this point of its own.
-    """
-
-    points: Floats
-    times: Floats
-    bends: Floats
-    first: IntArray
-    arcs: Floats
-    wait_first: IntArray
-    wait_at: IntArray
-    wait_for: IntArray
-    wait_until: IntArray
+    points: Floats  #: ``(T, 3)`` float64 points of all routes, one robot's after another's [m]
+    times: Floats  #: ``(T,)`` float64, see :class:`Route`
+    bends: Floats  #: ``(T,)`` float64
+    first: IntArray  #: ``(K + 1,)`` int64 where each robot's begin
+    arcs: Floats  #: ``(T,)`` float64 length of the route up to each point [m]
+    wait_first: IntArray  #: ``(K + 1,)`` int64 where each robot's waits begin
+    wait_at: IntArray  #: int64 points, counted from the robot's first, that it may not come to ...
+    wait_for: IntArray  #: ... before this robot ...
+    wait_until: IntArray  #: ... has come to this point of its own.
 
     def each(self) -> list[slice]:
         """The rows of every robot."""
@@ -71,19 +53,12 @@ class Routes(NamedTuple):
 
 
 class Corners(NamedTuple):
-    """Corners of paths, one robot's after another's, each from its start on.
+    """Corners of paths, one robot's after another's, each from its start on."""
 
-    Attributes:
-        positions: ``(C, 3)`` float64 [m].
-        begin: ``(K + 1,)`` int64 where each robot's begin.
-        departs: ``(C,)`` float64 when it sets out for each from the one before.
-        arrives: ``(C,)`` float64 when it gets there.
-    """
-
-    positions: Floats
-    begin: IntArray
-    departs: Floats
-    arrives: Floats
+    positions: Floats  #: ``(C, 3)`` float64 [m]
+    begin: IntArray  #: ``(K + 1,)`` int64 where each robot's begin
+    departs: Floats  #: ``(C,)`` float64 when it sets out for each from the one before
+    arrives: Floats  #: ``(C,)`` float64 when it gets there
 
 
 BRAKING = 0.5
@@ -97,21 +72,13 @@ SLOWEST = 0.1
 
 
 class Progress(NamedTuple):
-    """Progress of robots along their routes.
+    """Progress of robots along their routes."""
 
-    Attributes:
-        at: ``(K,)`` int64 the point of its route that each is at, counted from its first.
-        waits: ``(K,)`` int64 the wait of each that is not over, or where its waits end.
-        targets: ``(K, 3)`` float32 where each heads [m].
-        room: ``(K,)`` float32 how far it may drive on [m].
-        pace: ``(K,)`` float32 how fast [m/s].
-    """
-
-    at: IntArray
-    waits: IntArray
-    targets: FloatArray
-    room: FloatArray
-    pace: FloatArray
+    at: IntArray  #: ``(K,)`` int64 the point of its route that each is at, counted from its first
+    waits: IntArray  #: ``(K,)`` int64 the wait of each that is not over, or where its waits end
+    targets: FloatArray  #: ``(K, 3)`` float32 where each heads [m]
+    room: FloatArray  #: ``(K,)`` float32 how far it may drive on [m]
+    pace: FloatArray  #: ``(K,)`` float32 how fast [m/s]
 
     @classmethod
     def of(cls, routes: Routes) -> Progress:
@@ -129,12 +96,12 @@ RouteStep: TypeAlias = Kernel[[ProblemArrays, IntArray, Progress, BoolArray, Flo
 def direct(
     routes: Routes,
     paces: Floats,
-    sights: Floats,
+    lookahead: Floats,
     dt: float,
     beyond: float,
     size: float,
     positions: Floats,
-    standing: BoolArray,
+    at_rest: BoolArray,
     progress: Progress,
 ) -> None:
     """Set the next target of all robots.
@@ -142,19 +109,19 @@ def direct(
     Args:
         routes: The routes.
         paces: ``(T,)`` how fast each point may be passed [m/s].
-        sights: ``(K,)`` how far ahead robots look at least [m].
+        lookahead: ``(K,)`` least distance ahead at which robots look [m].
         dt: Time step [s].
         beyond: Distance beyond their goals that robots may plan to drive, if these stop them [m].
         size: The radius of the largest robot [m].
         positions: ``(K, 3)`` float64 where they are [m].
-        standing: ``(K,)`` bool: docked, and so at the end of its route.
+        at_rest: ``(K,)`` bool: arrived, and so at the end of its route.
         progress: Changed in place.
     """
     points, arcs, num_robots = routes.points, routes.arcs, routes.first.shape[0] - 1
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
         i = point_reached(points, arcs, first + progress.at[k], last, positions[k], size)
-        progress.at[k] = (last if standing[k] else i) - first
+        progress.at[k] = (last if at_rest[k] else i) - first
     for k in range(num_robots):
         first, last = routes.first[k], routes.first[k + 1] - 1
         wait, end = progress.waits[k], routes.wait_first[k + 1]
@@ -163,7 +130,7 @@ def direct(
         progress.waits[k] = wait
         i, here = first + progress.at[k], positions[k]
         limit = last if wait == end else max(first + routes.wait_at[wait] - 1, i)
-        target = point_ahead(routes, paces, i, limit, np.inf, (sights[k], dt), here, size)
+        target = point_ahead(routes, paces, i, limit, np.inf, (lookahead[k], dt), here, size)
         progress.targets[k, 0], progress.targets[k, 1] = points[target, 0], points[target, 1]
         progress.targets[k, 2] = points[target, 2]
         room = RESERVE * (arcs[limit] - arcs[i])
@@ -246,13 +213,13 @@ def drive_routes(problem: Problem, routes: Routes, most_steps: int) -> tuple[Flo
     states, arrived = np.stack([problem.start, problem.start]), np.zeros(num_robots, bool)
     positions, progress = np.zeros((most_steps + 1, num_robots, 3)), Progress.of(routes)
     arrivals = np.full(num_robots, most_steps + 1, np.int64)
-    sights, beyond, size = lookaheads(problem), beyond_goal(problem), problem.team.largest_radius
+    lookahead, beyond, size = lookaheads(problem), beyond_goal(problem), problem.team.largest_radius
     parts = [(route_kernel(model.name), np.array(robots)) for model, robots in by_model(problem)]
     ends, steps = np.diff(routes.first) - 1, 0
     while True:
         positions[steps, :, :d] = states[0, :, :d]
-        direct(routes, paces, sights, problem.dt, beyond, size, positions[steps], arrived & problem.docks, progress)
-        # Without docking a robot may come through its goal before it has made way for others.
+        direct(routes, paces, lookahead, problem.dt, beyond, size, positions[steps], arrived & problem.docks, progress)
+        # Without absorbing goals a robot may pass its goal before it has yielded to others.
         done = arrived & (problem.docks | (progress.at == ends))
         arrivals[:] = np.where(done, np.minimum(arrivals, steps), most_steps + 1)
         if steps == most_steps or done.all():
@@ -272,9 +239,9 @@ def beyond_goal(problem: Problem) -> float:
 
 
 def paces_along(problem: Problem, robot: int, arcs: Floats, bends: Floats, share: float = BRAKING) -> Floats:
-    """``(P,)`` how fast a robot may pass each point of its route [m/s], from their places along it and their bends.
+    """``(P,)`` speeds at which a robot may pass the points of its route, with a share of its acceleration [m/s].
 
-    It counts on that share of its acceleration.
+    ``arcs`` and ``bends`` are as in :class:`Routes`.
     """
     model, limits = problem.team.robot_models[robot], np.asarray(problem.team.limits[robot], np.float64)
     corner = np.sqrt(share * limits[ACCELERATION] * bends)

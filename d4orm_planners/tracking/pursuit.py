@@ -52,13 +52,13 @@ BACKING = np.float32(0.5)
 
 
 def lookaheads(problem: Problem) -> Floats:
-    """``(K,)`` how far ahead of them robots look at least [m]."""
+    """``(K,)`` least distance ahead at which robots look [m]."""
     return np.maximum(LOOKAHEAD * problem.team.largest_radius, CIRCLES * problem.team.turning_radius.astype(np.float64))
 
 
 @compiled
 def square_to(points: Floats, i: int, position: Floats | Row) -> float:
-    """Squared distance of a point from a place, which may be the beginning of a state."""
+    """Squared distance of a point from a position, which may be the beginning of a state."""
     square = 0.0
     for axis in range(points.shape[1]):
         gap = points[i, axis] - position[axis]
@@ -160,7 +160,7 @@ def steering(name: str) -> Steering:
 
 
 def vectors(dimension: int) -> tuple[Callable[[Row, Row, np.float32], Row], Length, Callable[[Row, Row], Row]]:
-    """``origin + step * factor``, the length of a step, and the step from a state to a place."""
+    """``origin + step * factor``, the length of a step, and the step from a state to a position."""
     squared_norm = SQUARED_NORM[dimension]
 
     @inlined
@@ -192,7 +192,7 @@ def _turning(robot: Model, length: Length) -> Turning:
     at_rest = (ZERO,) * robot.control_size
 
     @inlined
-    def needs_not(
+    def unchanged(
         state: Row, gap: Row, wanted: Row, pace: np.float32, backs_up: bool, limits: Row
     ) -> tuple[Row, np.float32]:
         return wanted, pace
@@ -220,7 +220,7 @@ def _turning(robot: Model, length: Length) -> Turning:
         return ((x * along - y * across) * speed, (y * along + x * across) * speed), pace
 
     if heading < 0:
-        return needs_not
+        return unchanged
     return in_place if robot.turns_in_place or robot.dimension == 3 else as_it_drives
 
 

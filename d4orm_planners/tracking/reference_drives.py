@@ -41,8 +41,8 @@ def reference_kernel(
         reference: Reference, memory: int, step: int, x: Row, goal: Row, limits: Row, h: TimeStep
     ) -> tuple[Row, int, bool]:
         positions, velocities, gain = reference
-        behind = between(x, to_fixed_tuple(positions[step], d))
-        return scaled(to_fixed_tuple(velocities[step], d), behind, gain), memory, False
+        error = between(x, to_fixed_tuple(positions[step], d))
+        return scaled(to_fixed_tuple(velocities[step], d), error, gain), memory, False
 
     drive = tracker(model, towards)
 
@@ -63,15 +63,14 @@ def reference_kernel(
 def follow_reference(
     problem: Problem, states: FloatArray, positions: FloatArray, velocities: FloatArray, gain: float
 ) -> FloatArray:
-    """``(T, K, m)`` controls that drive robots from ``states`` ``(K, n)`` along a reference, through goals as if none
-    were there.
+    """``(T, K, m)`` controls that drive robots along a reference, as if they had no goals.
 
     Args:
         problem: The robots.
-        states: Where they are.
-        positions: ``(T, K, d)`` where they should be at the beginning of every time step [m].
-        velocities: ``(T, K, d)`` and how fast they should go [m/s].
-        gain: Share of what is missing to there that is made good in a second [1/s].
+        states: ``(K, n)`` their present states.
+        positions: ``(T, K, d)`` of the reference at the beginning of every time step [m].
+        velocities: ``(T, K, d)`` likewise [m/s].
+        gain: Share of the position error that is corrected in a second [1/s].
     """
     anywhere = problem.arrays._replace(
         docks=np.bool_(False), turns_at_goals=None, goal_direction=None, squared_goal_chord=None, footprints=None

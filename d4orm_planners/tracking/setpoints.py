@@ -28,7 +28,7 @@ class Setpoints:
     was made for and was verified to touch nothing, between the samples too.
 
     Attributes:
-        time: ``(T,)`` from 0 to when everybody is at rest [s].
+        time: ``(T,)`` from 0 until all robots are at rest [s].
         position: ``(T, K, d)`` [m].
         velocity: ``(T, K, d)`` [m/s].
         acceleration: ``(T, K, d)`` [m/s^2].

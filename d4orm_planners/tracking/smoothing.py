@@ -1,10 +1,9 @@
 """Smooth motions through a plan: splines of class C4 within limits on speed, acceleration and jerk, verified again.
 
 A plan's accelerations jump at every step, which no robot follows. Its positions are fitted by quintic P-splines (P. H.
-C. Eilers and B. D. Marx, Statistical Science, 1996), which begin and end without acceleration; where they need more
-than a limit allows, the whole team drives them more slowly: that changes neither where anybody drives nor who meets
-whom. The smoother the curves the quicker they may be driven, but the farther are they from the plan, and the first that
-touch nothing are taken, in the order of their duration.
+C. Eilers and B. D. Marx, Statistical Science, 1996), which begin and end without acceleration. Where they exceed a
+limit the whole team drives more slowly, which changes no path and no encounter. Smoother curves may be driven faster,
+but deviate more from the plan: of several, the quickest is taken that is free of collisions.
 """
 
 from __future__ import annotations
@@ -23,35 +22,29 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.verify import VerificationReport
 from d4orm_env.verify.discs import verify_curves
+from d4orm_planners.tracking.steering import present_velocities
 
 DEGREE = 5
 SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
 """Weights of the squared third differences of a curve's coefficients, against the squared distances from the plan."""
 GATHERING, SETTLING = 2, 5
-"""Steps before a plan from rest in which the team gathers way, and after the last arrival in which it comes to rest."""
+"""Steps before a plan from rest in which the team starts, and after the last arrival in which it comes to rest."""
 PER_STEP = 32
-"""Times a step at which a motion's speeds, accelerations and jerks are looked at."""
+"""Samples per step at which a motion's speeds, accelerations and jerks are checked."""
 RESERVE = 1e-3
-"""Share of the limits that is left for what happens between these times."""
+"""Share of the limits that is left for peaks between these samples."""
 SLOWEST = 4.0
-"""Times the plan's duration that a motion may take."""
+"""Longest duration of a motion, in durations of the plan."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Most that a robot's controller is asked for, each ``(K,)``; infinite where anything goes.
+    """Limits of what a robot's controller is asked for, each ``(K,)``; infinite for none."""
 
-    Attributes:
-        speed: [m/s].
-        acceleration: [m/s^2]; of robots with a heading along it.
-        turn_rate: [rad/s].
-        jerk: [m/s^3].
-    """
-
-    speed: Floats
-    acceleration: Floats
-    turn_rate: Floats
-    jerk: Floats
+    speed: Floats  #: [m/s]
+    acceleration: Floats  #: [m/s^2]; of robots with a heading along it
+    turn_rate: Floats  #: [rad/s]
+    jerk: Floats  #: [m/s^3]
 
     @classmethod
     def of(cls, problem: Problem, acceleration: ArrayLike | None = None, jerk: ArrayLike | None = None) -> MotionLimits:
@@ -88,25 +81,17 @@ def _each(name: str, value: ArrayLike | None, otherwise: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:
-    """A team's motion as splines over the plan's own time, driven ``stretch`` times as slowly.
+    """A team's motion as splines over the plan's own time, driven ``stretch`` times as slowly."""
 
-    Attributes:
-        problem: The team and its world.
-        curves: Of :meth:`position`, ``(K, d)`` by the plan's time [m].
-        headings: ``(K,)`` by the plan's time [rad]; zero for robots without one.
-        deviation: Largest distance from the plan at its steps [m].
-        stretch: Times the plan's duration that it takes, at least 1.
-    """
-
-    problem: Problem
-    curves: BSpline
-    headings: BSpline
-    deviation: float
-    stretch: float = 1.0
+    problem: Problem  #: The team and its world
+    curves: BSpline  #: Of :meth:`position`, ``(K, d)`` by the plan's time [m]
+    headings: BSpline  #: ``(K,)`` by the plan's time [rad]; zero for robots without one
+    deviation: float  #: Largest distance from the plan at its steps [m]
+    stretch: float = 1.0  #: Times the plan's duration that it takes, at least 1
 
     @property
     def duration(self) -> float:
-        """When everybody is at rest [s]."""
+        """Time at which all robots are at rest [s]."""
         return float(self.curves.t[-1]) * self.stretch
 
     def position(self, times: Floats, derivative: int = 0) -> Floats:
@@ -159,7 +144,7 @@ class SmoothMotion:
 
 
 def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits) -> SmoothMotion:
-    """The quickest smooth motion along a trajectory in which nobody touches anything.
+    """The quickest smooth motion along a trajectory that is free of collisions.
 
     Args:
         problem: What the trajectory solves.
@@ -203,15 +188,8 @@ def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
 
 def _initial_velocity(problem: Problem) -> Floats:
     """``(K, d)`` velocities at the start [m/s]."""
-    velocity = np.zeros((problem.num_robots, problem.dimension))
-    for robot, model in enumerate(problem.team.robot_models):
-        state = problem.start[robot].astype(np.float64)
-        if model.heading_index is not None and model.speed_indices:
-            heading = state[model.heading_index]
-            velocity[robot, :2] = state[model.speed_indices[0]] * np.array([np.cos(heading), np.sin(heading)])
-        elif model.speed_indices:
-            velocity[robot] = state[list(model.speed_indices)]
-    return velocity
+    no_controls = np.zeros((problem.num_robots, problem.control_size), np.float32)
+    return present_velocities(problem, problem.start, no_controls).astype(np.float64)
 
 
 def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> SmoothMotion:

@@ -60,10 +60,9 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
 
 
 def goals_along_paths(problem: Problem, positions: FloatArray | Floats, goals: FloatArray) -> FloatArray:
-    """``(K, d)`` where robots without a plan should head from ``positions`` ``(K, d)``: along their shortest paths, as
-    far off as those are long [m].
+    """``(K, d)`` aims from ``positions`` ``(K, d)`` along the shortest paths, as far off as these are long [m].
 
-    It is their present ``goals`` ``(K, d)`` where the world is empty, for robots with other goals than the problem's,
+    They are the present ``goals`` ``(K, d)`` where the world is empty, for robots with other goals than the problem's,
     to which the paths lead, and for those without a path.
     """
     if not problem.world.num_obstacles:
@@ -119,8 +118,9 @@ def _by_rows(problem: Problem, width: int, rows: tuple[FloatArray, ...], law: Ca
 
 
 def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals: FloatArray) -> BoolArray:
-    """``(K,)`` robots as near to their goals ``(K, d)`` as they need for braking to dock, where they must slow down for
-    that; ``controls`` ``(K, m)`` are those executed last.
+    """``(K,)`` robots with a goal speed that are so near to their goals ``(K, d)`` that they must brake now.
+
+    ``controls`` ``(K, m)`` are those executed last.
     """
     speed = np.linalg.norm(present_velocities(problem, states, controls), axis=1)
     gap = np.linalg.norm(goals - states[:, : problem.dimension], axis=1) - problem.goal_radius
@@ -129,7 +129,7 @@ def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals
 
 
 def brake_to_dock(problem: Problem, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
-    """``(N, m)`` the controls of some robots, but of those that must brake now to dock the controls of go-to-goal."""
+    """``(N, m)`` the controls of some robots, replaced by those of go-to-goal for robots that must brake now."""
     braking = must_brake(problem, joint.states, joint.controls, joint.goals)[robots, None]
     return np.where(braking, drive_to_goal(problem, joint.states, joint.goals)[robots], controls)
 
@@ -158,19 +158,12 @@ def _robots_by_name(models: tuple[str, ...]) -> tuple[tuple[str, tuple[int, ...]
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Paths that robots could take, each robot alone: ``R`` robots, ``V`` paths each.
+    """Paths of robots that each drive alone: ``R`` robots, ``V`` paths each."""
 
-    Attributes:
-        controls: ``(H, R, V, m)``, zero after arrival.
-        states: ``(H+1, R, V, n)``.
-        arrived: ``(R, V)`` bool.
-        dimension: ``d``.
-    """
-
-    controls: FloatArray
-    states: FloatArray
-    arrived: BoolArray
-    dimension: int
+    controls: FloatArray  #: ``(H, R, V, m)``, zero after arrival
+    states: FloatArray  #: ``(H+1, R, V, n)``
+    arrived: BoolArray  #: ``(R, V)`` bool
+    dimension: int  #: ``d``
 
     @property
     def positions(self) -> FloatArray:
@@ -188,7 +181,7 @@ def drives(
     Args:
         problem: The robots.
         states: ``(H+1, R, n)`` their states under ``controls``.
-        controls: ``(H, R, m)`` as executed: clipped, zero for docked robots.
+        controls: ``(H, R, m)`` as executed: clipped, zero after arrival.
         switch_times: ``(R, V)`` time steps.
         vias: ``(R, V, P, d)`` the points [m]; none by default.
     """
@@ -213,10 +206,10 @@ def prepare_drives(problem: Problem) -> None:
 
 def straight_drives(problem: Problem) -> Rollouts:
     """Drive from the start straight to the goal: a single path for every robot."""
-    return drives(problem, *standing(problem), np.zeros((problem.num_robots, 1), int))
+    return drives(problem, *at_rest(problem), np.zeros((problem.num_robots, 1), int))
 
 
-def standing(problem: Problem) -> tuple[FloatArray, FloatArray]:
+def at_rest(problem: Problem) -> tuple[FloatArray, FloatArray]:
     """States ``(H+1, K, n)`` and controls ``(H, K, m)`` of robots that stay where they start."""
     states = np.repeat(np.asarray(problem.start)[None], problem.horizon + 1, axis=0)
     return states, np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)

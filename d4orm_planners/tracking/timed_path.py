@@ -26,37 +26,21 @@ NEAR, SHORT = 2 / 15, 2 / 3
 
 
 class Timed(NamedTuple):
-    """A route and its clock.
+    """A route and its clock."""
 
-    Attributes:
-        points: ``(P, d)`` float64 [m].
-        targets: ``(P, d)`` the same in float32.
-        arcs: ``(P,)`` float64 length of the route up to each [m].
-        paces: ``(P,)`` float64 how fast each may be passed [m/s].
-        bends: ``(P,)`` float64 radius of the bend at each [m].
-        corners: ``(C,)`` float64 length of the route up to each corner [m].
-        departs: ``(C,)`` float64 step at which it may set out for each corner from the one before.
-        arrives: ``(C,)`` float64 step at which it should be there.
-        lookahead: Least look-ahead of the robot [m].
-        beyond: Distance beyond its goal that it may plan to drive, if that stops it [m].
-        size: The radius of the largest robot [m].
-        dt: Time step [s].
-        backs_up: Whether the robot does, see :func:`~d4orm_planners.tracking.pursuit.gear_towards`.
-    """
-
-    points: Floats
-    targets: FloatArray
-    arcs: Floats
-    paces: Floats
-    bends: Floats
-    corners: Floats
-    departs: Floats
-    arrives: Floats
-    lookahead: float
-    beyond: np.float32
-    size: float
-    dt: np.float32
-    backs_up: bool
+    points: Floats  #: ``(P, d)`` float64 [m]
+    targets: FloatArray  #: ``(P, d)`` the same in float32
+    arcs: Floats  #: ``(P,)`` float64 length of the route up to each [m]
+    paces: Floats  #: ``(P,)`` float64 how fast each may be passed [m/s]
+    bends: Floats  #: ``(P,)`` float64 radius of the bend at each [m]
+    corners: Floats  #: ``(C,)`` float64 length of the route up to each corner [m]
+    departs: Floats  #: ``(C,)`` float64 step at which it may set out for each corner from the one before
+    arrives: Floats  #: ``(C,)`` float64 step at which it should be there
+    lookahead: float  #: Least look-ahead of the robot [m]
+    beyond: np.float32  #: Distance beyond its goal that it may plan to drive, if that stops it [m]
+    size: float  #: The radius of the largest robot [m]
+    dt: np.float32  #: Time step [s]
+    backs_up: bool  #: Whether the robot does, see :func:`~d4orm_planners.tracking.pursuit.gear_towards`
 
 
 @inlined

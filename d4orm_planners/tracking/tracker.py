@@ -1,9 +1,9 @@
 """The loop that drives a robot along a reference under its own dynamics, compiled with numba.
 
-A reference is data and a guide, which says what velocity is wanted next: from point to point
-(:func:`straight_kernel`), along a route as others let it pass
-(:mod:`~d4orm_planners.tracking.path_drives`), by the clock (:mod:`~d4orm_planners.tracking.timed_path`), or beside
-positions and velocities in time (:mod:`~d4orm_planners.tracking.reference_drives`).
+A reference is data and a guide, a function that returns the velocity wanted next. There are guides from point to point
+(:func:`straight_kernel`), along a route as others let it pass (:mod:`~d4orm_planners.tracking.path_drives`), by the
+clock (:mod:`~d4orm_planners.tracking.timed_path`), and along positions and velocities in time
+(:mod:`~d4orm_planners.tracking.reference_drives`).
 """
 
 from __future__ import annotations
@@ -24,13 +24,12 @@ from d4orm_env.engine.caching import Kernel, cached_kernel
 from d4orm_env.engine.compiling import WITHOUT_ARRAYS, ZERO, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.stepping import SQUARED_GAP, Docking, Row, docking_of, make_stepper, models_key
+from d4orm_planners.tracking.steering import CREEPING
 
-CREEPING = np.float32(2.0**-20)
-"""Share of its speed limit with which a robot at its goal heads for its goal heading: it turns in place."""
 Guide: TypeAlias = Callable[[Any, Any, int, Row, Row, Row, TimeStep], tuple[Row, Any, bool]]
-"""``(reference, memory, step, state, goal, limits, h) -> (velocity, memory, is_at_end)``: the velocity that is wanted,
-what the guide remembers for the next step, and whether the reference ends here: only there does a robot arrive that may
-be moved again."""
+"""``(reference, memory, step, state, goal, limits, h) -> (velocity, memory, is_at_end)``: the velocity wanted, the
+guide's memory for the next step, and whether the reference ends here: without absorbing goals robots arrive only
+there."""
 Tracker: TypeAlias = Callable[[ProblemArrays, Whole, Any, Any, int, Row, bool, FloatArray, FloatArray], int]
 VelocityStep: TypeAlias = Callable[[Row, Row, Row, Row, Docking, TimeStep], tuple[Row, Row, bool]]
 
@@ -95,7 +94,7 @@ def tracker(model: Model, guide: Guide) -> Tracker:
     ) -> int:  # fmt: skip
         dt = arrays.time_step
         docking = docking_of(arrays, robot)
-        h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
+        h = TimeStep(dt[0], dt[1], dt[2], dt[3])
         limits, goal = to_fixed_tuple(arrays.limits[robot], num_limits), to_fixed_tuple(arrays.goal[robot], d)
         horizon = controls.shape[0]
         arrival = first if arrived else horizon + 1

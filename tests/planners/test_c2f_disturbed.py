@@ -24,9 +24,9 @@ from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_veloci
 from d4orm_planners.d4orm_c2f.deviation import StateFilter
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.d4orm_c2f.estimators import (
-    AFTER,
-    BRAKING_AFTER,
-    LATEST,
+    BRAKING_STEPS,
+    IDLE_STEPS,
+    MAX_LATENCY,
     ActuatorGainEstimator,
     LatencyEstimator,
     PacketLossEstimator,
@@ -51,7 +51,7 @@ def joint(problem: Any, states: Any, **parts: Any) -> JointState:
     return JointState(**{"states": np.asarray(states, np.float32), "goals": problem.goal, **given, **parts})
 
 
-@given(late=st.integers(0, LATEST), noise=st.floats(0, 0.3), seed=st.integers(0, 1000))
+@given(late=st.integers(0, MAX_LATENCY), noise=st.floats(0, 0.3), seed=st.integers(0, 1000))
 @settings(max_examples=25, deadline=None)
 def test_how_late_commands_are_is_found_out(late: int, noise: float, seed: int) -> None:
     random, latency = np.random.default_rng(seed), LatencyEstimator(Team(("holonomic2d",) * 3), None)
@@ -209,8 +209,8 @@ def test_noise_on_measurements_sends_nobody_off_again() -> None:
     ]:
         states = problem.start.copy()
         states[:, :2] = problem.goal + np.float32([away * problem.goal_radius, 0])
-        policy._see_docked(joint(problem, states, goals=goals, arrived=np.array([True, False])))
-        assert policy._docked.tolist() == [arrived, False]
+        policy._note_arrivals(joint(problem, states, goals=goals, arrived=np.array([True, False])))
+        assert policy._arrived.tolist() == [arrived, False]
 
 
 def test_who_is_nearly_there_drives_straight_home() -> None:
@@ -274,34 +274,34 @@ def test_robots_of_first_order_stray_until_their_next_command_only(model: str, w
     policy, problem = controller(), make_problem("random", num_robots=2, seed=1, model=model)
     run_episode(navigation_v0.parallel_env(problem=problem, control_noise_std=0.2), policy, seed=0)
     deviation = policy._deviation
-    assert deviation.room(0.4) == pytest.approx(within * deviation.speed.max())
-    assert 0 < deviation.room(0.4) < 0.15
+    assert deviation.margin_inflation(0.4) == pytest.approx(within * deviation.speed.max())
+    assert 0 < deviation.margin_inflation(0.4) < 0.15
 
 
 def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
     problem = hop_problem(3)
-    standing, states = StallEstimator(problem), problem.start.copy()
+    stall, states = StallEstimator(problem), problem.start.copy()
     told = np.array([[0.8, 0], [0.8, 0], [0.0, 0]], np.float32)
     executed = np.array([[0.8, 0], [0.0, 0], [0.0, 0]], np.float32)
-    for step in range(AFTER + 1):
-        assert standing.robots.tolist() == [False, step >= AFTER, False]
-        seen = standing.observe(joint(problem, states, controls=executed), told)
+    for step in range(IDLE_STEPS + 1):
+        assert stall.robots.tolist() == [False, step >= IDLE_STEPS, False]
+        seen = stall.observe(joint(problem, states, controls=executed), told)
     np.testing.assert_array_equal(seen.arrived, [False, True, False])
     np.testing.assert_array_equal(seen.goals[1], states[1, :2])
     np.testing.assert_array_equal(seen.goals[[0, 2]], problem.goal[[0, 2]])
     states[1, 0] += 0.2
-    assert not standing.observe(joint(problem, states, controls=executed), told).arrived.any()
+    assert not stall.observe(joint(problem, states, controls=executed), told).arrived.any()
 
 
 def test_who_brakes_whatever_it_is_told_is_taken_for_docked_where_it_will_come_to_rest() -> None:
     problem, engine = hop_problem(2), get_sampling_engine("cpu")
-    standing, states = StallEstimator(problem), problem.start.copy()
+    stall, states = StallEstimator(problem), problem.start.copy()
     states[:, 2] = 0.9
     told = np.array([[0.0, 0.9], [0.0, -0.9]], np.float32)
     executed = np.zeros_like(told)
     for step in range(9):
-        seen = standing.observe(joint(problem, states, controls=executed), told)
-        assert standing.robots.tolist() == [step >= BRAKING_AFTER, False]
+        seen = stall.observe(joint(problem, states, controls=executed), told)
+        assert stall.robots.tolist() == [step >= BRAKING_STEPS, False]
         executed = told.copy()
         executed[0] = track_velocities(problem, states, np.zeros((2, 2), np.float32))[0]
         states = engine.step(problem.arrays, states, np.zeros(2, bool), executed).states
@@ -446,10 +446,10 @@ def test_a_robot_that_has_stalled_is_driven_around() -> None:
     env = navigation_v0.parallel_env(problem=problem, disturbances=[Stall(1.0, robots=1)])
     policy = controller()
     executed = run_episode(env, policy, seed=2)
-    assert policy._deviation.standing is not None
-    assert policy._deviation.standing.robots.sum() == 1
+    assert policy._deviation.stall is not None
+    assert policy._deviation.stall.robots.sum() == 1
     assert not executed.trajectory.collided.any()
-    np.testing.assert_array_equal(executed.trajectory.arrived[-1], ~policy._deviation.standing.robots)
+    np.testing.assert_array_equal(executed.trajectory.arrived[-1], ~policy._deviation.stall.robots)
 
 
 @pytest.mark.parametrize("lifelong", [False, True], ids=["once", "lifelong"])
@@ -473,7 +473,7 @@ def test_the_paper_preset_is_algorithm_4() -> None:
     assert executed.metrics["success"], executed.metrics
     config = policy.config
     assert (config.num_samples, config.coarse_samples, config.credit, config.penalty) == (1024, 1024, "team", 1.0)
-    planner = policy._guide._planning.planner.config
+    planner = policy._tracker._planning.planner.config
     assert (planner.decoupling, planner.start, planner.credit, planner.weight_cutoff) == ("groups", "team", "team", 0.0)
     assert not any(loop.replanned for loop in policy.loops)
     # Line 7: one waypoint for the whole team.

@@ -22,8 +22,8 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
+from d4orm_planners.base.background import Background
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.d4orm_c2f.background import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.fine_plan import Window
@@ -328,6 +328,20 @@ def test_a_job_in_the_background_is_one_at_a_time_and_gives_its_result_once() ->
     assert background.result() == (True, None)
 
 
+def test_an_error_of_late_work_is_raised_once() -> None:
+    background, go = Background(), threading.Event()
+
+    def broken() -> None:
+        assert go.wait(60)
+        raise ValueError("broken")
+
+    assert background.run(broken, 0.01) is None
+    go.set()
+    with pytest.raises(ValueError, match="broken"):
+        background.run(lambda: None, 60)
+    assert background.run(lambda: 1, 60) == 1
+
+
 def test_the_control_loop_is_compiled_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
     prepared = []
     monkeypatch.setattr(
@@ -367,7 +381,7 @@ def replanned(
         *more: Any,
     ) -> Any:  # fmt: skip
         if initial is not None:
-            calls.append((joint, initial.copy(), iterations, policy._guide.guidance, policy._guide.index))
+            calls.append((joint, initial.copy(), iterations, policy._tracker.guidance, policy._tracker.index))
         return plan(self, problem, joint, arrived, initial, iterations, *more)
 
     monkeypatch.setattr(CoarsePlanning, "plan", coarse_plan)
@@ -490,7 +504,7 @@ def test_paths_of_robots_that_were_pushed_lead_on_to_their_ends() -> None:
     joint = split_state(problem, env.state())
     states = joint.states + np.float32([0.1, -0.1, 0.4, 0.3])
     everybody = np.ones(4, bool)
-    initial = policy._guide._beginning(joint._replace(states=states), everybody)
+    initial = policy._tracker._beginning(joint._replace(states=states), everybody)
     coarse = coarse_problem(problem.with_state(states, problem.goal), policy.config.coarse_factor)
     assert get_sampling_engine("cpu").rollout(coarse, initial).arrived[-1].all()
 
@@ -505,7 +519,7 @@ def test_a_plan_that_comes_before_the_episode_ends_is_preferred(seed: int) -> No
     states = joint.states.copy()
     states[0, 2:] = -1.1, 0.0  # A push may make a robot faster than a problem lets it start.
     late = joint._replace(states=states, steps=env.max_cycles - left * policy.config.coarse_factor)
-    guide = policy._guide
+    guide = policy._tracker
     plan = guide._planning.plan(guide.problem, late, nobody, None, 20, thorough=True)
     assert get_sampling_engine("cpu").rollout(plan.problem, plan.controls).arrived[left].all()
 
@@ -518,13 +532,13 @@ def test_who_is_behind_robots_that_have_docked_is_barred() -> None:
     joint, arrived = split_state(problem, env.state()), np.array([True, False, False, False])
     states = joint.states.copy()
     states[0, :2] = policy.guidance.path[10, 2]
-    barred = policy._guide._barred(joint._replace(states=states), arrived, np.ones(4, bool))
+    barred = policy._tracker._barred(joint._replace(states=states), arrived, np.ones(4, bool))
     assert barred[2]
     assert not barred[0]
-    assert not policy._guide._barred(joint._replace(states=states), arrived, np.arange(4) == 1)[2]
+    assert not policy._tracker._barred(joint._replace(states=states), arrived, np.arange(4) == 1)[2]
     far = joint.states.copy()
     far[0, :2] = 50
-    assert not policy._guide._barred(joint._replace(states=far), arrived, np.ones(4, bool)).any()
+    assert not policy._tracker._barred(joint._replace(states=far), arrived, np.ones(4, bool)).any()
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -539,7 +553,7 @@ def test_who_docked_at_the_rim_of_its_goal_stays_there_in_new_plans(seed: int) -
     states[arrived] = 0
     rim = problem.goal + 0.99 * problem.goal_radius * away / np.linalg.norm(away, axis=1, keepdims=True)
     states[arrived, :2] = rim[arrived]
-    guide = policy._guide
+    guide = policy._tracker
     plan = guide._planning.plan(
         guide.problem, joint._replace(states=states, arrived=arrived), arrived, None, 20, thorough=True
     )

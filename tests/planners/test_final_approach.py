@@ -18,7 +18,7 @@ from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.tracking.steering import Rollouts, drives, must_brake, standing, straight_drives
+from d4orm_planners.tracking.steering import Rollouts, at_rest, drives, must_brake, straight_drives
 
 FURTHER_IN = "d4orm_planners.base.solve.drive_further_in"
 
@@ -141,7 +141,7 @@ def test_who_is_refused_is_at_fault_until_it_moves() -> None:
     faults, first = team.faults([0, 1])
     assert faults.tolist() == [1, 1]
     assert first.tolist() == [2, 2]  # they meet within the second step
-    path = drives(problem, *standing(problem), [[0], [0]], np.full((2, 1, 1, 2), [[0.0, 1.0]]))
+    path = drives(problem, *at_rest(problem), [[0], [0]], np.full((2, 1, 1, 2), [[0.0, 1.0]]))
     team.take_best([0], path)
     assert team.faults([0, 1])[0].tolist() == [0, 1]
     # What it does already is no other way.

@@ -295,11 +295,10 @@ def test_conflicts_are_counted_and_the_first_is_found() -> None:
     time = np.linspace(-1, 1, 21)
     right, left = (np.column_stack([sign * time, np.zeros(21), np.zeros(21)]) for sign in (1, -1))
     far = right + np.array([0, 5, 0])
-    pairs, step, one, another = first_conflict(np.stack([right, far, left]), np.full((3, 3), 0.45))
-    assert (pairs, step, {one, another}) == (1, 8, {0, 2})
-    assert first_conflict(np.stack([right, far]), np.full((2, 2), 0.45))[2] == -1
-    counts = np.empty((2, 2), np.int64)
-    count_conflicts(np.stack([right, far]), np.stack([left, far, far]), np.full(3, 0.45), counts)
+    pairs, step, robots = first_conflict(np.stack([right, far, left]), np.full((3, 3), 0.45))
+    assert (pairs, step, set(robots)) == (1, 8, {0, 2})
+    assert first_conflict(np.stack([right, far]), np.full((2, 2), 0.45))[2] == (-1, -1)
+    counts = count_conflicts(np.stack([right, far]), np.stack([left, far, far]), np.full(3, 0.45))
     np.testing.assert_array_equal(counts, [[1, 5], [2, 42]])
 
 

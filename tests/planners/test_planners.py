@@ -26,7 +26,7 @@ from d4orm_env.core.trajectory import trajectory_metrics
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import IterationRecord, Plan, list_planners, make_planner
-from d4orm_planners.base.planner_registry import PLANNERS, describe_planner
+from d4orm_planners.base.planner_registry import PLANNERS, describe_policy
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
@@ -465,7 +465,7 @@ def test_a_bad_argument_of_solve_is_refused_by_name(arguments: dict[str, Any], m
 
 def test_the_methods_of_the_paper_are_there() -> None:
     assert {"d4orm", "mppi", "cem", "mbd", "i-mbd", "ipopt"} <= set(list_planners())
-    assert all(describe_planner(name) for name in list_planners())
+    assert all(describe_policy(name) for name in list_planners())
 
 
 @pytest.mark.parametrize("name", SAMPLING)

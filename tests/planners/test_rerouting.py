@@ -62,9 +62,9 @@ def test_a_path_costs_what_it_costs_whichever_paths_it_is_compared_with() -> Non
     own, other = (team.positions[:, robot] for robot in (3, 4))
     paths, arrived = np.stack([own, np.repeat(own[:1], len(own), axis=0), other, other]), np.array([1, 0, 1, 1], bool)
     alone = [team._costs([3], path[None, None], arrived[None, [i]])[0][0, 0] for i, path in enumerate(paths)]
-    assert team._costs_beside(3, paths, arrived).tolist() == [alone[0], *alone]
+    assert team._path_costs(3, paths, arrived).tolist() == [alone[0], *alone]
     assert len(set(alone)) == 3
-    assert team._costs_beside(3, paths[:1], arrived[:1]).tolist() == [0.0, 0.0]
+    assert team._path_costs(3, paths[:1], arrived[:1]).tolist() == [0.0, 0.0]
 
 
 def test_who_cannot_pass_waits() -> None:

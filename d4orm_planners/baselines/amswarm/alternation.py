@@ -3,8 +3,8 @@
 After V. K. Adajania, S. Zhou, A. K. Singh and A. P. Schoellig, *AMSwarm: An alternating minimization approach for safe
 motion planning of quadrotor swarms in cluttered environments* (ICRA 2023). A body at ``x_j`` is kept clear of by
 ``p = x_j + d w``, a unit vector ``w`` (which the publication writes by its angles) and a distance ``d`` of at least the
-reach; velocity and acceleration are a direction and a length within the limits. With directions and lengths held, the
-coefficients follow from one linear system; with coefficients held, directions and lengths are closed forms.
+safety distance; velocity and acceleration are a direction and a length within the limits. With directions and lengths
+held, the coefficients follow from one linear system; with coefficients held, directions and lengths are closed forms.
 """
 
 from __future__ import annotations
@@ -32,21 +32,13 @@ MOST_PENALTY = 5e7
 
 
 class Neighbourhood(NamedTuple):
-    """Surroundings that a team keeps clear of.
+    """Surroundings that a team keeps clear of."""
 
-    Attributes:
-        paths: ``(K, T, d)`` where robots are predicted to be [m].
-        radius: ``(K,)`` of the robots [m].
-        margin: Between surfaces [m].
-        boxes: ``(B, 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`.
-        bounds: ``(2, d)`` of the world, infinite where open [m].
-    """
-
-    paths: Floats
-    radius: Floats
-    margin: float
-    boxes: Floats
-    bounds: Floats
+    paths: Floats  #: ``(K, T, d)`` where robots are predicted to be [m]
+    radius: Floats  #: ``(K,)`` of the robots [m]
+    margin: float  #: Between surfaces [m]
+    boxes: Floats  #: ``(B, 2 d + 1)`` obstacles, see :class:`~d4orm_env.geometry.shapes.Shapes`
+    bounds: Floats  #: ``(2, d)`` of the world, infinite where open [m]
 
 
 @cached_kernel(**OPTIONS)
@@ -60,7 +52,7 @@ def alternate(
     motion: Floats,
     guess: Guess,
 ) -> float:
-    """Alternate until no constraint is violated and no place moves, to the tolerance, or as often as may be.
+    """Alternate until no constraint is violated and no position changes, to the tolerance, or as often as may be.
 
     Args:
         method: :class:`Method`.
@@ -78,11 +70,11 @@ def alternate(
     (steps, size), d = method.position.shape, len(goal)
     targets = Targets(np.empty((steps, d)), np.empty((steps, d)), np.empty((steps, d)))
     multiplier, right, matrix = np.zeros((size, d)), np.empty((size, d)), np.empty((size, size))
-    minded = np.zeros(len(bodies.radius) + len(bodies.boxes), np.bool_)
-    rows = _mind(method, bodies, robot, guess, minded) + 1  # the bounds are always minded
+    active = np.zeros(len(bodies.radius) + len(bodies.boxes), np.bool_)
+    rows = _activate(method, bodies, robot, guess, active) + 1  # the bounds always are
     bends = 1.0 if limits[1] < math.inf else 0.0
     squares = rows * method.squares[0] + method.squares[1] + bends * method.squares[2]
-    violation, penalty = _project(method, bodies, robot, limits, minded, motion[0], guess, targets), method.penalty
+    violation, penalty = _project(method, bodies, robot, limits, active, motion[0], guess, targets), method.penalty
     for _ in range(method.alternations):
         accumulate(method, targets, bends, right)
         for i in range(size):
@@ -92,7 +84,7 @@ def alternate(
                 right[i, axis] = method.goal[i] * goal[axis] + multiplier[i, axis] + penalty * right[i, axis]
         solve(matrix, right, fixed, motion)
         change = sample(method, motion, guess)
-        violation = _project(method, bodies, robot, limits, minded, motion[0], guess, targets)
+        violation = _project(method, bodies, robot, limits, active, motion[0], guess, targets)
         if max(violation, change) <= method.tolerance:
             break
         accumulate(method, targets, bends, right)
@@ -102,10 +94,10 @@ def alternate(
 
 
 @compiled
-def _mind(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, minded: BoolArray) -> int:
-    """Mark the bodies that come near the guess; how many there are."""
+def _activate(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, active: BoolArray) -> int:
+    """Mark the bodies near the guess, whose constraints are active; returns their number."""
     robots, d, count = len(bodies.radius), bodies.paths.shape[2], 0
-    for body in range(len(minded)):
+    for body in range(len(active)):
         if body == robot:
             continue
         for step in range(len(guess.position)):
@@ -123,7 +115,7 @@ def _mind(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, min
                     gap = max(box[axis] - x, x - box[d + axis], 0.0)
                     square += gap * gap
             if square < (safety_distance + method.lookout) * (safety_distance + method.lookout):
-                minded[body] = True
+                active[body] = True
                 count += 1
                 break
     return count
@@ -135,18 +127,19 @@ def _project(
     bodies: Neighbourhood,
     robot: Whole,
     limits: Floats,
-    minded: BoolArray,
+    active: BoolArray,
     here: Floats,
     guess: Guess,
     targets: Targets,
 ) -> float:
-    """The nearest places, velocities and accelerations that limits and the bodies ``minded`` ``(K + B,)`` allow, summed
-    into ``targets``; the largest violation. The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`.
+    """Sum the nearest samples that limits and the bodies ``active`` ``(K + B,)`` allow into ``targets``.
+
+    The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`. Returns the largest violation.
     """
     robots, (steps, d), radius = len(bodies.radius), guess.position.shape, bodies.radius[robot]
     worst = _stay_within(bodies.bounds, radius, limits, guess, targets)
-    for body in range(len(minded)):
-        if not minded[body]:
+    for body in range(len(active)):
+        if not active[body]:
             continue
         if body < robots:
             safety_distance = radius + bodies.radius[body] + bodies.margin
@@ -183,7 +176,7 @@ def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, ta
 
 @compiled
 def _gap(position: Floats, low: Floats, high: Floats) -> float:
-    """Return the distance of a place from a box, zero within."""
+    """Distance of a position from a box, zero within."""
     square = 0.0
     for axis in range(len(position)):
         gap = max(low[axis] - position[axis], position[axis] - high[axis], 0.0)

@@ -15,19 +15,12 @@ from d4orm_env.engine.compiling import compiled
 
 
 class Basis(NamedTuple):
-    """The basis of degree ``n`` over ``T`` steps: samples of a motion are ``position @ c``, ``c`` being ``(n+1, d)``.
+    """The basis of degree ``n`` over ``T`` steps: a motion with coefficients ``c`` ``(n+1, d)`` is ``position @ c``."""
 
-    Attributes:
-        position: ``(T, n+1)`` positions at steps 1 to T.
-        velocity: ``(T, n+1)`` [1/s].
-        acceleration: ``(T, n+1)`` [1/s^2].
-        jerk: ``(T, n+1)`` [1/s^3].
-    """
-
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    jerk: Floats
+    position: Floats  #: ``(T, n+1)`` positions at steps 1 to T
+    velocity: Floats  #: ``(T, n+1)`` [1/s]
+    acceleration: Floats  #: ``(T, n+1)`` [1/s^2]
+    jerk: Floats  #: ``(T, n+1)`` [1/s^3]
 
 
 def sample_basis(degree: int, steps: int, dt: float) -> Basis:
@@ -70,38 +63,25 @@ def _power(base: Floats, exponent: int) -> Floats:
 
 
 class Method(NamedTuple):
-    """Weights and limits of the alternation, with its basis.
+    """Weights and limits of the alternation, with its basis."""
 
-    Attributes:
-        position: ``(T, n+1)`` see :class:`Basis`.
-        velocity: ``(T, n+1)``.
-        acceleration: ``(T, n+1)``.
-        squares: ``(4, n+1, n+1)`` of the constraints on places, velocities and accelerations the sums of squares over
-            all steps, and the objective's.
-        goal: ``(n+1,)`` what the objective wants of the coefficients, per metre of goal.
-        barrier: Share ``gamma`` of its distance to a body's reach that a robot may use up in a step.
-        lookout: Bodies are minded that come this near to the reach [m].
-        penalty: First weight ``rho`` of the constraints.
-        growth: Factor by which it grows from one alternation to the next.
-        alternations: At most.
-        tolerance: Largest violation, and change of a place, at which it ends, in SI units.
-    """
-
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
+    position: Floats  #: ``(T, n+1)`` see :class:`Basis`
+    velocity: Floats  #: ``(T, n+1)``
+    acceleration: Floats  #: ``(T, n+1)``
+    #: ``(4, n+1, n+1)`` sums of squares over all steps: of the constraints on positions, velocities and accelerations,
+    #: and of the objective
     squares: Floats
-    goal: Floats
-    barrier: float
-    lookout: float
-    penalty: float
-    growth: float
-    alternations: int
-    tolerance: float
+    goal: Floats  #: ``(n+1,)`` what the objective wants of the coefficients, per metre of goal
+    barrier: float  #: Share ``gamma`` of its distance beyond the safety distance that a robot may use up in a step
+    lookout: float  #: Bodies are avoided that come within the safety distance and this [m]
+    penalty: float  #: First weight ``rho`` of the constraints
+    growth: float  #: Factor by which it grows from one alternation to the next
+    alternations: int  #: At most
+    tolerance: float  #: Largest violation, and change of a position, at which it ends, in SI units
 
 
 class Guess(NamedTuple):
-    """Samples of a motion at steps 1 to T, each ``(T, d)``: places [m], velocities [m/s], accelerations [m/s^2]."""
+    """Samples of a motion at steps 1 to T, each ``(T, d)``: positions [m], velocities [m/s], accelerations [m/s^2]."""
 
     position: Floats
     velocity: Floats
@@ -168,7 +148,7 @@ def solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
 
 @compiled
 def sample(method: Method, motion: Floats, guess: Guess) -> float:
-    """Make the guess the samples of a motion; return how far a place moved at most along an axis [m]."""
+    """Make the guess the samples of a motion; return the largest change of a position along an axis [m]."""
     (steps, size), d, change = method.position.shape, motion.shape[1], 0.0
     for step in range(steps):
         for axis in range(d):

@@ -166,14 +166,14 @@ class AMSwarmConfig(PlannerConfig):
         goal_steps: Steps at the end of a motion that are to be at the goal.
         goal_weight: Weight of their squared distances from it.
         smoothness: Weight of the squared jerk.
-        barrier: Share of its distance to a body's reach that a robot may use up in a step; 1 allows all of it.
-        lookout: Bodies are minded that are predicted to come this near to the reach; ``None`` minds all.
+        barrier: Share of its distance beyond the safety distance that a robot may use up in a step; 1 allows all of it.
+        lookout: Bodies are avoided that are predicted to come within the safety distance and this; ``None`` is all.
         clearance: Added to every distance to keep, for what is driven between the steps.
         perturbation: Largest perturbation of every guess, so that symmetric teams do not block themselves.
         penalty: First weight of the constraints.
         growth: Factor by which it grows from one alternation to the next.
         alternations: Of a replanning, at most.
-        tolerance: Largest violation, and change of a place, at which a replanning ends.
+        tolerance: Largest violation, and change of a position, at which a replanning ends.
     """
 
     max_iterations: Count = 20

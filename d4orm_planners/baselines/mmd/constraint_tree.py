@@ -1,4 +1,4 @@
-"""The search over conflicts: which robot plans again, and what it must keep clear of (CBS, ECBS, xECBS)."""
+"""Conflict-based search: the robot that plans again, and its constraints (CBS, ECBS, xECBS)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths.spaces import Space
 from d4orm_planners.baselines.mmd.guiding import PathSurroundings
 from d4orm_planners.baselines.mmd.path_frame import PathFrame
@@ -28,109 +25,69 @@ PADDING = 2
 """Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published."""
 
 
-@cached_kernel(variant="count", **OPTIONS)
-def count_conflicts(positions: Floats, others: Floats, distances: Floats, counts: IntArray) -> None:
-    """Fill ``counts`` ``(B, 2)`` int64 with how many others each of some paths conflicts with, and at how many steps.
+def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> IntArray:
+    """``(B, 2)`` numbers of other robots that each of some paths conflicts with, and of steps at which it does.
 
     Args:
         positions: ``(B, T, 3)`` the paths [m].
         others: ``(S, T, 3)`` where the others are [m].
         distances: ``(S,)`` to keep from each [m].
-        counts: Output.
     """
-    counts[:] = 0
-    for b in range(positions.shape[0]):
-        for other in range(others.shape[0]):
-            steps = 0
-            square = distances[other] * distances[other]
-            for t in range(positions.shape[1]):
-                dx = positions[b, t, 0] - others[other, t, 0]
-                dy = positions[b, t, 1] - others[other, t, 1]
-                dz = positions[b, t, 2] - others[other, t, 2]
-                if dx * dx + dy * dy + dz * dz <= square:
-                    steps += 1
-            if steps > 0:
-                counts[b, 0] += 1
-                counts[b, 1] += steps
+    steps = _too_near(positions[:, None] - others, distances[:, None]).sum(axis=2)
+    return np.stack([(steps > 0).sum(axis=1), steps.sum(axis=1)], axis=1)
 
 
-@cached_kernel(variant="first", **OPTIONS)
-def first_conflict(positions: Floats, distances: Floats) -> tuple[Whole, Whole, Whole, Whole]:
-    """``(pairs, step, robot, robot)``: how many pairs conflict, and the earliest conflict; robots are -1 if none does.
+def first_conflict(positions: Floats, distances: Floats) -> tuple[int, int, tuple[int, int]]:
+    """Number of pairs in conflict, and the step and the robots of the earliest conflict; robots are -1 for none.
 
     Args:
         positions: ``(K, T, 3)`` [m].
         distances: ``(K, K)`` to keep [m].
     """
-    robots, steps = positions.shape[0], positions.shape[1]
-    pairs, earliest, one, another = 0, steps, -1, -1
-    for k in range(1, robots):
-        for other in range(k):
-            square = distances[k, other] * distances[k, other]
-            for t in range(steps):
-                dx = positions[k, t, 0] - positions[other, t, 0]
-                dy = positions[k, t, 1] - positions[other, t, 1]
-                dz = positions[k, t, 2] - positions[other, t, 2]
-                if dx * dx + dy * dy + dz * dz <= square:
-                    pairs += 1
-                    if t < earliest:
-                        earliest, one, another = t, k, other
-                    break
-    return np.int64(pairs), np.int64(earliest), np.int64(one), np.int64(another)
+    one, other = np.tril_indices(len(positions), -1)
+    near = _too_near(positions[one] - positions[other], distances[one, other, None])
+    if not near.any():
+        return 0, positions.shape[1], (-1, -1)
+    step = int(near.any(axis=0).argmax())
+    pair = int(near[:, step].argmax())
+    return int(near.any(axis=1).sum()), step, (int(one[pair]), int(other[pair]))
+
+
+def _too_near(gaps: Floats, distances: Floats) -> BoolArray:
+    """Check which gaps ``(..., 3)`` are no longer than the distances to keep [m]."""
+    too_near: BoolArray = gaps[..., 0] ** 2 + gaps[..., 1] ** 2 + gaps[..., 2] ** 2 <= distances**2
+    return too_near
 
 
 class Constraint(NamedTuple):
-    """A sphere that one robot's centre has to be out of for some steps.
+    """A sphere that one robot's centre has to be out of for some steps."""
 
-    Attributes:
-        sphere: Centre and radius [m].
-        span: First and last step.
-    """
-
-    sphere: tuple[float, float, float, float]
-    span: tuple[int, int]
+    sphere: tuple[float, float, float, float]  #: Centre and radius [m]
+    span: tuple[int, int]  #: First and last step
 
 
 @dataclass(frozen=True, eq=False)
 class RobotMotion:
-    """Motion of one robot in a node of the tree.
+    """Motion of one robot in a node of the tree."""
 
-    Attributes:
-        motions: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with.
-        controls: ``(H, m)``.
-        positions: ``(H+1, 3)`` [m].
-        cost: Steps until it arrives.
-        fails: Whether it comes too near to an obstacle or does not arrive.
-    """
-
-    motions: FloatArray
-    controls: FloatArray
-    positions: Floats
-    cost: int
-    fails: bool
+    motions: FloatArray  #: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with
+    controls: FloatArray  #: ``(H, m)``
+    positions: Floats  #: ``(H+1, 3)`` [m]
+    cost: int  #: Steps until it arrives
+    fails: bool  #: Whether it comes too near to an obstacle or does not arrive
 
 
 @dataclass(frozen=True, order=True)
 class TreeNode:
-    """A node of the tree; the one to be expanded next is the least.
+    """A node of the tree; the one to be expanded next is the least."""
 
-    Attributes:
-        conflicts: Pairs in conflict, and robots that fail by themselves.
-        cost: Sum of the robots' steps until arrival.
-        number: Of the node, counted as they are made.
-        motions: Of the robots.
-        constraints: Of each robot.
-        pair: Two robots in conflict, or -1.
-        step: Of their conflict.
-    """
-
-    conflicts: int
-    cost: int
-    number: int
-    motions: tuple[RobotMotion, ...] = field(compare=False)
-    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)
-    pair: tuple[int, int] = field(compare=False)
-    step: int = field(compare=False)
+    conflicts: int  #: Pairs in conflict, and robots that fail by themselves
+    cost: int  #: Sum of the robots' steps until arrival
+    number: int  #: Of the node, counted as they are made
+    motions: tuple[RobotMotion, ...] = field(compare=False)  #: Of the robots
+    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)  #: Of each robot
+    pair: tuple[int, int] = field(compare=False)  #: Two robots in conflict, or -1
+    step: int = field(compare=False)  #: Of their conflict
 
     @property
     def controls(self) -> FloatArray:
@@ -179,32 +136,32 @@ class Planning:
     ) -> TreeNode:
         """A node with its conflicts counted and the first one found."""
         positions = np.stack([motion.positions for motion in motions])
-        pairs, step, one, another = first_conflict(positions, self._distances)
+        pairs, step, pair = first_conflict(positions, self._distances)
         failing = sum(motion.fails for motion in motions)
         cost = sum(motion.cost for motion in motions)
-        return TreeNode(int(pairs) + failing, cost, number, motions, constraints, (int(one), int(another)), int(step))
+        return TreeNode(pairs + failing, cost, number, motions, constraints, pair, step)
 
     def children(self, node: TreeNode, number: int, seeds: list[int], unlucky: int) -> list[TreeNode]:
         """Return a node's children: for each of two robots in conflict, one in which it keeps clear of where they met.
 
-        In a node without a pair in conflict a robot that fails plans anew, or if none does, ``unlucky``.
+        In a node without a pair in conflict a robot that fails plans from noise, or if none does, ``unlucky``.
         """
         one, another = node.pair
         if one < 0:
             failing = [robot for robot, motion in enumerate(node.motions) if motion.fails]
             robot = failing[0] if failing else unlucky
-            return [self._child(node, number, robot, node.constraints[robot], seeds[0], anew=True)]
+            return [self._child(node, number, robot, node.constraints[robot], seeds[0], from_noise=True)]
         added = []
         for count, (robot, other) in enumerate(((one, another), (another, one))):
             own = (*node.constraints[robot], self._constraint(node, robot, other))
-            added.append(self._child(node, number + count, robot, own, seeds[count], anew=False))
+            added.append(self._child(node, number + count, robot, own, seeds[count], from_noise=False))
         return added
 
     def _child(
-        self, node: TreeNode, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, anew: bool
+        self, node: TreeNode, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, from_noise: bool
     ) -> TreeNode:
         others = [other for other in range(len(node.motions)) if other != robot]
-        before = None if anew or self._config.reuse_steps is None else node.motions[robot].motions
+        before = None if from_noise or self._config.reuse_steps is None else node.motions[robot].motions
         motion = self._plan(robot, list(node.motions), others, own, seed, before)
         motions = tuple(motion if k == robot else kept for k, kept in enumerate(node.motions))
         constraints = tuple(own if k == robot else kept for k, kept in enumerate(node.constraints))
@@ -249,9 +206,7 @@ class Planning:
 
     def _choose(self, batch: Batch, paths: Floats, distances: Floats, safety_distance: float) -> RobotMotion:
         driven = batch.driven
-        counts: NDArray[np.int64] = np.zeros((len(batch.motions), 2), np.int64)
-        if len(paths):
-            count_conflicts(driven.positions, paths, distances, counts)
+        counts = count_conflicts(driven.positions, paths, distances)
         fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < safety_distance + self._slack)
         best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
         controls, positions = driven.controls[best].copy(), driven.positions[best].copy()

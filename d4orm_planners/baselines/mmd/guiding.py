@@ -1,4 +1,4 @@
-"""Guidance: what pushes motions out of obstacles, constraints and other robots' paths while they are denoised.
+"""Guidance of motions out of obstacles, constraints and other robots' paths while they are denoised.
 
 Every step of guidance goes once along the motion. Where a point violates something, the motion's modes are changed by
 as little as it takes, measured by their deviation among the examples: a gradient step on one point's hinge loss in the
@@ -28,34 +28,22 @@ the rest."""
 
 
 class PathSurroundings(NamedTuple):
-    """Constraints on a robot's motion.
+    """Constraints on a robot's motion."""
 
-    Attributes:
-        space: The world.
-        clearance: Distance from obstacles to keep with the robot's centre [m].
-        size: Radius of the largest robot [m].
-        dt: Of the steps [s].
-        spheres: ``(C, 4)`` centre and radius of hard constraints [m].
-        spans: ``(C, 2)`` int64 first and last step of each.
-        others: ``(S, T, 3)`` where other robots are at every step [m].
-        radii: ``(S,)`` distance to keep from each [m].
-        pull: Share of a soft violation that a step takes away; of hard ones it takes away all.
-    """
-
-    space: Space
-    clearance: float
-    size: float
-    dt: float
-    spheres: Floats
-    spans: IntArray
-    others: Floats
-    radii: Floats
-    pull: float
+    space: Space  #: The world
+    clearance: float  #: Distance from obstacles to keep with the robot's centre [m]
+    size: float  #: Radius of the largest robot [m]
+    dt: float  #: Of the steps [s]
+    spheres: Floats  #: ``(C, 4)`` centre and radius of hard constraints [m]
+    spans: IntArray  #: ``(C, 2)`` int64 first and last step of each
+    others: Floats  #: ``(S, T, 3)`` where other robots are at every step [m]
+    radii: Floats  #: ``(S,)`` distance to keep from each [m]
+    pull: float  #: Share of a soft violation that a step takes away; of hard ones it takes away all
 
 
 @register_jitable(nogil=True, **OPTIONS)
 def _point_variance(sines: Floats, deviation: Floats) -> Floats:
-    """``(N + 1, 2)`` how much each point varies among the examples, ahead and aside."""
+    """``(N + 1, 2)`` variances of each point among the examples, ahead and aside."""
     points, modes = sines.shape
     variance = np.zeros((points, 2))
     for i in range(points):
@@ -118,7 +106,7 @@ def guide(
 
 @compiled
 def _violation(surroundings: PathSurroundings, step: Whole, spot: Floats, push: Floats) -> bool:
-    """Fill ``push`` ``(3,)`` with what would end a place's violations at a step [m]; whether there are any."""
+    """Fill ``push`` ``(3,)`` with what would end a position's violations at a step [m]; whether there are any."""
     push[:] = 0.0
     position, aside = spot[0], spot[2]
     violated = False
@@ -135,7 +123,7 @@ def _violation(surroundings: PathSurroundings, step: Whole, spot: Floats, push: 
 
 @compiled
 def _push_clear(space: Space, clearance: float, probe: float, spot: Floats, push: Floats) -> bool:
-    """Add to ``push`` what brings a place out of obstacles, on the side where the path is; whether it is too near."""
+    """Add to ``push`` what brings a position out of obstacles on the side of the path; whether it is too near."""
     x, y, z = spot[0, 0], spot[0, 1], spot[0, 2]
     missing = clearance - clearance_at(space, x, y, z)
     if not missing > 0.0:
@@ -159,7 +147,7 @@ def _push_clear(space: Space, clearance: float, probe: float, spot: Floats, push
 
 @compiled
 def _push_out(centre: Floats, radius: float, share: float, aside: Floats, position: Floats, push: Floats) -> bool:
-    """Add to ``push`` that share of what brings a place out of a sphere; whether it is in it."""
+    """Add to ``push`` that share of what brings a position out of a sphere; whether it is in it."""
     dx, dy, dz = position[0] - centre[0], position[1] - centre[1], position[2] - centre[2]
     square = dx * dx + dy * dy + dz * dz
     if not square < radius * radius or share == 0.0:

@@ -1,7 +1,7 @@
-"""The frame in which a robot's motion is described: its shortest path, and how much room there is beside it.
+"""The frame in which a robot's motion is described: its shortest path, and the clearance on both sides of it.
 
 The model never sees a map. It learns how motions differ from the shortest path driven at an even pace, in lengths of
-that path: how far ahead or behind they are on it, and how far beside it. So one model serves all maps, sizes and
+that path: how far ahead or behind on it, and how far to its side. So one model serves all maps, sizes and
 directions, and a robot that waits or hurries stays on its path.
 """
 
@@ -24,7 +24,7 @@ POINTS = 64
 MODES = 16
 """Sines that a difference from the path is made of."""
 LOOKS = 16
-"""Places along the path at which the model is told of the path and of the room beside it."""
+"""Points along the path at which the model gets the path and the clearances on both sides of it."""
 FEATURES = 5 * LOOKS + 2
 """Numbers that the model is told."""
 _ROUNDING = 2
@@ -32,34 +32,23 @@ _ROUNDING = 2
 _ANY = 1e6
 """Rate at which robots that take any velocity at once could reach their full speed [1/s]."""
 _FAR = 4.0
-"""Largest room that the model is told of, in robots' reach."""
+"""Largest clearance that the model is told of, in safety distances."""
 
 
 class PathFrame(NamedTuple):
-    """A robot's path and the axes in which its motion is described; all float64.
+    """A robot's path and the axes in which its motion is described; all float64."""
 
-    Attributes:
-        reference: ``(POINTS + 1, 3)`` places on the shortest path at equal distances, from start to goal [m].
-        tangents: ``(POINTS + 1, 3)`` its direction at each, corners rounded; of at most unit length.
-        axes: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four
-            across the line from start to goal in space.
-        length: Of the path, at least the goal's radius [m].
-        safety_distance: The distance that the robot's centre keeps from obstacles [m].
-        speed: Limit of the robot [m/s].
-        acceleration: Limit of the robot; for one without inertia, a very large one [m/s^2].
-        quickest: Time that the path takes at full speed from rest [s].
-        features: ``(P, FEATURES)`` what the model is told, per axis.
-    """
-
-    reference: Floats
-    tangents: Floats
+    reference: Floats  #: ``(POINTS + 1, 3)`` positions on the shortest path at equal distances, from start to goal [m]
+    tangents: Floats  #: ``(POINTS + 1, 3)`` its direction at each, corners rounded; of at most unit length
+    #: ``(P, 3)`` unit vectors about which directions turn to the side: up and down in the plane, and any four across
+    #: the line from start to goal in space
     axes: Floats
-    length: float
-    safety_distance: float
-    speed: float
-    acceleration: float
-    quickest: float
-    features: FloatArray
+    length: float  #: Of the path, at least the goal's radius [m]
+    safety_distance: float  #: The distance that the robot's centre keeps from obstacles [m]
+    speed: float  #: Limit of the robot [m/s]
+    acceleration: float  #: Limit of the robot; for one without inertia, a very large one [m/s^2]
+    quickest: float  #: Time that the path takes at full speed from rest [s]
+    features: FloatArray  #: ``(P, FEATURES)`` what the model is told, per axis
 
 
 def sine_table() -> Floats:
@@ -110,10 +99,8 @@ def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> Path
     path[:, : problem.dimension] = corners
     reference = np.empty((POINTS + 1, 3))
     length = max(resample(path, reference), problem.goal_radius)
-    limits, safety_distance = (
-        problem.team.limits[robot].astype(np.float64),
-        float(problem.team.radius[robot]) + problem.margin,
-    )
+    limits = problem.team.limits[robot].astype(np.float64)
+    safety_distance = float(problem.team.radius[robot]) + problem.margin
     speed = float(limits[SPEED])
     acceleration = float(limits[ACCELERATION]) if problem.team.robot_models[robot].speed_indices else _ANY * speed
     tangents = np.empty_like(reference)
@@ -193,7 +180,7 @@ def round_tangents(reference: Floats, tangents: Floats) -> None:
 def locate(
     frame: PathFrame, axis: Floats, sines: Floats, deviation: Floats, motion: FloatArray, i: int, spot: Floats
 ) -> None:
-    """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its place on the way [m].
+    """Fill ``spot`` ``(4, 3)``: a motion's point [m], directions ahead and aside there, its point on the path [m].
 
     Args:
         frame: The robot's path.

@@ -78,7 +78,7 @@ class MMD(Planner):
     config: MMDConfig
 
     def iterate(self, search: SolveRun, state: Tree | NoPaths | None) -> tuple[Tree | NoPaths, Iteration]:
-        """See :meth:`Planner.iterate`: everybody's motion at first, then an expansion of the best node."""
+        """See :meth:`Planner.iterate`: all robots' motions at first, then an expansion of the best node."""
         if state is None:
             with search.watch.paused():
                 compile_mmd(search.problem)

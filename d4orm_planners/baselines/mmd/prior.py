@@ -1,4 +1,4 @@
-"""The trained diffusion model: a small network that tells the clean motion in a noisy one, evaluated in a fixed order.
+"""The trained diffusion model: a small network that predicts the clean motion in a noisy one, in a fixed order.
 
 The network is a residual multilayer perceptron over the modes of a motion, whitened by their deviation among the
 examples. Its sums run in the order in which they are written, so that a seed has the same plan on every processor.
@@ -40,31 +40,18 @@ _END = 0.98
 
 
 class Prior(NamedTuple):
-    """The network's weights, all float32, and what whitens motions.
+    """The network's weights, all float32, and what whitens motions."""
 
-    Attributes:
-        deviation: ``(SIZE,)`` of the modes among the examples, in lengths of the path.
-        features_mean: ``(FEATURES,)``.
-        features_deviation: ``(FEATURES,)``.
-        into: ``(SIZE + LEVELS, W)`` from motion and noise level to the first layer.
-        context: ``(FEATURES, W)`` from the features to the first layer.
-        into_bias: ``(W,)``.
-        hidden: ``(L, W, W)``.
-        hidden_bias: ``(L, W)``.
-        out: ``(W, SIZE)``.
-        out_bias: ``(SIZE,)``.
-    """
-
-    deviation: FloatArray
-    features_mean: FloatArray
-    features_deviation: FloatArray
-    into: FloatArray
-    context: FloatArray
-    into_bias: FloatArray
-    hidden: FloatArray
-    hidden_bias: FloatArray
-    out: FloatArray
-    out_bias: FloatArray
+    deviation: FloatArray  #: ``(SIZE,)`` of the modes among the examples, in lengths of the path
+    features_mean: FloatArray  #: ``(FEATURES,)``
+    features_deviation: FloatArray  #: ``(FEATURES,)``
+    into: FloatArray  #: ``(SIZE + LEVELS, W)`` from motion and noise level to the first layer
+    context: FloatArray  #: ``(FEATURES, W)`` from the features to the first layer
+    into_bias: FloatArray  #: ``(W,)``
+    hidden: FloatArray  #: ``(L, W, W)``
+    hidden_bias: FloatArray  #: ``(L, W)``
+    out: FloatArray  #: ``(W, SIZE)``
+    out_bias: FloatArray  #: ``(SIZE,)``
 
 
 @cache
@@ -171,19 +158,12 @@ def predict(
 
 @dataclass(frozen=True)
 class Batch:
-    """Motions of one robot that were denoised together.
+    """Motions of one robot that were denoised together."""
 
-    Attributes:
-        motions: ``(B, SIZE)`` float32 whitened modes.
-        durations: ``(B,)`` how long each takes [s].
-        driven: Rollouts along them.
-        steps: Denoising steps that it took.
-    """
-
-    motions: FloatArray
-    durations: Floats
-    driven: TrackedMotions
-    steps: int
+    motions: FloatArray  #: ``(B, SIZE)`` float32 whitened modes
+    durations: Floats  #: ``(B,)`` how long each takes [s]
+    driven: TrackedMotions  #: Rollouts along them
+    steps: int  #: Denoising steps that it took
 
 
 class Denoiser:
@@ -257,15 +237,13 @@ class _Draws:
         self._call = 0
 
     def normals(self, shape: tuple[int, ...]) -> FloatArray:
-        numbers = np.empty((1, int(np.prod(shape))), np.float32)
-        draw_normals(self._keys, np.zeros(1, np.int64), np.uint32(0), np.uint32(self._next()), numbers)
-        return numbers.reshape(shape)
+        return self._drawn(draw_normals, shape)
 
     def uniforms(self, count: int) -> FloatArray:
-        numbers = np.empty((1, count), np.float32)
-        draw_uniforms(self._keys, np.zeros(1, np.int64), np.uint32(0), np.uint32(self._next()), numbers)
-        return numbers[0]
+        return self._drawn(draw_uniforms, (count,))
 
-    def _next(self) -> int:
+    def _drawn(self, draw: Callable[..., None], shape: tuple[int, ...]) -> FloatArray:
         self._call += 1
-        return self._call
+        numbers = np.empty((1, int(np.prod(shape))), np.float32)
+        draw(self._keys, np.zeros(1, np.int64), np.uint32(0), np.uint32(self._call), numbers)
+        return numbers.reshape(shape)

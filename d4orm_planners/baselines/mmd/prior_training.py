@@ -1,6 +1,4 @@
-"""Training of the diffusion model: its training set, plans of single robots among things that it is not told of, and
-the network.
-"""
+"""Training of the diffusion model on plans of single robots among obstacles that it does not observe."""
 
 from __future__ import annotations
 
@@ -51,15 +49,10 @@ _LEAST = 1e-4
 
 
 class Examples(NamedTuple):
-    """Motions and what the model is told of them.
+    """Motions and what the model is told of them."""
 
-    Attributes:
-        features: ``(E, FEATURES)`` float32.
-        modes: ``(E, 2, MODES)`` float32 differences from the path, ahead and aside, in lengths of the path.
-    """
-
-    features: FloatArray
-    modes: FloatArray
+    features: FloatArray  #: ``(E, FEATURES)`` float32
+    modes: FloatArray  #: ``(E, 2, MODES)`` float32 differences from the path, ahead and aside, in lengths of the path
 
 
 def draw_examples(count: int, seed: int, progress: Callable[[int], object] = lambda done: None) -> Examples:
@@ -102,7 +95,7 @@ def modes_of(frame: PathFrame, positions: Floats) -> Floats:
 
 
 def _motions(seed: int) -> Iterator[tuple[PathFrame, Floats]]:
-    """Frames and ``(POINTS + 1, 3)`` places at equal times from start to arrival."""
+    """Frames and ``(POINTS + 1, 3)`` positions at equal times from start to arrival."""
     random, number = np.random.default_rng(seed), seed
     while True:
         kind, settings = KINDS[number % len(KINDS)]
@@ -140,7 +133,7 @@ def _with_phantoms(problem: Problem, frame: PathFrame, random: np.random.Generat
 
 
 def _evenly(positions: FloatArray, arrival: int) -> Floats:
-    """``(POINTS + 1, 3)`` where a robot was at equal times, interpolated."""
+    """``(POINTS + 1, 3)`` positions of a robot at equal times, interpolated."""
     times = np.linspace(0, arrival, POINTS + 1)
     points = np.zeros((POINTS + 1, 3))
     for axis in range(2):
@@ -160,7 +153,7 @@ class DenoisingNetwork(nn.Module):
         nn.init.zeros_(self.out.weight)
 
     def forward(self, noisy: Tensor, level: Tensor, features: Tensor) -> Tensor:
-        """Return what is to be added to ``sqrt(alpha_bar)`` times the noisy motion, over ``sqrt(1 - alpha_bar)``."""
+        """The term added to ``sqrt(alpha_bar)`` times the noisy motion, over ``sqrt(1 - alpha_bar)``."""
         layer = torch.relu(self.into(torch.cat([noisy, level], dim=1)) + self.context(features))
         for hidden in self.hidden:
             layer = layer + torch.relu(hidden(layer))

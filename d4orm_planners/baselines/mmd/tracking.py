@@ -67,21 +67,13 @@ def fill_clock(
 
 
 class TrackedMotions(NamedTuple):
-    """Rollouts along ``B`` motions.
+    """Rollouts along ``B`` motions."""
 
-    Attributes:
-        controls: ``(B, H, m)`` float32, zero once docked.
-        states: ``(B, H+1, n)`` float32, from the first step on.
-        positions: ``(B, H+1, 3)`` [m].
-        arrivals: ``(B,)`` int64 the step of arrival; ``H + 1`` for none.
-        clearances: ``(B,)`` least distance of the centre from obstacles and bounds [m].
-    """
-
-    controls: FloatArray
-    states: FloatArray
-    positions: Floats
-    arrivals: IntArray
-    clearances: Floats
+    controls: FloatArray  #: ``(B, H, m)`` float32, zero after arrival
+    states: FloatArray  #: ``(B, H+1, n)`` float32, from the first step on
+    positions: Floats  #: ``(B, H+1, 3)`` [m]
+    arrivals: IntArray  #: ``(B,)`` int64 the step of arrival; ``H + 1`` for none
+    clearances: Floats  #: ``(B,)`` least distance of the centre from obstacles and bounds [m]
 
 
 def _motion_follower(model: Model) -> Callable[..., int]:

@@ -1,4 +1,4 @@
-"""Work beside the control loop: a job at a time in a thread of its own."""
+"""Background work of a controller: a job at a time in a thread of its own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Generic, TypeVar
 
 Result = TypeVar("Result")
@@ -25,13 +25,15 @@ class Background(Generic[Result]):
         self._pool: ThreadPoolExecutor | None = None
         self._job: Future[Result] | None = None
 
-    def start(self, work: Callable[[], Result]) -> None:
+    def start(self, work: Callable[[], Result]) -> Future[Result]:
+        """Begin a job."""
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, thread_name_prefix="d4orm-c2f", initializer=self._initializer)
+            self._pool = ThreadPoolExecutor(1, thread_name_prefix="background", initializer=self._initializer)
         self._job = self._pool.submit(work)
+        return self._job
 
     def result(self) -> tuple[bool, Result | None]:
-        """Return whether nothing is under way, and the last job's result, once."""
+        """True if no job is under way, and the result of the last one, which is given once."""
         if self._job is None:
             return True, None
         if not self._job.done():
@@ -39,25 +41,30 @@ class Background(Generic[Result]):
         job, self._job = self._job, None
         return True, job.result()
 
-    def run(self, work: Callable[[], Result], timeout: float) -> Result | None:
-        """Return the result of the work within the time [s], or ``None``. What is late goes on, and is thrown away."""
+    def run(self, work: Callable[[], Result], timeout: float | None) -> Result | None:
+        """The result of the work, or ``None`` if it takes longer than the timeout [s]; without one it is waited for.
+
+        Late work goes on, and its result is thrown away. No other work begins before it is done.
+        """
+        if timeout is None:
+            return work()
         end = time.perf_counter() + timeout
-        if timeout <= 0:
+        if timeout <= 0 or (self._job is not None and not wait([self._job], timeout).done):
             return None
-        try:
-            if self._job is not None:
-                self._job.result(timeout)
-            self.start(work)
-            assert self._job is not None
-            return self._job.result(max(end - time.perf_counter(), 0))
-        except TimeoutError:
-            return None
+        self.result()  # an error of late work must not get lost
+        wait([self.start(work)], max(end - time.perf_counter(), 0))
+        return self.result()[1]
 
     def forget(self) -> None:
         """Wait for what is under way and throw it away."""
         if self._job is not None:
             self._job.exception()
             self._job = None
+
+    def close(self) -> None:
+        """End the thread as soon as its job is done."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _yield_to_others() -> None:
