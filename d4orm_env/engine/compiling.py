@@ -1,4 +1,4 @@
-"""Compilation of kernels, and of the functions of :mod:`d4orm_env.core` that they may call."""
+"""Compilation of kernels, and of the plain Python functions of the physics that they may call."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ for _function in (
     collision.meets_triangle,
     transition.step_reward,
 ):
-    # Lets compiled code call the core's plain Python functions, which stay as they are for everyone else.
+    # Compiled code may call these, which stay plain Python functions for all other callers.
     register_jitable(**INLINED)(_function)
 
 to_fixed_tuple: Callable[..., tuple[np.float32, ...]] = ndarray.to_fixed_tuple

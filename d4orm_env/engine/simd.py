@@ -20,6 +20,7 @@ from numba.core.base import BaseContext
 from numba.core.types import Type, boolean, float32, int64, uint64, void
 from numba.core.typing.context import BaseContext as TypingContext
 from numba.core.typing.templates import Signature
+from numba.cpython.unsafe import numbers
 
 Generator: TypeAlias = Callable[[BaseContext, IRBuilder, Signature, tuple[Value, ...]], Value]
 """Writer of a function's instructions."""
@@ -28,6 +29,9 @@ Instructions: TypeAlias = tuple[Signature, Generator]
 
 intrinsic: Callable[[Callable[..., Instructions]], Callable[..., Any]] = extending.intrinsic
 """Decorator; compiled code calls the result with numbers and arrays instead of types, without the first argument."""
+
+trailing_zeros: Callable[..., int] = numbers.trailing_zeros
+"""Number of the lowest bit that is set; likewise called without the first argument."""
 
 TILE = 64
 """Worlds per tile, as many as a mask has bits."""
@@ -43,6 +47,7 @@ BOX = 2 * (TILE + CHUNK)
 
 NOWHERE = np.uint64(0)
 """The mask of what holds in no world."""
+BIT = np.uint64(1)
 
 _FLOATS = ir.VectorType(ir.FloatType(), CHUNK)
 _FLAGS = ir.VectorType(ir.IntType(1), CHUNK)
@@ -118,14 +123,14 @@ def _instructions(result: Type, *kinds: Type | None) -> Callable[[Callable[[_Wri
 
 
 def _within(dimension: int, count: int) -> Callable[..., np.uint64]:
-    """``(w, a, b, squared_radius_sum) -> mask``: where the positions in the rows from ``w[a]`` and ``w[b]`` on are
+    """``(w, a, b, squared_distance) -> mask``: where the positions in the rows from ``w[a]`` and ``w[b]`` on are
     near, in the first ``count`` worlds.
     """
 
     @_instructions(uint64, _ARRAY, int64, int64, float32)
     def within(writer: _Writer) -> Value:
-        _, a, b, squared_radius_sum = writer.arguments
-        bound = writer.splat(squared_radius_sum)
+        _, a, b, squared_distance = writer.arguments
+        bound = writer.splat(squared_distance)
 
         def near(first: int) -> Value:
             total = None

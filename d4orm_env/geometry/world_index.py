@@ -1,4 +1,4 @@
-"""Index of the obstacles: a grid that tells for any point which of them can be nearest, however many there are.
+"""Index of the obstacles: a grid with those that can be nearest to any point, however many there are.
 
 Every cell keeps the clearance at its centre and the obstacles that are nearest to some point in it. Clearance changes
 by no more than the distance between two points (it is 1-Lipschitz), so what it is at the centre decides nearly every
