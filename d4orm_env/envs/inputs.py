@@ -53,7 +53,7 @@ def checked_states(
 
 
 def usable(actions: FloatArray) -> BoolArray:
-    """Return where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
+    """Flags of actions that are finite, and at most :data:`MAX_ACTION` in magnitude."""
     return np.abs(actions) <= MAX_ACTION
 
 
