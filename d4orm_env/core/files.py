@@ -107,12 +107,12 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
 
 
 def claim_folder(path: Path, identity: Mapping[str, object], kind: str) -> None:
-    """Write down what a folder is for, or find out whether it is one for the same.
+    """Write the purpose of a folder to a JSON file in it, or check that it is the same.
 
     Args:
-        path: The JSON file in it that says so.
+        path: The file.
         identity: All that must be the same.
-        kind: What the folder holds, as ``"a training"``.
+        kind: Content of the folder for messages, as ``"a training"``.
 
     Raises:
         ValueError: If it is for something else, or does not say.

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numba.core import compiler
 from numba.core.codegen import JITCodeLibrary
+from numba.cpython.unsafe import numbers
 from numba.extending import register_jitable
 from numba.np.unsafe import ndarray
 
@@ -116,6 +117,8 @@ for _function in (
 
 to_fixed_tuple: Callable[..., tuple[np.float32, ...]] = ndarray.to_fixed_tuple
 """Its calls in compiled code lack the first argument, which type checkers cannot know."""
+trailing_zeros: Callable[..., int] = numbers.trailing_zeros
+"""Number of the lowest bit that is set; likewise."""
 
 
 @register_jitable(nogil=True, **OPTIONS)

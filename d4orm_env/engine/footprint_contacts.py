@@ -12,7 +12,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, trailing_zeros
 from d4orm_env.engine.convex_cores import (
     CORNERS,
     ball_meets_box,
@@ -26,7 +26,7 @@ from d4orm_env.engine.convex_cores import (
 )
 from d4orm_env.engine.elementary import cosine, sine
 from d4orm_env.engine.obstacles import cell_at
-from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, trailing_zeros, use_wide_registers
+from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, use_wide_registers
 
 POSE = 4
 """Rows of a body's pose."""
@@ -237,21 +237,6 @@ def _leaves_bounds(
 
 
 @compiled
-def _any_leaves_bounds(
-    f: FootprintArrays, bounds: FloatArray, k: Whole, position: tuple[np.float32, np.float32, np.float32],
-    poses: FloatArray, stride: int, begin: Whole, extra: np.float32, core: FloatArray,
-) -> bool:  # fmt: skip
-    i = np.int64(k)
-    while i >= 0:
-        if bounds.shape[1] == 2:
-            _place_own(f, i, poses, stride, begin, core)
-        if _leaves_bounds(f, bounds, i, position, extra, core):
-            return True
-        i = np.int64(f.following[i])
-    return False
-
-
-@compiled
 def _is_beyond(boxes: FloatArray, i: Whole, distance: np.float32, x: np.float32, y: np.float32) -> bool:
     """Check whether a rounded box of the plane is farther from a position than ``distance``."""
     gap_x, gap_y = max(boxes[i, 0] - x, x - boxes[i, 2], ZERO), max(boxes[i, 1] - y, y - boxes[i, 3], ZERO)
@@ -265,9 +250,13 @@ def touches_static(
     poses: FloatArray, stride: int, begin: Whole, extra: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
     """Check whether robot ``k`` at this position comes within ``extra`` of an obstacle or a bound."""
-    index, dimension = arrays.grid, arrays.goal.shape[1]
-    if _any_leaves_bounds(f, arrays.bounds, k, position, poses, stride, begin, extra, buffer[:TILE]):
-        return True
+    index, dimension, i = arrays.grid, arrays.goal.shape[1], np.int64(k)
+    while i >= 0:
+        if dimension == 2:
+            _place_own(f, i, poses, stride, begin, buffer[:TILE])
+        if _leaves_bounds(f, arrays.bounds, i, position, extra, buffer[:TILE]):
+            return True
+        i = np.int64(f.following[i])
     if index.clearance.shape[0] == 0:
         return False
     cell, (x, y, z) = cell_at(index, position, dimension), position

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import collision
-from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple, trailing_zeros
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, at_most, trailing_zeros, use_wide_registers
+from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, at_most, use_wide_registers
 from d4orm_env.geometry.world_index import WorldIndex
 
 _HALF = np.float32(0.5)

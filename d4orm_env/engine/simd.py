@@ -20,7 +20,6 @@ from numba.core.base import BaseContext
 from numba.core.types import Type, boolean, float32, int64, uint64, void
 from numba.core.typing.context import BaseContext as TypingContext
 from numba.core.typing.templates import Signature
-from numba.cpython.unsafe import numbers
 
 Generator: TypeAlias = Callable[[BaseContext, IRBuilder, Signature, tuple[Value, ...]], Value]
 """Writer of a function's instructions."""
@@ -29,9 +28,6 @@ Instructions: TypeAlias = tuple[Signature, Generator]
 
 intrinsic: Callable[[Callable[..., Instructions]], Callable[..., Any]] = extending.intrinsic
 """Decorator; compiled code calls the result with numbers and arrays instead of types, without the first argument."""
-
-trailing_zeros: Callable[..., int] = numbers.trailing_zeros
-"""Number of the lowest bit that is set; likewise called without the first argument."""
 
 TILE = 64
 """Worlds per tile, as many as a mask has bits."""

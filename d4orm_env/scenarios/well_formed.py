@@ -46,12 +46,9 @@ TRIES, ROUNDS = 200, 3
 
 
 class _FreeRegion:
-    """Positions taken one by one from a region, the rest of which stays connected and in touch with each of them.
+    """Positions, ``most`` of them, taken from a region, the rest of which stays connected and in touch with each.
 
-    Args:
-        inside: The region.
-        separation: Distance of robots that pass by from a position, in steps of the lattice.
-        most: Number of positions there will be.
+    Robots that pass by keep the ``separation`` to a position, in steps of the lattice.
     """
 
     def __init__(self, inside: Mask, separation: float, most: int) -> None:
@@ -162,14 +159,9 @@ def populate(
 ) -> Problem:
     """The problem of a team at random positions in a world with walls, at which robots leave all others a path.
 
-    Args:
-        settings: The common arguments; random obstacles are placed before the robots.
-        world: Walls and bounds.
-        step: Of the lattice that positions are drawn from [m].
-        travel: The distance the horizon is made for [m].
-        remedy: Remedy where the robots do not fit.
-        exchange: Half of the robots start at an x below the first of them and end above the second [m], the others the
-            other way round; everywhere by default.
+    Positions are drawn from a lattice of this ``step`` [m], after random obstacles; ``travel`` is the distance that the
+    horizon is made for [m], and ``remedy`` ends the error where the robots do not fit. With ``exchange`` half of the
+    robots start at an x below the first value and end above the second [m], the others the other way round.
     """
     world = with_obstacles(settings, world)
     starts, goals = draw_team(settings, free_space(world, safety_distance_of(settings), step), remedy, exchange)
