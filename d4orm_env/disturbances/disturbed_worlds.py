@@ -181,9 +181,12 @@ class DisturbedWorlds:
             memory = one.memory if worlds is None else one.memory_of(worlds)
             draws = self._draws(one, scene, _Purpose.SEE)
             draws = draws if worlds is None else draws.of(worlds)
-            changed = one.disturbance.see(seen, memory, part, draws)
-            parts = zip(changed, seen, strict=True)
-            seen = Observed(*(_checked(values, before.shape, one, "see") for values, before in parts))
+            states, controls, bodies = one.disturbance.see(seen, memory, part, draws)
+            seen = Observed(
+                _checked(states, seen.states.shape, one, "see"),
+                _checked(controls, seen.controls.shape, one, "see"),
+                _checked(bodies, seen.bodies.shape, one, "see"),
+            )
             if worlds is not None:
                 one.remember(memory, worlds)
         return seen
