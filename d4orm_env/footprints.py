@@ -1,4 +1,4 @@
-"""Footprints of robots: what of the plane, or of space, a robot covers round its reference point.
+"""Footprints of robots: the part of the plane, or of space, that a robot covers round its reference point.
 
 A planar footprint is a convex core, a point, a segment or a polygon, widened by a rounding radius. It turns with the
 heading of the robot; a robot without a heading keeps it along x. All lengths are metres, in the robot's frame.
@@ -39,7 +39,7 @@ class Core(NamedTuple):
 
     @property
     def axes(self) -> tuple[Floats, Floats]:
-        """``(m, 2)`` unit vectors along which two cores can be told apart, and how far the core reaches along each.
+        """``(m, 2)`` unit vectors along which cores are tested for a gap, and how far the core extends along each.
 
         Those of a polygon are normal to its edges, outward; a segment has its ends' too, a point has none.
         """
@@ -75,13 +75,11 @@ class Footprint(ABC):
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
-            if name == "offset":
-                if not (isinstance(value, int | float) and abs(value) <= LARGEST):
-                    raise ValueError(
-                        f"offset of {type(self).__name__} must be a number of metres, not {short_repr(value)}"
-                    )
-                continue
-            positive_number(value, f"{name} of {type(self).__name__}", least=SMALLEST, most=LARGEST)
+            title = f"{name} of {type(self).__name__}"
+            if name != "offset":
+                positive_number(value, title, least=SMALLEST, most=LARGEST)
+            elif not (isinstance(value, int | float) and abs(value) <= LARGEST):
+                raise ValueError(f"{title} must be a number of metres, not {short_repr(value)}")
 
 
 @dataclass(frozen=True)
@@ -281,7 +279,7 @@ class Train(Footprint):
 
     @property
     def outer_radius(self) -> float:
-        """That of the front; see :attr:`Team.radius` for how far trailers reach."""
+        """That of the front; :attr:`Team.radius` includes the trailers."""
         return self.front.outer_radius
 
     @property

@@ -25,8 +25,6 @@ from d4orm_env.scenarios.problems import ScenarioLike
 
 __all__ = ["env", "parallel_env", "raw_env"]
 
-_OPTIONS_OF_CONFORMANCE_TESTS = ("options",)  # PettingZoo's API tests send options={"options": 1}
-
 
 class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
     """All robots act at once.
@@ -38,8 +36,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all others.
         num_robots: Size of the team.
         **options: Further attributes of :class:`~d4orm_env.envs.options.EnvOptions`, and arguments of the scenario,
-        such as
-            ``model`` or ``seed``. ``max_cycles`` may be assigned later too.
+            such as ``model`` or ``seed``. ``max_cycles`` may be assigned later too.
 
     Raises:
         TypeError: For an argument that neither the environment nor the scenario has.
@@ -114,7 +111,7 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         Raises:
             ValueError: For any option.
         """
-        check_options(options, ignored=_OPTIONS_OF_CONFORMANCE_TESTS)
+        check_options(options, ignored=("options",))  # PettingZoo's API tests send options={"options": 1}
         if seed is not None:
             self._np_random = seeding.np_random(whole_number(seed, "seed", 0))[0]
         step = self._simulation.reset(self.np_random)

@@ -1,1 +1,1 @@
-"""The physics, written once: dynamics, docking, collision, reward, observation and metrics."""
+"""Problems as data: teams, worlds, observations and trajectories, checks of them, files and names."""

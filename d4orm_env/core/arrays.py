@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 """Arrays that must not take more room."""
 Whole = int | np.int64
-"""A number of something in compiled code, which tells no int from an int64."""
+"""A whole number in compiled code, where int and int64 are one."""
 
 
 A = TypeVar("A", bound=np.ndarray | tuple[Any, ...])
@@ -28,7 +28,7 @@ over a whole horizon."""
 
 
 def read_only(arrays: A) -> A:
-    """An array, or the arrays in a tuple, which nobody may write to from now on."""
+    """An array, or the arrays in a tuple, made read-only."""
     for array in arrays if isinstance(arrays, tuple) else (arrays,):
         if isinstance(array, np.ndarray):
             array.setflags(write=False)
@@ -51,7 +51,7 @@ def as_float32(value: ArrayLike) -> FloatArray:
 
 
 def _detached(value: Any) -> Any:
-    """``value`` with PyTorch's tensors, in a list too, as arrays, wherever they are and whether they have gradients."""
+    """``value`` with PyTorch's tensors, in a list too, as arrays, whatever their device and gradients."""
     if hasattr(value, "detach"):
         # In double precision NumPy has all their types.
         return value.detach().cpu().double().numpy()
@@ -73,17 +73,16 @@ def frozen_array(
         array = as_float32(value) + np.float32(0)
     except ValueError as error:
         raise ValueError(f"{name} must be an array of numbers, not {short_repr(value)}; {error}") from error
-    if (array.size == 0 and 0 in shape) or (array.size == 0 and None in shape):
+    if array.size == 0 and (0 in shape or None in shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise ValueError(f"{name} has shape {array.shape}; expected ({wanted})")
-    if not np.isfinite(array).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name}{list(where)} is {array[where]}; every value must be finite")
-    if (np.abs(array) > largest).any():
-        where = tuple(int(i) for i in np.argwhere(np.abs(array) > largest)[0])
-        raise ValueError(f"{name}{list(where)} is {array[where]:g}; magnitudes must be at most {largest:g}")
+    too_large = np.abs(array) > largest, f"magnitudes must be at most {largest:g}"
+    for wrong, remedy in ((~np.isfinite(array), "every value must be finite"), too_large):
+        if wrong.any():
+            where = np.argwhere(wrong)[0].tolist()
+            raise ValueError(f"{name}{where} is {array[tuple(where)]:g}; {remedy}")
     return read_only(array)
 
 
@@ -97,19 +96,17 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
     if np.ndim(value) == 0:
         value = np.repeat(value, num_robots)
     array = frozen_array(value, name, (num_robots,))
-    if (array <= 0).any():
-        robot = int(np.argmax(array <= 0))
-        raise ValueError(f"{name} of robot_{robot} is {array[robot]:g}; it must be positive")
     outside = (array < np.float32(SMALLEST)) | (array > LARGEST)
-    if outside.any():
-        robot = int(np.argmax(outside))
-        raise ValueError(f"{name} of robot_{robot} is {array[robot]:g}; it must be from {SMALLEST:g} to {LARGEST:g}")
+    for wrong, wanted in ((array <= 0, "positive"), (outside, f"from {SMALLEST:g} to {LARGEST:g}")):
+        if wrong.any():
+            robot = int(np.argmax(wrong))
+            raise ValueError(f"{name} of robot_{robot} is {array[robot]:g}; it must be {wanted}")
     return array
 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Frozen:
-    """Data that are set once. Copies, unpickled ones too, have read-only arrays and make anew what is cached."""
+    """Data that are set once. Copies, unpickled ones too, have read-only arrays and no cached values."""
 
     def _set(self, **values: object) -> None:
         for name, value in values.items():
@@ -136,7 +133,7 @@ LARGEST_WHOLE = 2**63 - 1
 
 
 def short_repr(value: object) -> str:
-    """``value`` as it stands in an error: on one line and not too long, whatever it is."""
+    """``value`` as errors show it: on one line, and not too long."""
     if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
         return f"about {'-' if value < 0 else ''}1e{int(value.bit_length() * np.log10(2))}"
     try:

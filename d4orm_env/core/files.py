@@ -25,7 +25,7 @@ import yaml
 def require_file(path: Path, kind: str) -> None:
     """Refuse a folder, a pipe or a device, whose reading may never end, in place of a ``kind`` such as ``"a map"``.
 
-    What is not there is left to whoever opens it.
+    A path without a file passes.
     """
     if path.exists() and not path.is_file():
         raise ValueError(f"is not a file; give the path of {kind}")
@@ -41,8 +41,19 @@ def read_limited(path: Path, kind: str, most: int) -> bytes:
     return content
 
 
+@contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Raise errors within as a ``ValueError`` of one line that begins with the path of the file."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(f"{error.filename or path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+
+
 def target_of(path: Path) -> Path:
-    """Return where a file is written: at its path, or where a symbolic link leads to.
+    """Path at which a file is written: its own, or the target of a symbolic link.
 
     Raises:
         OSError: If no file can be there, because of what is there or of a folder that is missing.
@@ -96,12 +107,12 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
 
 
 def claim_folder(path: Path, identity: Mapping[str, object], kind: str) -> None:
-    """Write down what a folder is for, or find out whether it is one for the same.
+    """Write the purpose of a folder to a JSON file in it, or check that it is the same.
 
     Args:
-        path: The JSON file in it that says so.
+        path: The file.
         identity: All that must be the same.
-        kind: What the folder holds, as ``"a training"``.
+        kind: Content of the folder for messages, as ``"a training"``.
 
     Raises:
         ValueError: If it is for something else, or does not say.
@@ -172,7 +183,7 @@ _WORDS = {"": None, "~": None, "null": None, "Null": None, "NULL": None} | {
 
 
 def is_yaml_path(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path ends as those of YAML files do, in letters of either case."""
+    """Check whether a path ends as those of YAML files do, in letters of either case."""
     return Path(path).suffix.lower() in SUFFIXES
 
 

@@ -22,7 +22,7 @@ WEIGHTS = np.linspace(0, 1, 257)[1:-1]
 def pair_gap(one: Footprint, pose: Floats, other: Footprint, its_pose: Floats) -> float:
     """Signed gap of two footprints at poses ``(d + 1,)`` [m]; in space that along the line of their centres.
 
-    Where a heading is NaN, the disc counts that the footprint covers anyhow.
+    Where a heading is NaN, the disc counts that the footprint covers at any heading.
     """
     if len(pose) == 4:
         return _ball_gap(its_pose[:3] - pose[:3], _semi_axes(one), _semi_axes(other))
@@ -30,7 +30,7 @@ def pair_gap(one: Footprint, pose: Floats, other: Footprint, its_pose: Floats) -
 
 
 def touching(team: Team, states: FloatArray, among: NDArray[np.intp], rounding: float) -> dict[int, list[int]]:
-    """Return which robots, of those ``among`` ``(C,)``, touch each other in states ``(K, n)``, each by its number.
+    """Partners in contact of each robot, of those ``among`` ``(C,)``, in states ``(K, n)``, by number.
 
     Gaps of no more than ``rounding`` count as none [m].
     """
@@ -57,7 +57,7 @@ def near_pairs(points: Floats, radius: Floats, margin: float) -> tuple[IntArray,
     along, safety_distance = points[order, axis], 2 * radius.max() + margin
     pairs: list[IntArray] = [np.empty((2, 0), np.int64)]
     for offset in range(1, len(points)):
-        # Robots farther apart along the axis than any two reach need no look; a larger offset brings none nearer.
+        # Robots farther apart along the axis than this cannot be within the margin; a larger offset brings none nearer.
         near = np.flatnonzero(along[offset:] - along[:-offset] <= safety_distance)
         if not len(near):
             break

@@ -1,9 +1,10 @@
 """Proofs that a problem has no solution, whatever the planner.
 
 A solution keeps the margin at the end of every step, and touches nothing in between. So its robots are nowhere nearer
-to an obstacle than their radius; and on straight lines from step to step nowhere nearer than radius and margin, less
-half of what they travel in a step. Space is cut into cells. One whose middle is not even so clear less half a diagonal
-has no place that is so clear, and what the other cells do not connect is not connected.
+to an obstacle than their radius; and on straight lines from step to step nowhere nearer than their safety distance,
+radius and margin, less half of what they travel in a step. Space is cut into cells. Where the clearance in the middle
+of a cell, plus half a diagonal, is less than that, no point of it is free; and what the other cells do not connect
+is not connected.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ MAX_CELLS = 2**18
 HALVINGS = 3
 """Number of times that cells as large as the smallest radius and margin are halved."""
 SIMILAR = 1.1
-"""Robots whose radii differ by less are judged by the smallest of them."""
+"""Robots whose safety distances differ by a smaller factor are judged by the smallest of them."""
 
 
 def prepare_proofs(problem: Problem) -> None:
@@ -39,7 +40,7 @@ def prepare_proofs(problem: Problem) -> None:
 
 
 def prove_infeasible(problem: Problem) -> dict[int, str]:
-    """Return why a problem has no solution, by robot; empty where that is not proved.
+    """Return the reasons why a problem has no solution, by robot; empty where that is not proved.
 
     Proved are starts within the margin that cannot be left in one step, goals within it or so near to each other that
     robots at rest there are within it, and walls between start and goal. Gaps that are only a little too narrow are
@@ -60,7 +61,7 @@ def prove_infeasible(problem: Problem) -> dict[int, str]:
 
 
 def _start_speed(problem: Problem) -> Floats:
-    """``(K,)`` of those whose speed is part of their state; that of all others is their limit [m/s]."""
+    """``(K,)`` speed of each robot at the start; its limit where the state holds none [m/s]."""
     speeds = problem.team.max_speed.astype(np.float64)
     for robot, model in enumerate(problem.team.robot_models):
         if model.speed_indices:
@@ -70,7 +71,7 @@ def _start_speed(problem: Problem) -> Floats:
 
 
 def _travel(problem: Problem, speed: Floats) -> Floats:
-    """``(K,)`` how far each robot gets in a step that it begins at this speed ``(K,)`` at most [m]."""
+    """``(K,)`` longest way of each robot in a step that it begins at this speed ``(K,)`` [m]."""
     limits, travel = problem.team.limits.astype(np.float64), np.full(problem.num_robots, np.inf)
     for robot, model in enumerate(problem.team.robot_models):
         if MODEL_CODES[model.name] < NUM_BUILT_IN:
@@ -82,7 +83,7 @@ def _travel(problem: Problem, speed: Floats) -> Floats:
 
 
 def _crowded(problem: Problem, what: str, positions: Floats, freedom: Floats, within: str) -> Iterator[tuple[int, str]]:
-    """Robots within the margin of something wherever they get from their places ``(K, d)`` by ``freedom`` ``(K,)``."""
+    """Robots that stay within the margin of something, ``freedom`` ``(K,)`` from their positions ``(K, d)`` or less."""
     radius, margin = problem.team.inner_radius, problem.margin
     clearance, needed = problem.world.clearance(positions) - radius, f"the margin of {margin:g} m within {within}"
     for robot in np.flatnonzero(clearance + freedom < margin).tolist():
@@ -107,7 +108,7 @@ def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -
         )
         half, are_open = cell * np.sqrt(d) / 2, True
         robots: list[int] = []
-        for group in _similar(safety_distance):
+        for group in _groups_by_size(safety_distance):
             body, least = float(safety_distance[group].min()) - problem.margin, float(safety_distance[group].min())
             by_steps = least - travel[group].max() / 2
             kept, away = (by_steps, travel[group].max()) if by_steps > body else (body, 0.0)
@@ -132,7 +133,7 @@ def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -
 def _cells(problem: Problem, positions: Floats, cell: float) -> tuple[Floats, float, Floats]:
     """The lowest corner of all cells, their size, larger where there would be too many, and the clearance of each.
 
-    They reach beyond the bounds, or in an open world all round obstacles and places ``(P, d)``.
+    They cover the bounds and a rim, or in an open world obstacles and positions ``(P, d)``.
     """
     lower, upper = problem.world.bounds.astype(np.float64)
     if problem.world.lower is None:
@@ -148,8 +149,8 @@ def _cells(problem: Problem, positions: Floats, cell: float) -> tuple[Floats, fl
     return low, cell, problem.world.clearance(centres)
 
 
-def _similar(safety_distance: Floats) -> Iterator[IntArray]:
-    """Robots in groups of about the same reach ``(K,)``."""
+def _groups_by_size(safety_distance: Floats) -> Iterator[IntArray]:
+    """Yield robots in groups of about the same safety distance, of ``(K,)`` [m]."""
     left = np.argsort(safety_distance, kind="stable")
     while len(left):
         alike = safety_distance[left] <= SIMILAR * safety_distance[left[0]]
@@ -158,7 +159,7 @@ def _similar(safety_distance: Floats) -> Iterator[IntArray]:
 
 
 def _near(labels: NDArray[np.int32], low: Floats, cell: float, position: Floats, distance: float) -> set[int]:
-    """Labels, but for zero, of the cells whose middle is so near to a place."""
+    """Labels, but for zero, of the cells whose middle is within a distance of a position."""
     first = np.clip(np.floor((position - distance - low) / cell).astype(int), 0, labels.shape)
     last = np.clip(np.ceil((position + distance - low) / cell).astype(int), 0, labels.shape)
     part = labels[tuple(map(slice, first, last))]

@@ -147,7 +147,7 @@ def _find_nearest_obstacles(position: FloatArray, arrays: ProblemArrays, nearest
 
 
 def _list_of(position: FloatArray, index: WorldIndex) -> int:
-    """Number of the list of obstacles in the innermost grid that holds a place; -1 beyond them all."""
+    """Number of the list of obstacles in the innermost grid that holds a position; -1 beyond them all."""
     width = 1.0
     for level in range(index.levels):
         cell, inside = 0, True

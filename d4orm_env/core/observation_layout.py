@@ -17,7 +17,7 @@ from d4orm_env.core.problem import Problem
 __all__ = ["BoundsSlack", "ObservationLayout"]
 
 WINDING = 10
-"""The longest path that an observation tells, over the farthest that anything may be from a robot."""
+"""Longest path in an observation, over the farthest that anything may be from a robot."""
 _NEVER_NEGATIVE = ("time_left", "arrived", "present", "length")
 
 
@@ -28,7 +28,7 @@ class BoundsSlack(NamedTuple):
         distance: Between where a robot is and where it is seen [m].
         speed: Beyond the speed limit, in what is seen [m/s].
         heading: Between true and seen [rad].
-        drift: Speed at which a robot may be moved beside what it does itself [m/s].
+        drift: Speed at which a robot may be moved in addition to its own motion [m/s].
         radius: Of what is seen and is no robot [m].
     """
 
@@ -211,7 +211,10 @@ class ObservationLayout(ObservationSlices):
         """
         sizes = problem.dimension, num_neighbors, num_obstacles
         slices = ObservationSlices(*sizes, num_rays=num_rays, observed_path=observed_path)
-        _check_sight(problem, num_rays, line_of_sight)
+        if line_of_sight and problem.dimension != 2:
+            raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
+        if num_rays and problem.dimension != 2:
+            raise ValueError("rays lie in the plane, and this problem is in space; leave observed_rays out")
         number = partial(positive_number, most=LARGEST)
         low, high = _bounds(problem, slices, slack, number(ray_range, "ray_range"))
         limit = np.inf if communication_range is None else number(communication_range, "communication_range")
@@ -229,35 +232,27 @@ class ObservationLayout(ObservationSlices):
         return read_only(np.stack([self.low, self.high]))
 
 
-def _check_sight(problem: Problem, num_rays: int, line_of_sight: bool) -> None:
-    """Raise ``ValueError`` for a team that cannot have a range sensor or a line of sight."""
-    if line_of_sight and problem.dimension != 2:
-        raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
-    if num_rays and problem.dimension != 2:
-        raise ValueError("rays lie in the plane, and this problem is in space; leave observed_rays out")
-
-
 def _bounds(problem: Problem, slices: ObservationSlices, slack: BoundsSlack, ray_range: float) -> FloatArray:
     """``(2, D)`` lower and upper bounds that no motion of the robots can leave, read-only."""
     team, d = problem.team, problem.dimension
     radius, speed, acceleration = (float(x.max()) for x in (team.radius, team.max_speed, team.max_acceleration))
-    # Nobody gets further than the widest distance between places, plus a full-speed drive from either end. Within a
-    # step a robot may exceed the speed limit, which is applied at its end.
+    # No robot gets further than the widest distance between positions, plus a full-speed drive from either end. The
+    # speed limit is applied at the end of a step, within which a robot may exceed it.
     drive = (speed + acceleration * problem.dt / 2 + slack.drift) * problem.duration + slack.distance
     widest = np.ptp(np.concatenate([problem.start[:, :d], problem.goal, *problem.world.extremes()]), axis=0)
     # Farthest that anything may be from a robot.
-    reach = float(np.sqrt(np.square(widest).sum())) + 2 * drive + 2 * radius
+    farthest = float(np.sqrt(np.square(widest).sum())) + 2 * drive + 2 * radius
     top = speed + slack.speed
     own = _ends(
-        slices.own, velocity=top, heading=1, speed=top, goal=reach, time_left=1, arrived=1, radius=radius,
+        slices.own, velocity=top, heading=1, speed=top, goal=farthest, time_left=1, arrived=1, radius=radius,
         max_speed=speed, max_acceleration=acceleration,
     )  # fmt: skip
     neighbor = _ends(
-        slices.neighbor, present=1, position=reach, velocity=2 * top, radius=max(radius, slack.radius)
+        slices.neighbor, present=1, position=farthest, velocity=2 * top, radius=max(radius, slack.radius)
     )  # fmt: skip
-    obstacle = _ends(slices.obstacle, present=1, position=reach, gap=reach)
+    obstacle = _ends(slices.obstacle, present=1, position=farthest, gap=farthest)
     rays = np.tile(np.array([[0], [ray_range]], np.float32), slices.num_rays)
-    path = _ends(slices.path, direction=1, length=WINDING * reach)
+    path = _ends(slices.path, direction=1, length=WINDING * farthest)
     parts = [own, *[neighbor] * slices.num_neighbors, *[obstacle] * slices.num_obstacles, rays]
     return read_only(np.concatenate([*parts, *[path] * slices.observed_path], axis=1))
 

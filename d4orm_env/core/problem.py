@@ -126,7 +126,7 @@ class Problem(Frozen):
             arrival=arrival,
         )
         # Asked for first, so that all clearances are found by the index of the engines.
-        self.world.index(self._reach)
+        self.world.index(self._safety_distance)
         checks.check_states(team, self.start)
         for fault in checks.check_physics(self):
             warnings.warn(f"problem {name!r}: {fault}; move it, or use a smaller radius or margin", stacklevel=2)
@@ -167,14 +167,14 @@ class Problem(Frozen):
         return self.arrival == "dock"
 
     @property
-    def _reach(self) -> float:
-        """The largest distance from an obstacle at which it counts [m]."""
+    def _safety_distance(self) -> float:
+        """Distance from obstacles that the largest robot keeps: its radius and the margin [m]."""
         return float(np.max(self.team.radius)) + self.margin
 
     @property
     def _within(self) -> float:
         """The distance within which all obstacles count [m]: of a disc none but the nearest does."""
-        return self._reach if self.team.shapes else 0.0
+        return self._safety_distance if self.team.shapes else 0.0
 
     @property
     def stride(self) -> float:
@@ -190,12 +190,12 @@ class Problem(Frozen):
     @cached_property
     def arrays(self) -> ProblemArrays:
         """The problem as the engines read it."""
-        return as_arrays(self, self.world.index(self._reach, within=self._within))
+        return as_arrays(self, self.world.index(self._safety_distance, within=self._within))
 
     def arrays_to_observe(self, num_obstacles: int) -> ProblemArrays:
-        """:attr:`arrays` with an index that finds so many of the nearest obstacles of any place."""
+        """:attr:`arrays` with an index that finds so many of the nearest obstacles of any position."""
         positions = np.concatenate([self.start[:, : self.dimension], self.goal])
-        grid = self.world.index(self._reach, max(num_obstacles, 1), positions, self._within)
+        grid = self.world.index(self._safety_distance, max(num_obstacles, 1), positions, self._within)
         return self.arrays._replace(grid=grid)
 
     @cached_property
@@ -226,7 +226,7 @@ class Problem(Frozen):
 
     @property
     def key_figures(self) -> list[KeyFigure]:
-        """Return its key figures, in a few words each."""
+        """Key figures, in a few words each."""
         world, sides = self.world, np.ptp(self.world.bounds, axis=0)
         extent = "open" if world.lower is None else f"{' x '.join(f'{side:g}' for side in sides)} m"
         return [
@@ -264,11 +264,11 @@ class Problem(Frozen):
         """The same team in the same world in other states, for planning on from there.
 
         Unlike :meth:`replace` it does not check what is changed: under way robots may touch, be faster than they
-        should, or head for places that they cannot all be at.
+        should, or head for goals that they cannot all be at.
 
         Args:
             start: ``(K, n)`` states.
-            goal: ``(K, d)`` places to go to [m].
+            goal: ``(K, d)`` goals [m].
             **changes: Other attributes that differ, of the right type.
         """
         return self._unchecked(

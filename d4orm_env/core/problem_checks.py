@@ -72,7 +72,7 @@ def checked_numbers(
 
 
 def check_physics(problem: Problem) -> list[str]:
-    """Refuse what float32 or RK4 does not hold and places that robots cannot be at; those within the margin."""
+    """Refuse what float32 or RK4 does not hold, and contact at starts or goals; return what is within the margin."""
     team, starts = problem.team, problem.start[:, : problem.dimension]
     check_resolution(team, np.concatenate([starts, problem.goal], axis=1), problem.dt, problem.goal_radius)
     check_turning(team, problem.dt, problem.goal_radius)
@@ -93,13 +93,7 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
     if given is None:
         first_order = np.array([model.first_order for model in team.robot_models])
         return np.where(first_order, np.float32(np.inf), team.max_acceleration * np.float32(dt))
-    try:
-        speeds = as_float32(given)
-        speeds = np.repeat(speeds, team.num_robots) if speeds.ndim == 0 else speeds
-    except ValueError as error:
-        raise ValueError(f"goal_speed must be a number or one per robot, not {short_repr(given)}; {error}") from error
-    if speeds.shape != (team.num_robots,):
-        raise ValueError(f"goal_speed has shape {speeds.shape}; expected one number, or ({team.num_robots},)")
+    speeds = _one_or_each(given, "goal_speed", team.num_robots)
     wrong = ~((speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf)))
     if wrong.any():
         robot = int(np.argmax(wrong))
@@ -111,11 +105,7 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
 
 def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
     """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
-    count = team.num_robots
-    headings = as_float32(np.full(count, np.nan) if given is None else given)
-    headings = np.repeat(headings, count) if headings.ndim == 0 else headings
-    if headings.shape != (count,):
-        raise ValueError(f"goal_heading has shape {headings.shape}; expected one number, or ({count},), NaN for any")
+    headings = _one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
     for robot in np.flatnonzero(~np.isnan(headings)).tolist():
         if team.robot_models[robot].heading_index is None:
             raise ValueError(
@@ -128,6 +118,18 @@ def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
                 f"give radians, without whole turns"
             )
     return headings
+
+
+def _one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
+    """``(K,)`` numbers, given as one for all robots or one each."""
+    try:
+        values = as_float32(given)
+    except ValueError as error:
+        raise ValueError(f"{name} must be a number or one per robot, not {short_repr(given)}; {error}") from error
+    values = np.repeat(values, num_robots) if values.ndim == 0 else values
+    if values.shape != (num_robots,):
+        raise ValueError(f"{name} has shape {values.shape}; expected one number, or ({num_robots},){note}")
+    return values
 
 
 def check_tolerances(tolerance: FloatArray) -> None:

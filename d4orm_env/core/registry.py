@@ -1,4 +1,4 @@
-"""Things by name or by where they are written, of users and of installed packages: scenarios, planners and so on."""
+"""Things by name or by import path, of users and of installed packages: scenarios, planners and so on."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Registry(Mapping[str, T]):
         identity: Callable[[object], object] | None = None,
     ) -> None:
         self.what, self.group = what, group
-        self._admit, self._identity = admit, identity or _place
+        self._admit, self._identity = admit, identity or _qualified_name
         self._registered: dict[str, object] = {}
         self._admitted: dict[str, T] = {}
 
@@ -70,7 +70,7 @@ class Registry(Mapping[str, T]):
         return tuple(self._registered)
 
     def origin(self, name: str) -> object:
-        """Return what was registered under a name, or its import path."""
+        """The thing registered under a name, or its import path."""
         claims = [self._registered[name]] if name in self._registered else []
         claims += [f"{entry.module}:{entry.attr}" for entry in self._entry_points.get(name, ())]
         if not claims:
@@ -143,11 +143,11 @@ def load_reference(text: str) -> object:
     Raises:
         ValueError: If the text has another form, or the module cannot be imported or has no such name.
     """
-    place, _, name = text.rpartition(":")
-    if not place or not all(part.isidentifier() for part in name.split(".")):
+    module, _, name = text.rpartition(":")
+    if not module or not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"{text!r} is no import path; give {FORMS}")
     try:
-        found: object = _load_file(Path(place)) if place.endswith(".py") else _import(place)
+        found: object = _load_file(Path(module)) if module.endswith(".py") else _import(module)
     except Exception as error:  # whatever foreign code raises when it is imported
         raise ValueError(
             f"{text!r} cannot be imported ({describe(error)}); give {FORMS}, of a module that Python finds and that "
@@ -155,7 +155,7 @@ def load_reference(text: str) -> object:
         ) from error
     for part in name.split("."):
         if not hasattr(found, part):
-            raise ValueError(f"{text!r} names nothing: {place} has no {name!r}; give a name that the module defines")
+            raise ValueError(f"{text!r} names nothing: {module} has no {name!r}; give a name that the module defines")
         found = getattr(found, part)
     return found
 
@@ -187,8 +187,8 @@ def _load_file(path: Path) -> ModuleType:
     return sys.modules[name]
 
 
-def _place(thing: object) -> object:
-    """Return where a class or function is defined; anything else is identified by what it is."""
+def _qualified_name(thing: object) -> object:
+    """Module and name of a class or function; anything else is identified by itself."""
     name = getattr(thing, "__qualname__", "<")
     return thing if "<" in name else (thing.__module__, name)
 
@@ -199,7 +199,7 @@ def source_digest(thing: object) -> str:
     Raises:
         ValueError: If there is no source to be read.
     """
-    code = written(thing)
+    code = source_object(thing)
     try:
         file = inspect.getsourcefile(code)
         source = Path(file).read_bytes() if file and Path(file).is_file() else inspect.getsource(code).encode()
@@ -211,7 +211,7 @@ def source_digest(thing: object) -> str:
     return hashlib.sha256(source).hexdigest()
 
 
-def written(thing: object) -> type | Callable[..., object]:
+def source_object(thing: object) -> type | Callable[..., object]:
     """The class or function whose source makes a thing what it is."""
     while isinstance(thing, functools.partial):
         thing = thing.func
@@ -226,5 +226,8 @@ def check_sendable(thing: object, owner: str) -> None:
     except Exception as error:  # pickle raises whatever the thing's own methods do
         raise ValueError(f"{owner} cannot be handed to worker processes ({describe(error)}); {remedy}") from error
     main = sys.modules["__main__"]
-    if written(thing).__module__ == "__main__" and not Path(getattr(main, "__file__", None) or "<stdin>").is_file():
+    if (
+        source_object(thing).__module__ == "__main__"
+        and not Path(getattr(main, "__file__", None) or "<stdin>").is_file()
+    ):
         raise ValueError(f"{owner} cannot be handed to worker processes (it was typed in); {remedy}")

@@ -1,4 +1,4 @@
-"""Robots by name: what a planner must know of them, and where each number comes from."""
+"""Robots by name: the numbers that a planner needs, and the source of each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from d4orm_env.core.arrays import short_repr, whole_number
+from d4orm_env.core.arrays import whole_number
+from d4orm_env.core.errors import unknown
 from d4orm_env.core.team import Team
 
 _BITCRAZE = "92 mm between motors, 47 mm propellers; not looked up, measure yours"
@@ -15,7 +16,7 @@ _MEASURED = "flown in crazyflow 0.4.0 with the Mellinger controller: largest tra
 
 @dataclass(frozen=True, kw_only=True)
 class RobotType:
-    """A robot that can be bought. Numbers are what it reaches in a team's everyday, not its records."""
+    """A robot that can be bought. Numbers are those of everyday work in a team, not its records."""
 
     model: str  #: Name of its model
     radius: float  #: Of the circle (sphere) around it [m]
@@ -89,7 +90,7 @@ ROBOTS: Mapping[str, RobotType] = MappingProxyType({
 def find_robot(name: str) -> RobotType:
     """The robot of that name."""
     if not isinstance(name, str) or name not in ROBOTS:
-        raise ValueError(f"robot {short_repr(name)} is unknown; choose one of {', '.join(ROBOTS)}")
+        raise unknown("robot", name, ROBOTS)
     return ROBOTS[name]
 
 

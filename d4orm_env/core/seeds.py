@@ -19,33 +19,30 @@ class Stream(IntEnum):
     REPAIR = 2  # samples of D4orm-D's repairs, by repair of the iteration
     REPAIR_ORDER = 3
     DETOURS = 4  # of D4orm-D, by sweep of the iteration
-    CHOICE = 5  # what a node goes on from
+    CHOICE = 5  # of the plan that a node continues
     NODE = 6  # the seed of a node of D-D4orm
     PERTURBATION = 7  # of IPOPT's warm start
-    COARSE_PLAN = 8  # the seeds of D4orm-C2F's searches and loops, by step of the episode
+    COARSE_PLAN = 8  # the seeds of D4orm-C2F's solver runs and loops, by step of the episode
     REFINEMENT = 9
     CONTROL_LOOP = 10
     CONTROLLER_NOISE = 11
     RANDOM_CONTROLS = 12
     PREFERRED_DIRECTION = 13  # of ORCA
     CONTROL_NOISE = 14  # of the environment wrapper
-    TRAINING_WORLDS = 15  # by lesson
-    TRAINING = 16  # first weights (0), then exploration and minibatches by lesson (from 1)
+    TRAINING_WORLDS = 15  # by stage
+    TRAINING = 16  # first weights (0), then exploration and minibatches by stage (from 1)
     TAKEOVER = 17  # the seeds of the plans that a team makes on the way, by takeover
     GUIDANCE = 18  # ties of path finding, by try, and which robots are replanned, by iteration
     NEIGHBOURHOODS = 19  # which robots look for faster paths, and how, by iteration
     DEMONSTRATIONS = 20  # of an expert, by round and episode
-    TRAINING_INSTANCES = 21  # by part of the mixture and number
+    TRAINING_INSTANCES = 21  # by part of the task mixture and number
     GUSTS = 22  # on drones in crazyflow
 
 
 def derived_seed(seed: int, stream: Stream, *key: int) -> int:
-    """A 64-bit seed for one purpose, another one for every other seed, stream and key.
+    """A 64-bit seed for one purpose, another one for every other seed, stream and key, none of them negative.
 
-    Args:
-        seed: Non-negative.
-        stream: The purpose.
-        key: Non-negative numbers that tell its uses apart, such as the iteration; as many in every use of a stream.
+    The key tells the uses of a stream apart, as by the iteration; all uses of a stream have keys of one length.
     """
     return int(_sequence(seed, stream, key).generate_state(1, np.uint64)[0])
 

@@ -107,8 +107,8 @@ class Team(Frozen):
                     f"footprint of robot_{robot} has {pulled} trailers, and a {self.models[robot]} pulls "
                     f"{trailers[robot]}; give such as Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
                 )
-        reach = [self._reach(robot, footprint) for robot, footprint in enumerate(footprints)]
-        radii = frozen_per_robot(reach, "radius", count)
+        outer = [self._outer_radius(robot, footprint) for robot, footprint in enumerate(footprints)]
+        radii = frozen_per_robot(outer, "radius", count)
         if radius is not None and (frozen_per_robot(radius, "radius", count) != radii).any():
             raise ValueError(
                 f"radius {short_repr(radius)} is not that of the footprints, {radii.tolist()}; leave it out"
@@ -116,14 +116,14 @@ class Team(Frozen):
         shaped = not all(isinstance(footprint, Disc) for footprint in footprints)
         self._set(radius=radii, shapes=footprints if shaped else ())
 
-    def _reach(self, robot: int, footprint: Footprint) -> float:
-        """Largest reach of a robot's bodies about its reference point [m]."""
-        reach, distance = footprint.outer_radius, 0.0
+    def _outer_radius(self, robot: int, footprint: Footprint) -> float:
+        """Radius of the disc about a robot's reference point that its trailers do not leave either [m]."""
+        radius, distance = footprint.outer_radius, 0.0
         if isinstance(footprint, Train):
             for trailer, (_, column) in zip(footprint.trailers, self.robot_models[robot].trailers, strict=True):
                 distance += float(self.limits[robot, column])
-                reach = max(reach, distance + trailer.outer_radius)
-        return reach
+                radius = max(radius, distance + trailer.outer_radius)
+        return radius
 
     def replace(self, **changes: object) -> Team:
         """A copy with some attributes changed, checked again; of radius and footprint, what is not given follows."""
@@ -265,21 +265,17 @@ class Team(Frozen):
 
     def select(self, robots: Sequence[int]) -> Team:
         """The team of these robots only, in the order given."""
-        index = list(robots)
+        index, models = list(robots), self.robot_models
+        limits = {limit.name for robot in index for limit in models[robot].own_limits}
         return Team(
             tuple(self.models[robot] for robot in index),
             None if self.shapes else self.radius[index],
             self.max_speed[index],
             self.max_acceleration[index],
             self.max_turn_rate[index],
-            self._own_limits_of(index),
+            {name: values[index] for name, values in self.own_limits.items() if name in limits},
             [self.shapes[robot] for robot in index] if self.shapes else None,
         )
-
-    def _own_limits_of(self, robots: list[int]) -> dict[str, FloatArray]:
-        models = self.robot_models
-        names = {limit.name for robot in robots for limit in models[robot].own_limits}
-        return {name: values[robots] for name, values in self.own_limits.items() if name in names}
 
 
 def _per_robot(name: str, value: ArrayLike | None, limits: list[Limit | None]) -> FloatArray:

@@ -86,28 +86,20 @@ class DisturbanceEvents:
 
 
 def arrival_steps(arrived: BoolArray) -> NDArray[np.intp]:
-    """``(K,)`` first row of ``arrived`` ``(H+1, K)`` from which on a robot is at its goal; the last where it is not."""
+    """``(K,)`` first row of ``arrived`` ``(H+1, K)`` from which on a robot is at its goal; the last without one."""
     last_away = len(arrived) - (~arrived[::-1]).argmax(axis=0)
     return np.where(arrived.all(axis=0), 0, np.minimum(last_away, len(arrived) - 1))
 
 
 def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
-    """``(K,)`` time from which on each robot is at its goal [s]; infinite for one that is not there at the end.
-
-    Args:
-        arrived: ``(H+1, K)`` bool.
-        dt: Time step [s].
-    """
+    """``(K,)`` time from which on each robot is at its goal [s], of ``arrived`` ``(H+1, K)``; infinite without one."""
     return np.where(arrived[-1], arrival_steps(arrived) * dt, np.inf)
 
 
 def mean_squared_jerk(controls: FloatArray, arrived: BoolArray, dt: float) -> float:
     """Mean squared norm of the jerk [m^2/s^6] over robots and over steps before arrival (paper, section VIII-C).
 
-    Args:
-        controls: ``(H, K, m)`` executed :func:`accelerations`, of which the jerk is the finite difference.
-        arrived: ``(H+1, K)`` bool.
-        dt: Time step [s].
+    It is the finite difference of ``controls`` ``(H, K, m)``, executed :func:`accelerations`; arrived ``(H+1, K)``.
     """
     jerk = np.diff(controls.astype(np.float64), axis=0) / dt
     moving = ~arrived[1:-1]

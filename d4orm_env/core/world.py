@@ -67,7 +67,7 @@ class World(Frozen):
         upper: ArrayLike | None = None,
         origin: ArrayLike | None = None,
     ) -> None:
-        if dimension not in (2, 3):
+        if isinstance(dimension, float) or dimension not in (2, 3):
             raise ValueError(f"dimension of the world is {dimension!r}; it must be 2 or 3")
         if (lower is None) != (upper is None):
             raise ValueError("bounds need both lower and upper; give both, or neither for an open world")
@@ -81,7 +81,7 @@ class World(Frozen):
             name: frozen_array(given, name, (None, width), largest=LARGEST) for name, (given, width) in rows.items()
         }
         bounds = {
-            f"{name}": None if given is None else frozen_array(given, f"bounds {name}", (dimension,), largest=LARGEST)
+            name: None if given is None else frozen_array(given, f"bounds {name}", (dimension,), largest=LARGEST)
             for name, given in (("lower", lower), ("upper", upper))
         }
         corners = tuple(
@@ -172,8 +172,8 @@ class World(Frozen):
         return {}
 
     @property
-    def _usual_reach(self) -> float:
-        """Default cell of the index: a share of the room that the obstacles take [m]."""
+    def _default_distance(self) -> float:
+        """Distance that the index is made for by default: a share of the room that the obstacles take [m]."""
         lower, upper = self.shapes.extent()
         return max(float((upper - lower).max()), SMALLEST) / 32
 
@@ -185,7 +185,7 @@ class World(Frozen):
         Args:
             max_distance: The largest distance from an obstacle at which it counts [m].
             nearest: Number of nearest obstacles that it is to find.
-            positions: ``(N, dimension)`` places round which it is to find them, however far from obstacles [m], and in
+            positions: ``(N, dimension)`` points round which it is to find them, however far from obstacles [m], and in
                 wider grids farther away.
             within: Distance within which it is to find all obstacles, not only the nearest [m].
         """
@@ -197,7 +197,7 @@ class World(Frozen):
             levels = _LEVELS if self.shapes.count <= _FEW else 1
         key = (max_distance, nearest, margin, levels, within)
         if key not in self._indices:
-            # Cells of a quarter of a reach leave few points undecided, which pays for thousands of samples. Who
+            # Cells of a quarter of the distance leave few points undecided, which pays for thousands of samples. Who
             # observes asks once per robot and time step, and in ever new worlds.
             cell = max_distance / 4 if positions is None else max_distance
             self._indices[key] = build_index(self.shapes, cell, margin, nearest, levels, within)
@@ -218,7 +218,7 @@ class World(Frozen):
         to_bounds = self._to_bounds(points)
         if not self.shapes.count:
             return to_bounds
-        index = next(iter(self._indices.values()), None) or self.index(self._usual_reach)
+        index = next(iter(self._indices.values()), None) or self.index(self._default_distance)
         flat = points.reshape(-1, self.dimension)
         return np.minimum(nearest_distance(self.shapes, index, flat).reshape(to_bounds.shape), to_bounds)
 

@@ -91,7 +91,7 @@ class DroneBodies:
 
     Drones follow setpoints, which move as the team's model does under the controls and stay at the goal where that has
     arrived. Drones that are held hover. What is seen of a drone is its setpoint, and how far it is off that on the
-    average of half a second: who saw what its attitude has not yet done would ask for it again.
+    average of half a second: a controller that saw what its attitude has yet to do would ask for it again.
 
     Args:
         problem: The problem; see :func:`check_problem`.
@@ -173,7 +173,7 @@ class DroneBodies:
     def follow(
         self, position: Floats, velocity: Floats, acceleration: Floats, intruders: FloatArray | None = None
     ) -> BoolArray:
-        """Fly setpoints ``(S, K, 3)``, one every 0.01 s, and return who touched something or fell, ``(K,)`` bool."""
+        """Fly setpoints ``(S, K, 3)``, one every 0.01 s, and return ``(K,)`` bool: touched something, or fell."""
         path = self._flight.fly(position, velocity, acceleration, self._gusts(len(position)))
         error = np.linalg.norm(path - position, axis=2)
         walked = np.concatenate([self._position[None], path])

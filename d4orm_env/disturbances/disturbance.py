@@ -24,7 +24,7 @@ from d4orm_env.disturbances.draws import Draws
 from d4orm_env.dynamics.robot_model import TimeStep
 
 Memory = tuple[NDArray[np.generic], ...]
-"""Memory of a disturbance over an episode: arrays ``(B, ...)``, changed in position. A ``NamedTuple`` names them."""
+"""Memory of a disturbance over an episode: arrays ``(B, ...)``, changed in place. A ``NamedTuple`` names them."""
 
 M = TypeVar("M", bound=Memory)
 
@@ -203,7 +203,7 @@ Disturbances: TypeAlias = tuple[AnyDisturbance, ...]
 
 
 def checked_disturbances(given: object) -> Disturbances:
-    """Return what an environment was given, a list of disturbances, as a tuple."""
+    """The disturbances that an environment was given, as a tuple."""
     if isinstance(given, Disturbance):
         given = (given,)
     if isinstance(given, str) or not isinstance(given, Iterable):
@@ -230,7 +230,7 @@ def total_slack(disturbances: Disturbances, problem: Problem) -> BoundsSlack:
 
 
 def events_of(effects: Sequence[DisturbanceEffect], problem: Problem) -> DisturbanceEvents:
-    """Marks of one world from its effects at the beginning and after every step, each of one world."""
+    """Disturbance events of one world, from its effects at the beginning and after every step."""
     still = np.zeros((1, problem.num_robots, problem.dimension), np.float32)
     obeying = np.zeros((1, problem.num_robots), np.bool_)
     nothing = np.zeros((1, 0, 2 * problem.dimension + 1), np.float32)
@@ -294,5 +294,4 @@ def check_components(value: float | tuple[float, ...], name: str, control_size: 
 
 def scaled(value: float | tuple[float, ...], numbers: FloatArray) -> FloatArray:
     """``numbers`` ``(..., m)`` times levels."""
-    level = np.array(value, np.float32) if isinstance(value, tuple) else np.float32(value)
-    return level * numbers
+    return np.asarray(value, np.float32) * numbers

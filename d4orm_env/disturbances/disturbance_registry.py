@@ -70,13 +70,13 @@ def find_level(text: str) -> Level:
     Raises:
         ValueError: If there is no such kind, it has no such attribute, or one is given twice.
     """
-    place, opened, behind = text.partition("(")
+    path, opened, behind = text.partition("(")
     given, closed, rest = behind.partition(")")
     if opened and (not closed or (rest and not rest.startswith("."))):
         raise ValueError(f"disturbance {text!r} is not of the form push(rate=0.5).speed")
-    name, _, attribute = _split_path(place) if ":" in place else place.partition(".")
-    if opened:
-        attribute = attribute or rest[1:]
+    module, colon, name = path.rpartition(":")
+    name, _, attribute = name.partition(".")
+    name, attribute = module + colon + name, attribute or rest[1:]
     kind = DISTURBANCES.find(name)
     known = [field.name for field in fields(kind)] if is_dataclass(kind) else []
     if not known:
@@ -100,12 +100,6 @@ def _fixed(given: str, text: str) -> dict[str, object]:
     if not isinstance(values, dict) or not all(isinstance(name, str) for name in values) or None in values.values():
         raise ValueError(f"disturbance {text!r}: write what is in brackets as name=value, as in push(rate=0.5).speed")
     return {name: math.inf if value == "inf" else value for name, value in values.items()}
-
-
-def _split_path(text: str) -> tuple[str, str, str]:
-    place, colon, name = text.rpartition(":")
-    kind, dot, attribute = name.partition(".")
-    return place + colon + kind, dot, attribute
 
 
 def disturbance_at(text: str, level: object) -> AnyDisturbance:

@@ -68,6 +68,10 @@ class _ActiveDisturbance:
 class DisturbedWorlds:
     """Disturbances in the order in which they act, none of them negligible, with the memory of ``B`` worlds of a
     problem.
+
+    Attributes:
+        bodies: ``(B, N, 2 d + 1)`` moving obstacles, see :class:`DisturbanceEffect`.
+        alters_limits: Whether any changes the robots' limits.
     """
 
     def __init__(
@@ -78,7 +82,7 @@ class DisturbedWorlds:
         self._all: list[_ActiveDisturbance] = []
         for disturbance in disturbances:
             name = type(disturbance).__name__
-            # By name and not by place, so that each draws the same whatever stands beside it.
+            # By name and not by order, so that each draws the same whatever others there are.
             self._all.append(_ActiveDisturbance(disturbance, zlib.crc32(f"{name}/{occurrences[name]}".encode())))
             occurrences[name] += 1
         self._commanding, self._moving, self._seeing, self._observing, self._effective = (
@@ -86,20 +90,15 @@ class DisturbedWorlds:
         )
         self.alters_limits = any(one.has("limits") for one in self._all)
         self._keys: Keys = np.zeros((num_worlds, 2), np.uint32)
-        self._bodies: FloatArray = np.zeros((num_worlds, 0, 2 * problem.dimension + 1), np.float32)
+        self.bodies: FloatArray = np.zeros((num_worlds, 0, 2 * problem.dimension + 1), np.float32)
         self._bringing: list[_ActiveDisturbance] = []
         self._begun = False
         self._ahead: Ahead | None = {} if num_worlds == 1 else None
 
     @property
-    def bodies(self) -> FloatArray:
-        """``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`DisturbanceEffect`."""
-        return self._bodies
-
-    @property
     def alters_sight(self) -> bool:
         """True if what is seen may differ from the true state of the robots."""
-        return bool(self._seeing or self._observing or self._bodies.shape[1])
+        return bool(self._seeing or self._observing or self.bodies.shape[1])
 
     def true_limits(self, limits: FloatArray) -> FloatArray:
         """``(K, L)`` what limits truly are, read-only."""
@@ -117,7 +116,7 @@ class DisturbedWorlds:
         steps: Steps,
     ) -> Scene:
         """The worlds as they are; arguments as the attributes of :class:`Scene`."""
-        return Scene(self.problem, self.max_cycles, start, goal, states, controls, arrived, steps, self._bodies)
+        return Scene(self.problem, self.max_cycles, start, goal, states, controls, arrived, steps, self.bodies)
 
     def begin(self, worlds: Worlds, seeds: Sequence[int], start: FloatArray, goal: FloatArray) -> None:
         """Begin the episodes of worlds ``(b,)``, the first time of all, from ``(b, K, n)`` to ``(b, K, d)`` [m].
@@ -141,9 +140,9 @@ class DisturbedWorlds:
                     self._bringing.append(one)
                 scene = scene._replace(bodies=np.concatenate([scene.bodies, bodies], axis=1))
         if not self._begun:
-            self._bodies = scene.bodies
+            self.bodies = scene.bodies
         else:
-            self._bodies[worlds] = scene.bodies
+            self.bodies[worlds] = scene.bodies
         self._begun = True
 
     def act(self, scene: Scene, controls: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -158,10 +157,10 @@ class DisturbedWorlds:
             controls = _checked(moved[1], controls.shape, one, "move")
         if states is not scene.states and scene.standing.any():
             states = np.where(scene.standing[..., None], scene.states, states)
-        if self._bodies.shape[1]:
+        if self.bodies.shape[1]:
             effects = (one.disturbance.effect(one.memory, scene).bodies for one in self._bringing)
             present = [bodies for bodies in effects if bodies is not None]
-            self._bodies = present[0] if len(present) == 1 else np.concatenate(present, axis=1)
+            self.bodies = present[0] if len(present) == 1 else np.concatenate(present, axis=1)
         return states, controls
 
     def effect(self, scene: Scene) -> DisturbanceEffect:
@@ -171,7 +170,7 @@ class DisturbedWorlds:
             pushed=_together(np.add, [effect.pushed for effect in effects]),
             stalled=_together(np.logical_or, [effect.stalled for effect in effects]),
             lost=_together(np.logical_or, [effect.lost for effect in effects]),
-            bodies=self._bodies,
+            bodies=self.bodies,
         )
 
     def see(self, scene: Scene, worlds: Worlds | None = None) -> Observed:
@@ -182,8 +181,7 @@ class DisturbedWorlds:
             memory = one.memory if worlds is None else one.memory_of(worlds)
             draws = self._draws(one, scene, _Purpose.SEE)
             draws = draws if worlds is None else draws.of(worlds)
-            changed = one.disturbance.see(seen, memory, part, draws)
-            states, controls, bodies = changed
+            states, controls, bodies = one.disturbance.see(seen, memory, part, draws)
             seen = Observed(
                 _checked(states, seen.states.shape, one, "see"),
                 _checked(controls, seen.controls.shape, one, "see"),

@@ -103,10 +103,10 @@ class Draws:
 
     def _taken(self, kind: int, shape: tuple[int, ...], ahead: Ahead) -> FloatArray:
         """``(1, *shape)`` numbers of a single world, drawn ahead if they are not yet."""
-        step, place = int(self._steps[0]), (kind, self._stream, self._call, shape)
-        first, rows = ahead.get(place, (0, _NOTHING))
+        step, key = int(self._steps[0]), (kind, self._stream, self._call, shape)
+        first, rows = ahead.get(key, (0, _NOTHING))
         if not first <= step < first + len(rows):
             first, steps = step, np.arange(step, step + _AHEAD)
             rows = self._drawn(kind, self._keys.repeat(_AHEAD, axis=0), steps, shape)
-            ahead[place] = first, rows
+            ahead[key] = first, rows
         return rows[step - first : step - first + 1].copy()  # the caller's to change

@@ -73,7 +73,7 @@ class Push(Disturbance[Kept]):
 
 
 def pushed(problem: Problem, states: FloatArray, velocity: FloatArray) -> FloatArray:
-    """``states`` ``(B, K, n)``, changed in position, with velocities ``(B, K, d)`` given to robots."""
+    """``states`` ``(B, K, n)``, changed in place, with velocities ``(B, K, d)`` given to robots."""
     slip, d = velocity.copy(), problem.dimension
     for robot in np.flatnonzero(velocity.any(axis=(0, 2))):
         model = problem.team.robot_models[robot]
@@ -151,7 +151,7 @@ class Stall(Disturbance[Stops]):
 
 @dataclass(frozen=True)
 class Drag(Disturbance[Memory]):
-    """Friction of a fluid, linear in the speed: velocities decay by ``dv/dt = -coefficient v`` beside the control.
+    """Friction of a fluid, linear in the speed: it adds ``dv/dt = -coefficient v`` to what the control does.
 
     Taken exactly at the beginning of every step, ``v <- exp(-coefficient dt) v``, the control after it (Lie splitting).
 

@@ -1,7 +1,7 @@
 """Contact tests in scalar style, on squared lengths: no square root is needed to compare two distances.
 
 Two bodies touch when the distance between their surfaces is zero or less, so every test is "less or equal"
-(paper, Eq. 1 and the safety reward, with the margin added to the reach).
+(paper, Eq. 1 and the safety reward, with the margin added to the radii).
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ NUM_BUILT_IN = len(_BUILT_IN)
 
 COMMON = tuple(model.name for model in _BUILT_IN[:4])
 """Models that share compiled kernels, whatever mixture of them a team is. Teams with others have kernels of their own,
-so that nobody waits for the compiler because of a model that they do not use.
+so that compiling never takes longer because of a model that is not used.
 """
 
 

@@ -61,7 +61,7 @@ L = TypeVar("L", FloatArray, list[float])
 """A robot's limits."""
 
 Vector: TypeAlias = tuple[Number, ...]
-"""A state, a control, limits, a place or a velocity."""
+"""A state, a control, limits, a position or a velocity."""
 
 
 class TimeStep(NamedTuple):
@@ -260,7 +260,7 @@ class Model:
         return components
 
     def lower_bounds(self, limits: L) -> L:
-        """``(L,)`` magnitudes that bound negative values in position of the limits; see :attr:`lower_limits`."""
+        """``(L,)`` magnitudes that bound negative values in place of the limits; see :attr:`lower_limits`."""
         bounds = limits.copy()
         for column, own in self.lower_limits:
             bounds[column] = min(limits[own], limits[SPEED]) if column == SPEED else limits[own]

@@ -62,7 +62,7 @@ def _plain(value: Any) -> FunctionType | None:
 
 
 def _named(function: FunctionType) -> Mapping[str, Any]:
-    """What the names of a function's code and annotations mean, in modules that it names too."""
+    """Values of the names in a function's code and annotations, and of those in modules that it names."""
     names = {name for code in _codes(function.__code__) for name in code.co_names}
     names.update(*(re.findall(r"\w+", str(text)) for text in function.__annotations__.values()))
     named = {name: function.__globals__[name] for name in names if name in function.__globals__}

@@ -25,7 +25,7 @@ S = TypeVar("S", bound=tuple[Any, ...])
 
 
 class _Borrowed(types.Type):
-    """A named tuple in memory that somebody else keeps."""
+    """A named tuple in memory that the caller keeps."""
 
     def __init__(self, struct: types.NamedTuple) -> None:
         self.struct = struct
@@ -50,8 +50,8 @@ class _Borrowed(types.Type):
 @register_model(_Borrowed)
 class _BorrowedModel(models.PrimitiveModel):
     def __init__(self, manager: DataModelManager, kind: _Borrowed) -> None:
-        place = manager.lookup(kind.struct).get_value_type().as_pointer()
-        super().__init__(manager, kind, place)  # type: ignore[no-untyped-call]
+        address = manager.lookup(kind.struct).get_value_type().as_pointer()
+        super().__init__(manager, kind, address)  # type: ignore[no-untyped-call]
 
 
 @infer_getattr
@@ -63,16 +63,16 @@ class _Fields(AttributeTemplate):
 
 
 @lower_getattr_generic(_Borrowed)
-def _read(context: BaseContext, builder: IRBuilder, borrowed: _Borrowed, place: Value, name: str) -> Value:
+def _read(context: BaseContext, builder: IRBuilder, borrowed: _Borrowed, address: Value, name: str) -> Value:
     kind = borrowed.field(name)
-    field = cgutils.gep_inbounds(builder, place, 0, borrowed.struct.fields.index(name))
+    field = cgutils.gep_inbounds(builder, address, 0, borrowed.struct.fields.index(name))
     return field if isinstance(kind, _Borrowed) else impl_ret_borrowed(context, builder, kind, builder.load(field))
 
 
-def _store(builder: IRBuilder, struct: Value, place: Value) -> None:
+def _store(builder: IRBuilder, struct: Value, address: Value) -> None:
     """Store field by field, which LLVM takes apart best."""
     for i, kind in enumerate(struct.type.elements):
-        field, value = cgutils.gep_inbounds(builder, place, 0, i), builder.extract_value(struct, i)
+        field, value = cgutils.gep_inbounds(builder, address, 0, i), builder.extract_value(struct, i)
         if isinstance(kind, ir.LiteralStructType):
             _store(builder, value, field)
         else:
@@ -82,12 +82,12 @@ def _store(builder: IRBuilder, struct: Value, place: Value) -> None:
 @intrinsic
 def _borrow(typing_context: TypingContext, struct: types.NamedTuple) -> Instructions:
     def generate(context: BaseContext, builder: IRBuilder, signature: Signature, arguments: tuple[Value, ...]) -> Value:
-        place = cgutils.alloca_once(builder, arguments[0].type)
-        _store(builder, arguments[0], place)
-        return place
+        address = cgutils.alloca_once(builder, arguments[0].type)
+        _store(builder, arguments[0], address)
+        return address
 
     return _Borrowed(struct)(struct), generate
 
 
 borrow: Callable[[S], S] = _borrow
-"""Hand on a kernel's own argument, a named tuple, by reference: whoever called the kernel keeps the arrays alive."""
+"""Hand on a kernel's own argument, a named tuple, by reference: its caller keeps the arrays alive."""

@@ -1,6 +1,6 @@
 """Compiled kernels on disk, invalidated by any change of the sources they are made of.
 
-Those that a wheel brings are looked for first.
+Kernels of a wheel come first.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Kernel(Protocol[P, R_co]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R_co: ...
 
 
-class _Place(CompileResultCacheImpl):
+class _CacheFolder(CompileResultCacheImpl):
     """The folder that numba chooses, but none in a home folder that is not there or that others can write to."""
 
     def __init__(self, function: Callable[..., object]) -> None:
@@ -62,13 +62,13 @@ class _Place(CompileResultCacheImpl):
 
 
 def _is_private(folder: Path) -> bool:
-    """Return whether nobody else can put files there, which would be unpickled and executed."""
-    if not folder.is_absolute():  # where nobody knows the home folder, it begins with ~
+    """Check that no other user can put files there, which would be unpickled and executed."""
+    if not folder.is_absolute():  # where the home folder is unknown, it begins with ~
         return False
     if not hasattr(os, "getuid"):
         return True
     try:
-        states = [place.stat() for place in (folder, *folder.parents) if place.exists()]
+        states = [path.stat() for path in (folder, *folder.parents) if path.exists()]
     except OSError:
         return False
     # Others may make folders in /tmp, but not put them in the place of ours.
@@ -83,7 +83,7 @@ class _SourceKeyedCache(FunctionCache):
     into nor what functions one kernel of a factory has that another has not.
     """
 
-    _impl_class = _Place
+    _impl_class = _CacheFolder
 
     def __init__(self, function: Callable[..., object], key: str) -> None:
         super().__init__(function)
@@ -102,7 +102,7 @@ class _SourceKeyedCache(FunctionCache):
         return sig, codegen.magic_tuple(), self._source_key
 
     def load_overload(self, sig: Signature, target_context: Any) -> Any:
-        """Return what is kept for a signature, or ``None``.
+        """The kernel kept for a signature, or ``None``.
 
         numba fills its registries first, for half a second, which only compiling has a use for.
         """
@@ -168,7 +168,7 @@ def check_can_be_kept() -> None:
         OSError: If no folder can be written to, or the disk is full.
     """
     try:
-        folder = _Place(check_can_be_kept).locator.get_cache_path()
+        folder = _CacheFolder(check_can_be_kept).locator.get_cache_path()
     except RuntimeError:
         raise OSError("no cache folder can be written to; set NUMBA_CACHE_DIR to one that can") from None
     try:

@@ -1,4 +1,4 @@
-"""Compilation of kernels, and of the functions of :mod:`d4orm_env.core` that they may call."""
+"""Compilation of kernels, and of the plain Python functions of the physics that they may call."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numba.core import compiler
 from numba.core.codegen import JITCodeLibrary
+from numba.cpython.unsafe import numbers
 from numba.extending import register_jitable
 from numba.np.unsafe import ndarray
 
@@ -111,11 +112,13 @@ for _function in (
     collision.meets_triangle,
     transition.step_reward,
 ):
-    # Lets compiled code call the core's plain Python functions, which stay as they are for everyone else.
+    # Compiled code may call these, which stay plain Python functions for all other callers.
     register_jitable(**INLINED)(_function)
 
 to_fixed_tuple: Callable[..., tuple[np.float32, ...]] = ndarray.to_fixed_tuple
 """Its calls in compiled code lack the first argument, which type checkers cannot know."""
+trailing_zeros: Callable[..., int] = numbers.trailing_zeros
+"""Number of the lowest bit that is set; likewise."""
 
 
 @register_jitable(nogil=True, **OPTIONS)

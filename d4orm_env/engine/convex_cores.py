@@ -1,8 +1,8 @@
 """Exact tests of convex bodies, compiled with numba: cores of the plane, rounded rectangles, and ellipsoids.
 
-Two convex cores are apart by more than a reach where one of their axes tells (the separating axis theorem, which along
-a unit axis bounds the distance), overlap where none tells anything, and are otherwise as near as some corner of one is
-to some edge of the other. Of rectangles (boxes, capsules, discs) both are told in closed form from the offset of their
+Two convex cores are farther apart than a distance where one of their axes shows it (the separating axis theorem, which
+along a unit axis bounds the distance), overlap where none shows a gap, and are otherwise as near as some corner of one
+is to some edge of the other. Of rectangles (boxes, capsules, discs) both follow in closed form from the offset of their
 centres and the turn between them, in many samples at once: the loops over these vectorise. All is computed relative to
 the robot, so that large coordinates cost no precision. In space ellipsoids keep their axes along those of the world;
 see :func:`balls_within`.
@@ -18,7 +18,7 @@ from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.dynamics import collision
 from d4orm_env.engine.compiling import ONE, ZERO, compiled
-from d4orm_env.engine.elementary import OPS
+from d4orm_env.engine.elementary import OPS, maximum, minimum
 from d4orm_env.engine.simd import CHUNK, TILE, chunk_at_most, use_wide_registers
 
 _HALF = np.float32(0.5)
@@ -79,7 +79,7 @@ def place_triangle(triangles: FloatArray, i: Whole, x: np.float32, y: np.float32
 
 @compiled
 def _separation(a: FloatArray, b: FloatArray, widest: np.float32) -> np.float32:
-    """The most by which an axis of ``a`` tells ``b`` from it, or ``widest`` if that is more."""
+    """The widest gap to ``b`` along an axis of ``a``, or ``widest`` if that is wider."""
     for i in range(int(a[NUM_AXES])):
         along_x, along_y, least = a[AXES + 2 * i], a[AXES + 2 * i + 1], np.float32(np.inf)
         for j in range(int(b[COUNT])):
@@ -89,28 +89,28 @@ def _separation(a: FloatArray, b: FloatArray, widest: np.float32) -> np.float32:
 
 
 @compiled
-def _corner_near_edge(a: FloatArray, b: FloatArray, radius_sum: np.float32) -> bool:
-    """Check whether a corner of ``a`` is within radius_sum of an edge of ``b``."""
+def _corner_near_edge(a: FloatArray, b: FloatArray, distance: np.float32) -> bool:
+    """Check whether a corner of ``a`` is within ``distance`` of an edge of ``b``."""
     count = int(b[COUNT])
     for i in range(int(a[COUNT])):
         for j in range(count):
             x, y = a[CORNERS + 2 * i] - b[CORNERS + 2 * j], a[CORNERS + 2 * i + 1] - b[CORNERS + 2 * j + 1]
-            if x * x + y * y <= radius_sum * radius_sum:
+            if x * x + y * y <= distance * distance:
                 return True
             after = CORNERS + 2 * ((j + 1) % count)
             along_x, along_y = b[after] - b[CORNERS + 2 * j], b[after + 1] - b[CORNERS + 2 * j + 1]
             # A point, and a box of no size, have edges of no length: their corner has been asked.
             if along_x * along_x + along_y * along_y > ZERO and collision.meets_edge(
-                x, y, along_x, along_y, radius_sum, ZERO, OPS
+                x, y, along_x, along_y, distance, ZERO, OPS
             ):
                 return True
     return False
 
 
 @compiled
-def cores_within(a: FloatArray, b: FloatArray, radius_sum: np.float32) -> bool:
-    """Check whether two placed cores, each widened by its rounding, are within ``radius_sum`` of each other."""
-    total = a[ROUNDING] + b[ROUNDING] + radius_sum
+def cores_within(a: FloatArray, b: FloatArray, extra: np.float32) -> bool:
+    """Check whether two placed cores, each widened by its rounding, are within ``extra`` of each other."""
+    total = a[ROUNDING] + b[ROUNDING] + extra
     nothing = np.float32(-np.inf)
     apart = _separation(b, a, _separation(a, b, nothing))
     if apart > total:
@@ -165,21 +165,11 @@ Offset: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32, np.flo
 
 
 @compiled
-def _larger(a: np.float32, b: np.float32) -> np.float32:
-    return a if a > b else b
-
-
-@compiled
-def _smaller(a: np.float32, b: np.float32) -> np.float32:
-    return a if a < b else b
-
-
-@compiled
 def _offset(
     one: Rectangle, other: Rectangle, positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, p: Whole, q: Whole
 ) -> Offset:
     """The second centre seen from the first one, along the axes of the first and of the second, and the turn between
-    them as a unit vector. Places are in the rows from ``a`` and ``b`` on, poses in those from ``p`` and ``q`` on.
+    them as a unit vector. Positions are in the rows from ``a`` and ``b`` on, poses in those from ``p`` and ``q`` on.
     """
     c, s, d, t = poses[p], poses[p + TILE], poses[q], poses[q + TILE]
     x = (positions[b] - positions[a]) + ((poses[q + 2 * TILE] + other[2] * d) - (poses[p + 2 * TILE] + one[2] * c))
@@ -191,23 +181,23 @@ def _offset(
 
 @compiled
 def _apart(one: Rectangle, other: Rectangle, at: Offset) -> np.float32:
-    """The most by which an axis tells two rectangles from each other."""
+    """The widest gap of two rectangles along their axes."""
     along, across = abs(at[4]), abs(at[5])
-    mine = _larger(
+    mine = maximum(
         abs(at[0]) - (one[0] + other[0] * along + other[1] * across),
         abs(at[1]) - (one[1] + other[0] * across + other[1] * along),
     )
-    its = _larger(
+    its = maximum(
         abs(at[2]) - (other[0] + one[0] * along + one[1] * across),
         abs(at[3]) - (other[1] + one[0] * across + one[1] * along),
     )
-    return _larger(mine, its)
+    return maximum(mine, its)
 
 
 @compiled
 def _corner_distance2(half: Rectangle, x: np.float32, y: np.float32) -> np.float32:
     """The squared distance of a point from a rectangle about the origin."""
-    gap_x, gap_y = _larger(abs(x) - half[0], ZERO), _larger(abs(y) - half[1], ZERO)
+    gap_x, gap_y = maximum(abs(x) - half[0], ZERO), maximum(abs(y) - half[1], ZERO)
     return gap_x * gap_x + gap_y * gap_y
 
 
@@ -217,15 +207,15 @@ def _corners_distance2(
 ) -> np.float32:
     """The squared distance of the nearest corner of another rectangle, at ``(x, y)`` and turned by ``(c, s)``."""
     along_x, along_y, across_x, across_y = its[0] * c, its[0] * s, -its[1] * s, its[1] * c
-    front = _smaller(
+    front = minimum(
         _corner_distance2(half, x + along_x + across_x, y + along_y + across_y),
         _corner_distance2(half, x + along_x - across_x, y + along_y - across_y),
     )
-    back = _smaller(
+    back = minimum(
         _corner_distance2(half, x - along_x + across_x, y - along_y + across_y),
         _corner_distance2(half, x - along_x - across_x, y - along_y - across_y),
     )
-    return _smaller(front, back)
+    return minimum(front, back)
 
 
 @compiled
@@ -233,7 +223,7 @@ def rectangles_within(
     one: Rectangle, other: Rectangle, near: np.uint64, total: np.float32,
     positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, p: Whole, q: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
-    """Return where, of the first ``CHUNK`` samples, those ``near``, two rectangles are within ``total``."""
+    """Mask of the first ``CHUNK`` samples, of those ``near``, in which two rectangles are within ``total``."""
     use_wide_registers()
     for s in range(CHUNK):
         buffer[s] = _apart(one, other, _offset(one, other, positions, a + s, b + s, poses, p + s, q + s))
@@ -243,5 +233,5 @@ def rectangles_within(
     for s in range(CHUNK):
         at = _offset(one, other, positions, a + s, b + s, poses, p + s, q + s)
         mine = _corners_distance2(one, other, at[0], at[1], at[4], at[5])
-        buffer[s] = _smaller(mine, _corners_distance2(other, one, -at[2], -at[3], at[4], -at[5]))
+        buffer[s] = minimum(mine, _corners_distance2(other, one, -at[2], -at[3], at[4], -at[5]))
     return sure | (chunk_at_most(buffer, 0, total * total) & possible)

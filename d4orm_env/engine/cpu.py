@@ -58,7 +58,7 @@ def kernels_of_codes(codes: bytes) -> WorldKernels:
 
 
 class CpuEngine:
-    """The physics on the CPU, and what environments need beside it. Stateless: all instances are alike."""
+    """The physics on the CPU, and observations for environments. Stateless: all instances are alike."""
 
     name = "cpu"
 
@@ -100,15 +100,10 @@ class CpuEngine:
         batch: WorldBatch,
         out: FloatArray,
     ) -> None:
-        """Step, reset and observe the worlds of a batch in place, each as it is ordered to.
+        """Step, reset and observe the worlds of a batch in place, each by one of ``orders`` ``(B,)`` such as ``STEP``.
 
-        Args:
-            arrays: The problem that the worlds share; each has its own starts and goals.
-            layout: Components of an observation, and their bounds.
-            max_cycles: Steps in an episode.
-            orders: ``(B,)`` one of :data:`STEP` and its like for every world.
-            batch: The worlds; ``batch.control`` holds what to do.
-            out: ``(B, K, D)`` observations, output; those of skipped worlds are not written. ``(0, K, D)`` makes none.
+        They share the problem of ``arrays``, but for starts and goals; ``batch.control`` holds their controls. ``out``
+        ``(B, K, D)`` is filled with the observations of all but skipped worlds, or ``(0, K, D)`` with none.
         """
         arrays = typed(arrays)
         kernel, view = kernels_of_codes(arrays.model_codes.tobytes()).advance_worlds, _view(layout)
@@ -118,8 +113,8 @@ class CpuEngine:
 
     def rollout(self, problem: Problem, controls: ArrayLike) -> Trajectory:
         """See :meth:`d4orm_env.engine.types.Engine.rollout`."""
-        nobody = np.zeros(problem.num_robots, bool)
-        moments = _rolled_out(problem.arrays, problem.start, nobody, checked_controls(problem, controls))
+        away = np.zeros(problem.num_robots, bool)
+        moments = _rolled_out(problem.arrays, problem.start, away, checked_controls(problem, controls))
         return Trajectory(
             states=moments.state,
             positions=np.ascontiguousarray(moments.state[..., : problem.dimension]),
@@ -132,12 +127,12 @@ class CpuEngine:
 
     def score(self, problem: Problem, controls: ArrayLike) -> FloatArray:
         """See :meth:`d4orm_env.engine.types.Engine.score`."""
-        samples, nobody = checked_controls(problem, controls, batch=True), np.zeros(problem.num_robots, bool)
+        samples, away = checked_controls(problem, controls, batch=True), np.zeros(problem.num_robots, bool)
         rewards = np.empty((len(samples), problem.num_robots), np.float32)
 
         def work(part: IntArray) -> None:
             for sample in range(*part):
-                moments = _rolled_out(problem.arrays, problem.start, nobody, samples[sample])
+                moments = _rolled_out(problem.arrays, problem.start, away, samples[sample])
                 rewards[sample] = moments.rewards[1:].mean(axis=0)
 
         self._threads.over(len(samples), work)

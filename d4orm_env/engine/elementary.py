@@ -11,17 +11,17 @@ from d4orm_env.engine.compiling import ONE, ZERO, compiled
 
 
 @compiled
-def _sqrt(x: float) -> float:
+def sqrt(x: float) -> float:
     return math.sqrt(x)
 
 
 @compiled
-def _minimum(a: np.float32, b: np.float32) -> np.float32:
+def minimum(a: np.float32, b: np.float32) -> np.float32:
     return a if a < b else b
 
 
 @compiled
-def _maximum(a: np.float32, b: np.float32) -> np.float32:
+def maximum(a: np.float32, b: np.float32) -> np.float32:
     return a if a > b else b
 
 
@@ -84,4 +84,4 @@ def _where(condition: bool, a: np.float32, b: np.float32) -> np.float32:
     return a if condition else b
 
 
-OPS = Ops(cosine, sine, _sqrt, _minimum, _maximum, arctan2, _where)
+OPS = Ops(cosine, sine, sqrt, minimum, maximum, arctan2, _where)

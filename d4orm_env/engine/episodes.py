@@ -62,7 +62,7 @@ def _tally(batch: WorldBatch, max_cycles: int, b: int) -> None:
     """Count the step that world ``b`` has just taken, and see whether its episode has ended."""
     num_robots = batch.arrived.shape[1]
     batch.steps[b] += 1
-    total, everybody = 0.0, True
+    total, all_arrived = 0.0, True
     for k in range(num_robots):
         total += batch.rewards[b, k]
         batch.contacts[b, k] += batch.collided[b, k]
@@ -71,11 +71,11 @@ def _tally(batch: WorldBatch, max_cycles: int, b: int) -> None:
             batch.arrival[b, k] = 0
         elif batch.arrival[b, k] == 0:
             batch.arrival[b, k] = batch.steps[b]
-        everybody &= batch.arrived[b, k]
+        all_arrived &= batch.arrived[b, k]
     batch.reward[b] = total / num_robots
     batch.total_reward[b] += total
-    batch.terminated[b] = everybody
-    batch.truncated[b] = batch.steps[b] >= max_cycles and not everybody
+    batch.terminated[b] = all_arrived
+    batch.truncated[b] = batch.steps[b] >= max_cycles and not all_arrived
 
 
 @inlined

@@ -2,20 +2,17 @@
 
 A robot is a body, and its trailers are further ones: see :class:`~d4orm_env.core.bodies.FootprintArrays`.
 Where the bodies of the plane are is kept in ``poses``, :data:`POSE` rows each: the heading as a unit vector, and the
-reference point relative to the robot's place. Those of body ``i`` begin at ``i * stride + begin``.
+reference point relative to the robot's position. Those of body ``i`` begin at ``i * stride + begin``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba.cpython.unsafe import numbers
 
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, trailing_zeros
 from d4orm_env.engine.convex_cores import (
     CORNERS,
     ball_meets_box,
@@ -29,15 +26,13 @@ from d4orm_env.engine.convex_cores import (
 )
 from d4orm_env.engine.elementary import cosine, sine
 from d4orm_env.engine.obstacles import cell_at
-from d4orm_env.engine.simd import CHUNK, NOWHERE, TILE, use_wide_registers
+from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, use_wide_registers
 
 POSE = 4
 """Rows of a body's pose."""
 
-_BIT = np.uint64(1)
 _CHUNK_BITS = np.uint64((1 << CHUNK) - 1)
 _HALF = np.float32(0.5)
-_trailing_zeros: Callable[..., int] = numbers.trailing_zeros
 
 
 @compiled
@@ -77,7 +72,7 @@ def _semi_axes(
 
 @compiled
 def _place_own(f: FootprintArrays, i: Whole, poses: FloatArray, stride: int, begin: Whole, core: FloatArray) -> None:
-    """Write body ``i`` of a robot about the robot's place."""
+    """Write body ``i`` of a robot about the robot's position."""
     o = i * stride + begin
     place_body(f, i, poses[o], poses[o + TILE], poses[o + 2 * TILE], poses[o + 3 * TILE], core)
 
@@ -89,14 +84,14 @@ def _meets_own(
     poses: FloatArray,
     stride: int,
     begin: Whole,
-    radius_sum: np.float32,
+    extra: np.float32,
     buffer: FloatArray,
 ) -> bool:
-    """Check whether a body of robot ``k`` is within ``radius_sum`` of the core in the second row of ``buffer``."""
+    """Check whether a body of robot ``k`` is within ``extra`` of the core in the second row of ``buffer``."""
     i = np.int64(k)
     while i >= 0:
         _place_own(f, i, poses, stride, begin, buffer[:TILE])
-        if cores_within(buffer[:TILE], buffer[TILE : 2 * TILE], radius_sum):
+        if cores_within(buffer[:TILE], buffer[TILE : 2 * TILE], extra):
             return True
         i = np.int64(f.following[i])
     return False
@@ -106,26 +101,26 @@ def _meets_own(
 def meets_body(
     f: FootprintArrays, k: Whole, own_radius: np.float32, poses: FloatArray, stride: int, begin: Whole,
     others: FootprintArrays, other: Whole, radius: np.float32, turns: FloatArray,
-    x: np.float32, y: np.float32, z: np.float32, planar: bool, radius_sum: np.float32, buffer: FloatArray,
+    x: np.float32, y: np.float32, z: np.float32, planar: bool, extra: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
-    """Check whether robot ``k`` is within ``radius_sum`` of another body, offset by ``(x, y, z)`` from it.
+    """Check whether robot ``k`` is within ``extra`` of another body, offset by ``(x, y, z)`` from it.
 
     That is number ``other`` of ``others``, its bodies' headings in ``turns``, or a disc or ball of its radius if it is
     number -1.
     """
     if not planar:
-        wider = _HALF * radius_sum
+        wider = _HALF * extra
         return balls_within(x, y, z, _semi_axes(f, k, own_radius, wider), _semi_axes(others, other, radius, wider))
     core = buffer[TILE : 2 * TILE]
     if other < 0:
         place_disc(radius, x, y, core)
-        return _meets_own(f, k, poses, stride, begin, radius_sum, buffer)
+        return _meets_own(f, k, poses, stride, begin, extra, buffer)
     j = np.int64(other)
     while j >= 0:
         c, s = (cosine(turns[j]), sine(turns[j])) if others.heading[j] >= 0 else (ONE, ZERO)
         x, y = x - others.hitch[j] * c, y - others.hitch[j] * s
         place_body(others, j, c, s, x, y, core)
-        if _meets_own(f, k, poses, stride, begin, radius_sum, buffer):
+        if _meets_own(f, k, poses, stride, begin, extra, buffer):
             return True
         j = np.int64(others.following[j])
     return False
@@ -133,45 +128,45 @@ def meets_body(
 
 @compiled
 def _refine_balls(
-    f: FootprintArrays, k: Whole, other: Whole, near: np.uint64, radius_sum: np.float32, positions: FloatArray,
+    f: FootprintArrays, k: Whole, other: Whole, near: np.uint64, extra: np.float32, positions: FloatArray,
     a: Whole, b: Whole,
 ) -> np.uint64:  # fmt: skip
-    sure, unsure, wider = near, near, _HALF * radius_sum
+    sure, unsure, wider = near, near, _HALF * extra
     own, its = _semi_axes(f, k, ZERO, wider), _semi_axes(f, other, ZERO, wider)
     while unsure != NOWHERE:
-        s = np.int64(_trailing_zeros(unsure))
-        unsure &= unsure - _BIT
+        s = np.int64(trailing_zeros(unsure))
+        unsure &= unsure - BIT
         x, y = positions[b + s] - positions[a + s], positions[b + TILE + s] - positions[a + TILE + s]
         if not balls_within(x, y, positions[b + 2 * TILE + s] - positions[a + 2 * TILE + s], own, its):
-            sure &= ~(_BIT << np.uint64(s))
+            sure &= ~(BIT << np.uint64(s))
     return sure
 
 
 @compiled
 def _refine_cores(
-    f: FootprintArrays, i: Whole, j: Whole, near: np.uint64, radius_sum: np.float32, positions: FloatArray, a: Whole,
+    f: FootprintArrays, i: Whole, j: Whole, near: np.uint64, extra: np.float32, positions: FloatArray, a: Whole,
     b: Whole, poses: FloatArray, p: Whole, q: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     sure, unsure, own, core = near, near, buffer[:TILE], buffer[TILE : 2 * TILE]
     while unsure != NOWHERE:
-        s = np.int64(_trailing_zeros(unsure))
-        unsure &= unsure - _BIT
+        s = np.int64(trailing_zeros(unsure))
+        unsure &= unsure - BIT
         m, n = p + s, q + s
         x = (positions[b + s] - positions[a + s]) + (poses[n + 2 * TILE] - poses[m + 2 * TILE])
         y = (positions[b + TILE + s] - positions[a + TILE + s]) + (poses[n + 3 * TILE] - poses[m + 3 * TILE])
         place_body(f, i, poses[m], poses[m + TILE], ZERO, ZERO, own)
         place_body(f, j, poses[n], poses[n + TILE], x, y, core)
-        if not cores_within(own, core, radius_sum):
-            sure &= ~(_BIT << np.uint64(s))
+        if not cores_within(own, core, extra):
+            sure &= ~(BIT << np.uint64(s))
     return sure
 
 
 @inlined
 def refine_chunk(
-    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, radius_sum: np.float32, dimension: int,
+    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, extra: np.float32, dimension: int,
     positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
-    """Return where, of the samples ``near`` among the first ``CHUNK``, two robots are as near as ``radius_sum``.
+    """Mask of the samples, of those ``near`` among the first ``CHUNK``, in which two robots are within ``extra``.
 
     Their positions are in the rows of ``positions`` from ``a`` and ``b`` on. ``f`` is the team's footprints; of discs,
     for which it is ``None``, it is known already. ``buffer`` is two rows to overwrite.
@@ -181,7 +176,7 @@ def refine_chunk(
     if near == NOWHERE:
         return near
     if dimension == 3:
-        return _refine_balls(f, k, other, near, radius_sum, positions, a, b)
+        return _refine_balls(f, k, other, near, extra, positions, a, b)
     touch, i = NOWHERE, np.int64(k)
     while i >= 0:
         j = np.int64(other)
@@ -192,10 +187,10 @@ def refine_chunk(
             if f.rectangles[i, 0] >= ZERO and f.rectangles[j, 0] >= ZERO:
                 one = (f.rectangles[i, 0], f.rectangles[i, 1], f.rectangles[i, 2])
                 its = (f.rectangles[j, 0], f.rectangles[j, 1], f.rectangles[j, 2])
-                total = f.rounding[i] + f.rounding[j] + radius_sum
+                total = f.rounding[i] + f.rounding[j] + extra
                 touch |= rectangles_within(one, its, left, total, positions, a, b, poses, p, q, buffer)
             else:
-                touch |= _refine_cores(f, i, j, left, radius_sum, positions, a, b, poses, p, q, buffer)
+                touch |= _refine_cores(f, i, j, left, extra, positions, a, b, poses, p, q, buffer)
             j = np.int64(f.following[j])
         i = np.int64(f.following[i])
     return touch
@@ -203,7 +198,7 @@ def refine_chunk(
 
 @inlined
 def refine_pair(
-    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, radius_sum: np.float32, dimension: int,
+    f: FootprintArrays | None, k: Whole, other: Whole, near: np.uint64, extra: np.float32, dimension: int,
     positions: FloatArray, a: Whole, b: Whole, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
     """:func:`refine_chunk` in all samples of a tile."""
@@ -213,7 +208,7 @@ def refine_pair(
     for s in range(0, TILE, CHUNK):
         part = (near >> np.uint64(s)) & _CHUNK_BITS
         part = refine_chunk(
-            f, k, other, part, radius_sum, dimension, positions, a + s, b + s, poses, stride, begin + s, buffer
+            f, k, other, part, extra, dimension, positions, a + s, b + s, poses, stride, begin + s, buffer
         )
         touch |= part << np.uint64(s)
     return touch
@@ -242,26 +237,11 @@ def _leaves_bounds(
 
 
 @compiled
-def _any_leaves_bounds(
-    f: FootprintArrays, bounds: FloatArray, k: Whole, position: tuple[np.float32, np.float32, np.float32],
-    poses: FloatArray, stride: int, begin: Whole, extra: np.float32, core: FloatArray,
-) -> bool:  # fmt: skip
-    i = np.int64(k)
-    while i >= 0:
-        if bounds.shape[1] == 2:
-            _place_own(f, i, poses, stride, begin, core)
-        if _leaves_bounds(f, bounds, i, position, extra, core):
-            return True
-        i = np.int64(f.following[i])
-    return False
-
-
-@compiled
-def _is_beyond(boxes: FloatArray, i: Whole, radius_sum: np.float32, x: np.float32, y: np.float32) -> bool:
-    """Check whether a rounded box of the plane is farther from a place than this."""
+def _is_beyond(boxes: FloatArray, i: Whole, distance: np.float32, x: np.float32, y: np.float32) -> bool:
+    """Check whether a rounded box of the plane is farther from a position than ``distance``."""
     gap_x, gap_y = max(boxes[i, 0] - x, x - boxes[i, 2], ZERO), max(boxes[i, 1] - y, y - boxes[i, 3], ZERO)
-    radius_sum += boxes[i, 4]
-    return bool(gap_x * gap_x + gap_y * gap_y > radius_sum * radius_sum)
+    distance += boxes[i, 4]
+    return bool(gap_x * gap_x + gap_y * gap_y > distance * distance)
 
 
 @compiled
@@ -270,9 +250,13 @@ def touches_static(
     poses: FloatArray, stride: int, begin: Whole, extra: np.float32, buffer: FloatArray,
 ) -> bool:  # fmt: skip
     """Check whether robot ``k`` at this position comes within ``extra`` of an obstacle or a bound."""
-    index, dimension = arrays.grid, arrays.goal.shape[1]
-    if _any_leaves_bounds(f, arrays.bounds, k, position, poses, stride, begin, extra, buffer[:TILE]):
-        return True
+    index, dimension, i = arrays.grid, arrays.goal.shape[1], np.int64(k)
+    while i >= 0:
+        if dimension == 2:
+            _place_own(f, i, poses, stride, begin, buffer[:TILE])
+        if _leaves_bounds(f, arrays.bounds, i, position, extra, buffer[:TILE]):
+            return True
+        i = np.int64(f.following[i])
     if index.clearance.shape[0] == 0:
         return False
     cell, (x, y, z) = cell_at(index, position, dimension), position
@@ -298,18 +282,18 @@ def refine_static(
     f: FootprintArrays | None, arrays: ProblemArrays, k: Whole, near: np.uint64, extra: np.float32,
     positions: FloatArray, poses: FloatArray, stride: int, begin: Whole, buffer: FloatArray,
 ) -> np.uint64:  # fmt: skip
-    """Return where, of the samples ``near``, robot ``k`` comes within ``extra`` of an obstacle or a bound.
+    """Mask of the samples, of those ``near``, in which robot ``k`` is within ``extra`` of an obstacle or a bound.
 
-    Its places are in the first rows of ``positions``; ``buffer`` is two rows to overwrite. ``f`` is as in
+    Its positions are in the first rows of ``positions``; ``buffer`` is two rows to overwrite. ``f`` is as in
     :func:`refine_chunk`.
     """
     if f is None:
         return near
     sure, unsure, planar = near, near, arrays.goal.shape[1] == 2
     while unsure != NOWHERE:
-        s = np.int64(_trailing_zeros(unsure))
-        unsure &= unsure - _BIT
+        s = np.int64(trailing_zeros(unsure))
+        unsure &= unsure - BIT
         position = (positions[s], positions[TILE + s], ZERO if planar else positions[2 * TILE + s])
         if not touches_static(f, arrays, k, position, poses, stride, begin + s, extra, buffer):
-            sure &= ~(_BIT << np.uint64(s))
+            sure &= ~(BIT << np.uint64(s))
     return sure

@@ -52,7 +52,7 @@ class KernelFiles(IndexDataCacheFile):
     """
 
     def load(self, key: tuple[object, ...]) -> Any:
-        """Return what is kept under a key, or ``None``."""
+        """Content kept under a key, or ``None``."""
         kept = super().load(key)
         # Two processes that add to an index at once may have given the same file to different keys.
         return kept[1] if kept is not None and kept[0] == key else None
@@ -155,8 +155,7 @@ def ship(cache: Path, folder: Path) -> None:
         with index.open("rb") as file:
             _, (stamp, _) = pickle.load(file), pickle.load(file)
         kept, shipped = (
-            KernelFiles(str(place), index.stem, mark)
-            for place, mark in ((index.parent, stamp), (folder, _SHIPPED_STAMP))
+            KernelFiles(str(path), index.stem, mark) for path, mark in ((index.parent, stamp), (folder, _SHIPPED_STAMP))
         )
         for key in kept._load_index():
             sig, _, source_key = key

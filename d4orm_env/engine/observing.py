@@ -1,4 +1,4 @@
-"""Kernels that observe many worlds of one problem at once, and who knows of whom."""
+"""Kernels that observe many worlds of one problem at once, and communication links between robots."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ class ObservationSpec(NamedTuple):
 
 @numba.njit(nogil=True, **OPTIONS)
 def allocate_sensed(num_robots: int, num_bodies: int, dimension: int, view: ObservationSpec) -> observation.Sensed:
-    everybody = num_robots + num_bodies
+    count = num_robots + num_bodies
     return observation.Sensed(
-        np.empty((everybody, dimension), np.float32), np.empty((everybody, dimension), np.float32),
-        np.empty(everybody, np.float32), np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
-        np.zeros(everybody, np.bool_), np.empty((5, 1), np.float32),
+        np.empty((count, dimension), np.float32), np.empty((count, dimension), np.float32),
+        np.empty(count, np.float32), np.empty((num_robots, 2), np.float32), np.empty(num_robots, np.float32),
+        np.zeros(count, np.bool_), np.empty((5, 1), np.float32),
         np.empty((view.num_neighbors, 2), np.float32), np.empty((view.num_obstacles, 2), np.float32),
     )  # fmt: skip
 
@@ -66,7 +66,7 @@ def _hide(
     position: FloatArray, positions: FloatArray, boxes: FloatArray, triangles: FloatArray, squared_range: np.float32,
     line_of_sight: bool, ray: FloatArray, hidden: BoolArray,
 ) -> None:  # fmt: skip
-    """Mark who is not observed from a place: beyond a range, and behind obstacles if asked."""
+    """Mark robots that are not observed from a position: beyond a range, and behind obstacles if asked."""
     for other in range(hidden.shape[0]):
         gap2 = ZERO
         for axis in range(position.shape[0]):
@@ -91,8 +91,8 @@ def communication_links(
 ) -> BoolArray:
     """``(K, K)`` bool: robot ``k`` at ``positions`` ``(K, d)`` knows of another one, as observations have it.
 
-    It knows nobody beyond ``communication_range`` [m], ``None`` for no limit, and with ``line_of_sight`` nobody behind
-    the problem's obstacles either.
+    It knows none beyond ``communication_range`` [m], ``None`` for no limit, and with ``line_of_sight`` none behind the
+    problem's obstacles either.
     """
     hidden = np.empty((len(positions), len(positions)), np.bool_)
     square = np.float32(np.inf if communication_range is None else communication_range**2)

@@ -6,26 +6,20 @@ are tested one by one, with the arithmetic of :mod:`d4orm_env.dynamics.collision
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba.cpython.unsafe import numbers
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import FloatArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics import collision
-from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import ONE, ZERO, compiled, inlined, to_fixed_tuple, trailing_zeros
 from d4orm_env.engine.elementary import OPS
-from d4orm_env.engine.simd import CHUNK, NOWHERE, TILE, at_most, use_wide_registers
+from d4orm_env.engine.simd import BIT, CHUNK, NOWHERE, TILE, at_most, use_wide_registers
 from d4orm_env.geometry.world_index import WorldIndex
 
 _HALF = np.float32(0.5)
-_BIT = np.uint64(1)
-
-_trailing_zeros: Callable[..., int] = numbers.trailing_zeros
-"""Its calls in compiled code lack the first argument, which type checkers cannot know."""
 
 
 @inlined
@@ -89,7 +83,7 @@ def is_closed(arrays: ProblemArrays) -> bool:
 
 @inlined
 def cell_at(index: WorldIndex, position: Any, dimension: int) -> np.int64:
-    """The number of the cell that holds a place, of the outermost one beyond the grid."""
+    """The number of the cell that holds a position, of the outermost one beyond the grid."""
     cell = np.int64(0)
     for axis in range(dimension):
         steps = np.int64(max((position[axis] - index.low[axis]) * index.scale, ZERO))
@@ -123,7 +117,7 @@ def _near_indexed(
     positions: FloatArray,
     buffer: FloatArray,
 ) -> np.uint64:
-    """Return where a body of this radius, centred at the first rows of ``positions``, touches an obstacle."""
+    """Mask of contacts of a body of this radius, centred at the first rows of ``positions``, with obstacles."""
     use_wide_registers()
     third = 2 * TILE if index.low.shape[0] == 3 else 0
     cells = buffer[TILE : 2 * TILE].view(np.uint32)
@@ -139,17 +133,17 @@ def _near_indexed(
     sure = at_most(buffer, 0, radius - index.slack)
     unsure = near & ~sure
     while unsure != NOWHERE:
-        sample = np.int64(_trailing_zeros(unsure))
-        unsure &= unsure - _BIT
+        sample = np.int64(trailing_zeros(unsure))
+        unsure &= unsure - BIT
         x, y, z = positions[sample], positions[TILE + sample], positions[third + sample]
         if _touches(index, boxes, triangles, np.int64(cells[sample]), radius, x, y, z):
-            sure |= _BIT << np.uint64(sample)
+            sure |= BIT << np.uint64(sample)
     return sure
 
 
 @inlined
 def near_obstacles(arrays: ProblemArrays, radius: np.float32, positions: FloatArray, buffer: FloatArray) -> np.uint64:
-    """Return where a body of this radius, centred at the first rows of ``positions``, touches an obstacle or a bound.
+    """Mask of contacts of a body of this radius, centred at the first rows of ``positions``, with obstacles or bounds.
 
     ``buffer`` is two rows to overwrite.
     """
@@ -176,16 +170,11 @@ def may_touch(
     axis_step: int,
     buffer: FloatArray,
 ) -> bool:
-    """Check whether a body may touch an obstacle anywhere in the lanes of :func:`~d4orm_env.engine.simd.enclose`.
+    """Check whether a body may touch an obstacle, of which there are some, in the lanes of
+    :func:`~d4orm_env.engine.simd.enclose`.
 
-    Args:
-        index: Index of the obstacles; there must be some.
-        radius: The body's.
-        widening: Excess of its lanes over its positions.
-        boxes: The lanes, those of the first axis from ``begin`` on, those of the next ``axis_step`` later.
-        begin: See ``boxes``.
-        axis_step: See ``boxes``.
-        buffer: Two rows to overwrite.
+    The lanes of the first axis are in ``boxes`` from ``begin`` on, those of the next ``axis_step`` later, each
+    ``widening`` larger than its positions. ``buffer`` is two rows to overwrite.
     """
     use_wide_registers()
     middles, squares, beyond = buffer[:CHUNK], buffer[CHUNK : 2 * CHUNK], buffer[2 * CHUNK : 3 * CHUNK]

@@ -226,15 +226,10 @@ def _count_bodies(f: FootprintArrays | None, num_robots: int) -> int:
 def cast_rays(
     s: Surroundings, state: FloatArray, bodies: FloatArray, first: int, part: IntArray, out: FloatArray
 ) -> None:
-    """Fill ``R`` components from ``first`` on of observations with distances along the rays [m].
+    """Fill ``R`` components from ``first`` on of observations ``out`` ``(B, K, D)`` with distances along rays [m].
 
-    Args:
-        s: What rays meet.
-        state: ``(B, K, n)``.
-        bodies: ``(B, N, 5)`` position, velocity and radius of what moves among the robots and is none.
-        first: Component of the first ray.
-        part: First tile of worlds and the one after the last.
-        out: ``(B, K, D)`` observations, output.
+    Robots are in ``state`` ``(B, K, n)``, among ``bodies`` ``(B, N, 5)``: position, velocity and radius of moving
+    obstacles. ``part`` is the first tile of worlds and the one after the last.
     """
     num_rays, fixed = s.directions.shape[0], s.boxes.shape[0] + s.triangles.shape[0]
     mobile = fixed + _count_bodies(s.footprints, state.shape[1])

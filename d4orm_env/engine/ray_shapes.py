@@ -23,10 +23,7 @@ _PARALLEL = np.float32(1e-15)
 def meet_disc(
     x: np.float32, y: np.float32, radius: np.float32, fan: FloatArray, row: FloatArray, begin: Whole, end: Whole
 ) -> None:
-    """Shorten rays by a disc at a relative position.
-
-    ``fan`` ``(4, .)`` has directions, and one over these. Rays from ``begin`` to ``end`` are shortened.
-    """
+    """Shorten rays by a disc at a relative position."""
     use_wide_registers()
     for i in range(np.uint64(begin), np.uint64(end)):
         along, across = x * fan[0, i] + y * fan[1, i], x * fan[1, i] - y * fan[0, i]
@@ -136,25 +133,25 @@ def _meet_nearby(
     y: np.float32,
     boxes: FloatArray,
     triangles: FloatArray,
-    reach: np.float32,
+    distance: np.float32,
     fan: FloatArray,
     row: FloatArray,
 ) -> None:
-    """Shorten one ray by all obstacles that are near enough."""
+    """Shorten one ray by all obstacles within ``distance`` of ``(x, y)``."""
     for j in range(boxes.shape[0]):
         low_x, low_y, high_x, high_y = boxes[j, 0] - x, boxes[j, 1] - y, boxes[j, 2] - x, boxes[j, 3] - y
         if boxes[j, 4] > ZERO:
-            if low_x * low_x + low_y * low_y <= (reach + boxes[j, 4]) * (reach + boxes[j, 4]):
+            if low_x * low_x + low_y * low_y <= (distance + boxes[j, 4]) * (distance + boxes[j, 4]):
                 meet_disc(low_x, low_y, boxes[j, 4], fan, row, 0, 1)
             continue
         gap_x, gap_y = max(low_x, -high_x, ZERO), max(low_y, -high_y, ZERO)
-        if gap_x * gap_x + gap_y * gap_y <= reach * reach:
+        if gap_x * gap_x + gap_y * gap_y <= distance * distance:
             meet_box(low_x, low_y, high_x, high_y, fan, row, 0, 1)
     for j in range(triangles.shape[0]):
         c = triangles[j]
         gap_x = max(min(c[0], c[2], c[4]) - x, x - max(c[0], c[2], c[4]), ZERO)
         gap_y = max(min(c[1], c[3], c[5]) - y, y - max(c[1], c[3], c[5]), ZERO)
-        if gap_x * gap_x + gap_y * gap_y <= reach * reach:
+        if gap_x * gap_x + gap_y * gap_y <= distance * distance:
             meet_triangle(x, y, c, fan, row, 0, 1)
 
 

@@ -42,11 +42,11 @@ def _mover(model: Model) -> Callable[..., None]:
         dt, docking = arrays.time_step, docking_of(arrays, k)
         h = transition.TimeStep(dt[0], dt[1], dt[2], dt[3])
         limits, goal = to_fixed_tuple(arrays.limits[k], num_limits), to_fixed_tuple(moments.goal[0, k], d)
-        standing = transition.absorbed(moments.arrived[t - 1, k], arrays.docks)
+        at_rest = transition.absorbed(moments.arrived[t - 1, k], arrays.docks)
         u = limit_control(to_fixed_tuple(moments.control[t, k], m), limits, OPS)
-        u = pick_u(standing, no_control, u)
-        x = move(standing, to_fixed_tuple(moments.state[t - 1, k], n), u, limits, h)
-        x, _, moments.arrived[t, k] = dock(standing, x, u, limits, goal, docking)
+        u = pick_u(at_rest, no_control, u)
+        x = move(at_rest, to_fixed_tuple(moments.state[t - 1, k], n), u, limits, h)
+        x, _, moments.arrived[t, k] = dock(at_rest, x, u, limits, goal, docking)
         for i in range(m):
             moments.control[t, k, i] = u[i]
         for i in range(n):

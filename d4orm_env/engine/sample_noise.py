@@ -16,6 +16,7 @@ from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.engine import noise
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import INLINED, OPTIONS, compiled, inlined
+from d4orm_env.engine.elementary import sqrt
 from d4orm_env.engine.noise import DRAWS
 from d4orm_env.engine.simd import copy_chunk, use_wide_registers
 from d4orm_env.engine.stepping import Row
@@ -68,12 +69,7 @@ def _bits_float(x: np.int32) -> np.float32:
     return np.int32(x).view(np.float32)
 
 
-@compiled
-def _sqrt(x: np.float32) -> np.float32:
-    return np.sqrt(x)
-
-
-BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, _sqrt)
+BIT_OPS = noise.BitOps(_uint32, _int32, _to_float, _float_bits, _bits_float, sqrt)
 
 
 @compiled
@@ -106,16 +102,11 @@ def _draw(key: tuple[np.uint32, np.uint32], first: int, draws: FloatArray) -> No
 def draw_block(
     keys: NDArray[np.uint32], first: int, begin: int, count: int, num_pairs: int, kept: FloatArray, draws: FloatArray
 ) -> None:
-    """Draw a robot's noise of a block of ``count`` steps.
+    """Draw a robot's noise of a block of ``count`` steps, with ``keys`` ``(2, K H P)`` of :func:`fill_keys`.
 
-    Args:
-        keys: ``(2, K H P)`` see :func:`fill_keys`.
-        first: The tile's first counter number.
-        begin: Number of the robot's stream at the first step.
-        count: Steps in the block.
-        num_pairs: ``P``, pairs of components.
-        kept: ``(T K H P 2 DRAWS,)`` where the noise is kept, output.
-        draws: ``(BLOCK 4 DRAWS,)`` the same noise, two rows for each of up to two pairs of components, output.
+    ``first`` is the tile's first counter number, ``begin`` the number of the robot's stream at the first step, and
+    ``num_pairs`` is ``P``. Filled are ``kept`` ``(T K H P 2 DRAWS,)`` and with the same noise ``draws``
+    ``(BLOCK 4 DRAWS,)``, two rows for each of up to two pairs of components.
     """
     # Of all tiles before this one.
     before = first // DRAWS * keys.shape[1]

@@ -43,6 +43,7 @@ BOX = 2 * (TILE + CHUNK)
 
 NOWHERE = np.uint64(0)
 """The mask of what holds in no world."""
+BIT = np.uint64(1)
 
 _FLOATS = ir.VectorType(ir.FloatType(), CHUNK)
 _FLAGS = ir.VectorType(ir.IntType(1), CHUNK)
@@ -118,14 +119,14 @@ def _instructions(result: Type, *kinds: Type | None) -> Callable[[Callable[[_Wri
 
 
 def _within(dimension: int, count: int) -> Callable[..., np.uint64]:
-    """``(w, a, b, squared_radius_sum) -> mask``: where the positions in the rows from ``w[a]`` and ``w[b]`` on are
+    """``(w, a, b, squared_distance) -> mask``: where the positions in the rows from ``w[a]`` and ``w[b]`` on are
     near, in the first ``count`` worlds.
     """
 
     @_instructions(uint64, _ARRAY, int64, int64, float32)
     def within(writer: _Writer) -> Value:
-        _, a, b, squared_radius_sum = writer.arguments
-        bound = writer.splat(squared_radius_sum)
+        _, a, b, squared_distance = writer.arguments
+        bound = writer.splat(squared_distance)
 
         def near(first: int) -> Value:
             total = None

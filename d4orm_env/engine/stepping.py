@@ -34,7 +34,7 @@ from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.simd import TILE
 
 Row: TypeAlias = tuple[np.float32, ...]
-"""A state, a control, limits, a place or a velocity of one robot in one world."""
+"""A state, a control, limits, a position or a velocity of one robot in one world."""
 
 
 @compiled
@@ -132,7 +132,7 @@ Docker: TypeAlias = Callable[[bool, Row, Row, Row, Row, Docking], tuple[Row, np.
 
 @inlined
 def docking_of(arrays: ProblemArrays, k: Whole) -> Docking:
-    """Return how robot ``k`` docks.
+    """Docking conditions of robot ``k``.
 
     Numbers only: a function without reference counts must not hand out arrays.
     """
@@ -183,7 +183,7 @@ def _in_scalar_style(function: ModelFunction) -> ModelFunction:
 def make_stepper(model: Model) -> tuple[Mover, Docker]:
     """The two halves of the compiled step of one robot of this model in one world, for a control within its limits.
 
-    ``move(standing, x, u, limits, h) -> x`` and ``dock(standing, x, u, limits, goal, docking) -> (x, squared distance
+    ``move(at_rest, x, u, limits, h) -> x`` and ``dock(at_rest, x, u, limits, goal, docking) -> (x, squared distance
     to the goal, whether docked)``.
     """
     functions = ModelFunctions(*(inlined(_in_scalar_style(function)) for function in model.functions))
@@ -192,16 +192,16 @@ def make_stepper(model: Model) -> tuple[Mover, Docker]:
     faces = _facing(model)
 
     @inlined
-    def move(standing: bool, x: Row, u: Row, limits: Row, h: TimeStep) -> Row:
-        return pick_x(standing, x, transition.advance(functions, x, u, limits, h, OPS))
+    def move(at_rest: bool, x: Row, u: Row, limits: Row, h: TimeStep) -> Row:
+        return pick_x(at_rest, x, transition.advance(functions, x, u, limits, h, OPS))
 
     @inlined
-    def dock(standing: bool, x: Row, u: Row, limits: Row, goal: Row, docking: Docking) -> tuple[Row, np.float32, bool]:
+    def dock(at_rest: bool, x: Row, u: Row, limits: Row, goal: Row, docking: Docking) -> tuple[Row, np.float32, bool]:
         gap2 = squared_gap(x, goal)
         speed2 = squared_norm(functions.velocity(x, u, limits, OPS))
         arrives = transition.arrives(gap2, speed2, docking[0], docking[1]) & faces(docking[3][0], x, docking[3])
         docks = transition.absorbed(arrives, docking[2])
-        return pick_x(docks, functions.rest(x, ZERO), x), gap2, standing | arrives
+        return pick_x(docks, functions.rest(x, ZERO), x), gap2, at_rest | arrives
 
     return move, dock
 
@@ -212,10 +212,10 @@ def _facing(model: Model) -> Callable[[np.bool_ | None, Row, GoalHeading], bool]
     if index is None:
 
         @inlined
-        def anyhow(turns: np.bool_ | None, x: Row, heading: GoalHeading) -> bool:
+        def always(turns: np.bool_ | None, x: Row, heading: GoalHeading) -> bool:
             return True
 
-        return anyhow
+        return always
 
     @inlined
     def faces(turns: np.bool_ | None, x: Row, heading: GoalHeading) -> bool:

@@ -1,4 +1,4 @@
-"""The step of a tile of worlds, compiled with numba from the scalar functions of :mod:`d4orm_env.core`.
+"""The step of a tile of worlds, compiled with numba from the scalar functions of :mod:`d4orm_env.dynamics`.
 
 A tile is a block of :data:`~d4orm_env.engine.simd.TILE` worlds (samples of a plan, or environments) that differ in
 their numbers only. All a tile needs lies in one flat float32 array, the workspace: for every robot :data:`ROWS` rows,
@@ -47,7 +47,7 @@ STATE, CONTROL, GOAL, ARRIVED, DISTANCE2, BUFFER, ROWS = 0, 6, 10, 13, 14, 15, 1
 STRIDE = ROWS * TILE
 
 BIG_TEAM = 128
-"""Robots from which on pairs are told apart by boxes: where worlds differ that takes a tenth longer at most."""
+"""Robots from which on boxes are compared before pairs: where worlds differ that takes a tenth longer at most."""
 WIDER = np.float32(1 + 2.0**-6)
 """Factor by which the distance of boxes that are apart is stretched for rounding."""
 
@@ -74,17 +74,17 @@ def _mover(model: Model) -> Callable[..., None]:
         use_wide_registers()
         limits = to_fixed_tuple(all_limits, num_limits)
         for s in range(TILE):
-            standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
+            at_rest = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
             u = limit_control(read_u(w, CONTROL * TILE, s), limits, OPS)
-            write_u(w, CONTROL * TILE, s, pick_u(standing, no_control, u))
+            write_u(w, CONTROL * TILE, s, pick_u(at_rest, no_control, u))
         for s in range(TILE):
-            standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
+            at_rest = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
             u = read_u(w, CONTROL * TILE, s)
-            write_x(w, STATE * TILE, s, move(standing, read_x(w, STATE * TILE, s), u, limits, h))
+            write_x(w, STATE * TILE, s, move(at_rest, read_x(w, STATE * TILE, s), u, limits, h))
         for s in range(TILE):
-            standing = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
+            at_rest = transition.absorbed(w[ARRIVED * TILE + s] > ZERO, docking[2])
             x, u = read_x(w, STATE * TILE, s), read_u(w, CONTROL * TILE, s)
-            x, gap2, arrived = dock(standing, x, u, limits, read_goal(w, GOAL * TILE, s), docking)
+            x, gap2, arrived = dock(at_rest, x, u, limits, read_goal(w, GOAL * TILE, s), docking)
             write_x(w, STATE * TILE, s, x)
             w[ARRIVED * TILE + s] = ONE if arrived else ZERO
             w[DISTANCE2 * TILE + s] = gap2
@@ -110,7 +110,7 @@ def robot_mover(names: tuple[str, ...]) -> RobotMover:
 
 @inlined
 def measure_goal_distance(num_robots: int, dimension: int, w: FloatArray) -> None:
-    """Fill the squared distance to the goal from places."""
+    """Fill the squared distances from the positions to the goals."""
     for k in range(num_robots):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
         for s in range(TILE):
@@ -121,17 +121,9 @@ def measure_goal_distance(num_robots: int, dimension: int, w: FloatArray) -> Non
             robot[DISTANCE2 * TILE + s] = total
 
 
-@inlined
-def near_pair(radius_sum: np.float32, a: int, b: int, dimension: int, w: FloatArray) -> np.uint64:
-    """Return where two centres, in the rows of ``w`` from ``a`` and from ``b`` on, are within ``radius_sum``."""
-    if dimension == 2:
-        return within_2(w, a, b, radius_sum * radius_sum)
-    return within_3(w, a, b, radius_sum * radius_sum)
-
-
 @register_jitable(nogil=True, **OPTIONS)
 def pose_rows(f: FootprintArrays | None) -> int:
-    """Return how many rows the poses of a team's bodies take; they are the last of the workspace."""
+    """Number of rows that the poses of a team's bodies take; they are the last of the workspace."""
     return 0 if f is None else POSE * f.heading.shape[0]
 
 
@@ -194,12 +186,12 @@ def _sort_boxes(corners: FloatArray, order: IntArray) -> None:
 
 
 @inlined
-def _is_apart(corners: FloatArray, k: Whole, other: Whole, radius_sum: np.float32) -> bool:
-    """Check whether two robots' boxes are farther apart than ``radius_sum``."""
+def _is_apart(corners: FloatArray, k: Whole, other: Whole, distance: np.float32) -> bool:
+    """Check whether two robots' boxes are farther apart than ``distance``."""
     apart = False
     for axis in range(corners.shape[2]):
         gap = max(corners[k, 0, axis] - corners[other, 1, axis], corners[other, 0, axis] - corners[k, 1, axis])
-        apart |= gap > WIDER * radius_sum
+        apart |= gap > WIDER * distance
     return apart
 
 
@@ -230,8 +222,9 @@ def mark_pairs(
                     break
                 if _is_apart(corners, k, other, arrays.radius[k] + arrays.radius[other] + extra):
                     continue
-            a, b = k * STRIDE, other * STRIDE
-            touch = near_pair(arrays.radius[k] + arrays.radius[other] + extra, a, b, dimension, w)
+            a, b, distance = k * STRIDE, other * STRIDE, arrays.radius[k] + arrays.radius[other] + extra
+            square = distance * distance
+            touch = within_2(w, a, b, square) if dimension == 2 else within_3(w, a, b, square)
             touch = refine_pair(f, k, other, touch, extra, dimension, w, a, b, w, POSE * TILE, poses, buffer)
             near[k, ROBOT] |= touch
             near[other, ROBOT] |= touch
@@ -239,9 +232,9 @@ def mark_pairs(
 
 @inlined
 def near_round(
-    radius_sum: np.float32, centre: FloatArray, axes: int, positions: FloatArray, buffer: FloatArray
+    distance: np.float32, centre: FloatArray, axes: int, positions: FloatArray, buffer: FloatArray
 ) -> np.uint64:
-    """Return where the first rows of ``positions`` are within ``radius_sum`` of a centre, over two or three axes.
+    """Mask of the first rows of ``positions`` within ``distance`` of a centre, over two or three axes.
 
     ``buffer`` is a row to overwrite.
     """
@@ -253,7 +246,7 @@ def near_round(
         spot = (centre[0], centre[1], centre[2])
         for s in range(TILE):
             buffer[s] = squared_gap3(read3(positions, 0, s), spot)
-    return at_most(buffer, 0, radius_sum * radius_sum)
+    return at_most(buffer, 0, distance * distance)
 
 
 def _motion_reader(model: Model) -> Callable[..., None]:

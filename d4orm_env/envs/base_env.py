@@ -88,25 +88,25 @@ class TeamSimulation(Simulation):
     def reset(self, random: np.random.Generator) -> TeamStep:
         """Begin an episode at the start; everything random in it follows from one draw from ``random``."""
         # One draw per episode, so that an episode does not depend on how long those before it were.
-        observations, self._running = self._unseen(), True
+        observations, self._running = self._new_observations(), True
         self.reset_worlds({0: int(random.integers(2**63))}, observations)
         self.terms = no_terms(self.setup.reward, self.worlds.arrived.shape)
         self._trail: deque[FloatArray] = deque(maxlen=_TRAIL_LENGTH)
-        return self._unpaid(observations)
+        return self._report_unrewarded(observations)
 
     def step(self, controls: FloatArray) -> TeamStep:
         """Advance one time step under ``controls`` ``(K, m)``, or actions; those of docked robots do not matter."""
         self.require_reset()
-        observations = self._unseen()
+        observations = self._new_observations()
         self.step_worlds(self.controls(controls[None]), observations)
         return self._report(observations, self.robot_rewards[0], self.reached[0])
 
     def set_state(self, states: ArrayLike) -> TeamStep:
         """Put the robots into states ``(K, n)``; see :meth:`Simulation.put_robots`."""
         self.require_reset()
-        observations = self._unseen()
+        observations = self._new_observations()
         self.put_robots(states, self.arrived, observations)
-        return self._unpaid(observations)
+        return self._report_unrewarded(observations)
 
     def state(self) -> FloatArray:
         """The joint state vector as it is seen; see :mod:`d4orm_env.envs.joint_state`."""
@@ -135,10 +135,10 @@ class TeamSimulation(Simulation):
         states, controls, bodies = (part[0] for part in shown)
         return join_state(JointState(states, self.goals, controls, self.arrived, int(self.worlds.steps[0]), bodies))
 
-    def _unseen(self) -> FloatArray:
+    def _new_observations(self) -> FloatArray:
         return np.empty((1, self.problem.num_robots, self.setup.layout.size), np.float32)
 
-    def _unpaid(self, observations: FloatArray) -> TeamStep:
+    def _report_unrewarded(self, observations: FloatArray) -> TeamStep:
         return self._report(observations, np.zeros(len(self.arrived), np.float32), self.arrived.copy())
 
     def _report(self, observations: FloatArray, rewards: FloatArray, arrived: BoolArray) -> TeamStep:
@@ -243,7 +243,7 @@ class BaseEnv:
         return self._simulation.state()
 
     def true_state(self) -> FloatArray:
-        """:meth:`state` as it truly is, where a disturbance of what is seen has it told otherwise."""
+        """:meth:`state` as it truly is, without disturbances of what is seen."""
         return self._simulation.true_state()
 
     def effect(self) -> DisturbanceEffect:

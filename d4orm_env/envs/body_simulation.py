@@ -39,7 +39,7 @@ class SimulatedBodies(Protocol):
 
     @property
     def sensed(self) -> FloatArray | None:
-        """``(K, n)`` states for who decides on controls, if they are not the true ones."""
+        """``(K, n)`` states as a controller sees them, if they are not the true ones."""
 
     def begin(self, seed: int) -> None:
         """Put all robots at the start, and let go of those that were held; the seed is of what is random."""
@@ -112,8 +112,8 @@ class BodySimulation(TeamSimulation):
         true = self.worlds.state
         if not self._moving or self.bodies is None or self.bodies.sensed is None:
             return true
-        standing = np.asarray(absorbed(self.worlds.arrived, self.problem.docks))
-        return np.where(standing[..., None], true, self.bodies.sensed)
+        at_rest = np.asarray(absorbed(self.worlds.arrived, self.problem.docks))
+        return np.where(at_rest[..., None], true, self.bodies.sensed)
 
     def _begin(self, seeds: Mapping[int, int]) -> None:
         super()._begin(seeds)
@@ -129,14 +129,14 @@ class BodySimulation(TeamSimulation):
         assert self.bodies is not None
         worlds, true = self.worlds, self.problems.true[0]
         team, docks = self.problem.team, self.problem.docks
-        standing = np.asarray(absorbed(self.arrived, docks))
-        limited = self._limited(controls[0], true.limits, standing)
+        at_rest = np.asarray(absorbed(self.arrived, docks))
+        limited = self._limited(controls[0], true.limits, at_rest)
         true = true._replace(goal=self.goals)
         present = worlds.bodies[0, :, -1:] > 0
         states, touched = self.bodies.advance(limited, true, np.where(present, worlds.bodies[0], _OUT_OF_THE_WAY))
-        states = self._measured(states, standing)
-        arrived = standing | reached_goals(team, true, states, limited)
-        docking = np.flatnonzero(np.asarray(absorbed(arrived, docks)) & ~standing)
+        states = self._measured(states, at_rest)
+        arrived = at_rest | reached_goals(team, true, states, limited)
+        docking = np.flatnonzero(np.asarray(absorbed(arrived, docks)) & ~at_rest)
         for robot in docking:
             model = team.robot_models[robot]
             states[robot, : model.state_size] = model.functions.rest(states[robot, : model.state_size], np.float32(0))
@@ -144,18 +144,18 @@ class BodySimulation(TeamSimulation):
         worlds.state[0], worlds.control[0], worlds.arrived[0], worlds.collided[0] = states, limited, arrived, touched
         return MOVED
 
-    def _limited(self, controls: FloatArray, limits: FloatArray, standing: BoolArray) -> FloatArray:
+    def _limited(self, controls: FloatArray, limits: FloatArray, at_rest: BoolArray) -> FloatArray:
         """``controls`` within the robots' limits, zero for those at rest."""
         limited: FloatArray = np.zeros(controls.shape, np.float32)
-        for robot in np.flatnonzero(~standing):
+        for robot in np.flatnonzero(~at_rest):
             model = self.problem.team.robot_models[robot]
             wanted = as_float32(controls[robot, : model.control_size])
             limited[robot, : model.control_size] = model.functions.limit_control(wanted, limits[robot], NUMPY_OPS)
         return limited
 
-    def _measured(self, states: FloatArray, standing: BoolArray) -> FloatArray:
+    def _measured(self, states: FloatArray, at_rest: BoolArray) -> FloatArray:
         """Return the known states: robots at rest are where they docked, and no speed is beyond the spaces."""
-        states = np.where(standing[:, None], self.states, states)
+        states = np.where(at_rest[:, None], self.states, states)
         most = self.setup.slack.speed + self.problem.team.max_speed
         for robot, model in enumerate(self.problem.team.robot_models):
             columns = list(model.speed_indices)

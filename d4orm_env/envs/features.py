@@ -1,4 +1,4 @@
-"""Features of an observation: the same things, seen from the robot and in its own measure.
+"""Features of an observation: the same quantities, in the robot's own frame and units.
 
 A problem that is turned or moved as a whole is the same problem. Vectors are therefore given in a frame of the robot's
 own: its first axis points to the goal where controls are vectors of the world, which are turned back, and forward where
@@ -18,9 +18,6 @@ from d4orm_env.core.observation_layout import ObservationLayout, ObservationSlic
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.paths.shortest_paths import along_paths
-
-TURNED_MODELS = frozenset({"holonomic2d", "holonomic3d", "velocity2d"})
-"""Models whose controls are vectors of the world."""
 
 ArrayOrTensor: TypeAlias = Any
 """An array of NumPy or JAX, or a tensor of torch."""
@@ -56,8 +53,11 @@ class Features:
     @classmethod
     def of(cls, slices: ObservationSlices, model: str) -> Features:
         """Make features for the observations of robots of a model."""
-        turns = get_model(model).heading_index is not None
-        return cls(slices, model in TURNED_MODELS, "heading" if turns else "goal")
+        kind = get_model(model)
+        if kind.heading_index is not None:
+            return cls(slices, False, "heading")
+        # A limit that all components of the control share bounds its norm: it is a vector of the world.
+        return cls(slices, kind.control_size == kind.dimension and len(set(kind.control_limits)) == 1)
 
     @classmethod
     def of_team(cls, slices: ObservationSlices, team: Team) -> Features:
@@ -130,25 +130,16 @@ class Features:
     def along(self, observations: FloatArray, direction: NDArray[np.floating], length: NDArray[np.floating]) -> None:
         """Put the goals where the shortest paths seem to lead, as far off as these are long.
 
-        Among walls the goal itself says little of where to go; without obstacles nothing changes. Robots at their goals
-        and those without a path see their goals.
-
-        Args:
-            observations: ``(N, D)``, whose goals are changed.
-            direction: ``(N, d)`` along the paths.
-            length: ``(N,)`` of the paths [m].
+        Among walls the goal itself is a poor guide; without obstacles nothing changes. Robots at their goals and those
+        without a path see their goals. Changed are ``observations`` ``(N, D)``; paths have unit vectors ``direction``
+        ``(N, d)`` and a ``length`` ``(N,)`` [m].
         """
         ahead, known = along_paths(direction, length)
         observations[known, self.slices.own.goal] = ahead[known]
 
     def encode(self, observations: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Features of ``N`` robots.
-
-        Args:
-            observations: ``(N, D)``.
-
-        Returns:
-            Features ``(N, F)``, and frames ``(N, 2)``: cosine and sine of the direction of their first axis.
+        """Features ``(N, F)`` of observations ``(N, D)``, and frames ``(N, 2)``: cosine and sine of the direction of
+        their first axis.
         """
         own, count = self.slices.own, len(observations)
         goal, max_speed = observations[:, own.goal], observations[:, own.max_speed]
@@ -175,15 +166,10 @@ class Features:
         return features, frame.astype(np.float32)
 
     def decode(self, actions: FloatArray, frames: FloatArray, limits: FloatArray) -> FloatArray:
-        """Controls for a network's actions.
+        """``(..., m)`` controls in physical units, within the limits: as a vector where controls are vectors.
 
-        Args:
-            actions: ``(..., m)`` in units of the limits, in the robots' frames.
-            frames: ``(..., 2)`` as from :meth:`encode`.
-            limits: ``(..., m)`` largest controls.
-
-        Returns:
-            ``(..., m)`` controls in physical units, within the limits: as a vector where controls are vectors.
+        A network's ``actions`` ``(..., m)`` are in units of the ``limits`` ``(..., m)``, in ``frames`` ``(..., 2)`` as
+        from :meth:`encode`.
         """
         xp = namespace(actions)
         controls = xp.clip(actions, -1, 1) * limits
@@ -193,15 +179,8 @@ class Features:
         return within
 
     def actions(self, controls: FloatArray, frames: FloatArray, limits: FloatArray) -> FloatArray:
-        """The actions that :meth:`decode` makes these controls of.
-
-        Args:
-            controls: ``(N, m)`` in physical units; clipped to the limits.
-            frames: ``(N, 2)`` as from :meth:`encode`.
-            limits: ``(N, m)`` largest controls.
-
-        Returns:
-            ``(N, m)`` in ``[-1, 1]``.
+        """``(N, m)`` actions in ``[-1, 1]`` for which :meth:`decode` gives ``controls`` ``(N, m)``, clipped to the
+        limits; its other arguments.
         """
         if self.turned:
             within = controls * np.minimum(1, limits / np.maximum(_norm(controls), 1e-6))
@@ -221,11 +200,11 @@ class Features:
         xp = namespace(observations)
         max_speed = observations[:, own.max_speed]
         position, velocity = seen[..., part.position], seen[..., part.velocity]
-        reach = observations[:, None, own.radius] + seen[..., part.radius]
-        gap = xp.maximum(_norm(position) - reach, 0)
+        radius_sum = observations[:, None, own.radius] + seen[..., part.radius]
+        gap = xp.maximum(_norm(position) - radius_sum, 0)
         approach = -_dot(position, velocity)
         time = xp.clip(approach / xp.maximum(_dot(velocity, velocity), 1e-6), 0, _HORIZON)
-        miss = xp.maximum(_norm(position + time * velocity) - reach, 0)
+        miss = xp.maximum(_norm(position + time * velocity) - radius_sum, 0)
         parts = [
             xp.ones_like(gap),
             _into(frame[:, None], _unit(position)),

@@ -148,7 +148,7 @@ def _robot_bounds(
     limits = team.limits.astype(np.float64)
     speed, acceleration = limits[:, SPEED], limits[:, ACCELERATION]
     # Within a step a robot may exceed the speed limit, which is applied at its end.
-    reach = (speed + acceleration * problem.dt / 2 + slack.drift) * duration + slack.distance
+    travel = (speed + acceleration * problem.dt / 2 + slack.drift) * duration + slack.distance
     high = np.ones((problem.num_robots, problem.state_size))
     for robot, model in enumerate(team.robot_models):
         high[robot, dimension : model.state_size] = LARGEST  # what no limit bounds
@@ -157,6 +157,6 @@ def _robot_bounds(
         for index, column in model.state_limits:
             high[robot, index] = limits[robot, column]
     low = -high
-    low[:, :dimension] = positions[0] - reach[:, None]
-    high[:, :dimension] = positions[1] + reach[:, None]
+    low[:, :dimension] = positions[0] - travel[:, None]
+    high[:, :dimension] = positions[1] + travel[:, None]
     return low, high

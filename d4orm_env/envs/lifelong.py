@@ -81,6 +81,6 @@ def fresh_goal(
         if free.any():
             return as_float32(candidates[np.argmax(free)])
     raise RuntimeError(
-        f"no free place for a new goal of robot_{robot} between {low.tolist()} and {high.tolist()}; "
+        f"no free position for a new goal of robot_{robot} between {low.tolist()} and {high.tolist()}; "
         "use a larger world, fewer robots or a smaller margin for lifelong mode"
     )

@@ -41,9 +41,9 @@ class EnvOptions:
         problem: The problem to run instead of a scenario.
         render_mode: ``"rgb_array"``, ``"human"`` or ``None``.
         control_noise_std: Standard deviation of Gaussian execution noise, in the controls' units, for all components
-            or one per component. It is added before the control is clipped.
-            It is short for ``ControlNoise(std)`` as the first of the disturbances.
-        disturbances: Disturbances, in the order in which it acts: instances of :mod:`d4orm_env.disturbances`, or of
+            or one per component, added before the control is clipped: short for ``ControlNoise(std)`` as the first of
+            the disturbances.
+        disturbances: Disturbances, in the order in which they act: instances of :mod:`d4orm_env.disturbances`, or of
             subclasses of your own. Those at level zero leave the environment as it is.
         lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated, and so may arrive
             at any speed unless ``goal_speed`` is given; its info says ``arrived`` at that step, and
@@ -55,8 +55,7 @@ class EnvOptions:
             :class:`~d4orm_env.envs.rewards.RewardInput` to the rewards ``(..., K)`` of all robots.
         progress: Distances of rewards, the paper's among them: ``"straight"``, or the length of the
             shortest free ``"path"``, see :mod:`d4orm_env.paths.shortest_paths`; the same in a world without obstacles.
-            Not for
-            ``lifelong``.
+            Not for ``lifelong``.
         observed_path: Whether an observation ends with direction and length of the shortest path. Not for
             ``lifelong``.
         observed_robots: Nearest robots in an observation; missing ones are marked absent.
@@ -160,8 +159,8 @@ class EnvOptions:
             raise ValueError("egocentric observations have no room for observed_path; leave one of the two out")
         if self.problem is None:
             return
-        beside = {"scenario": self.scenario, "num_robots": self.num_robots}
-        named = [name for name, value in beside.items() if value is not None]
+        excluded = {"scenario": self.scenario, "num_robots": self.num_robots}
+        named = [name for name, value in excluded.items() if value is not None]
         named += [*self.scenario_settings, *["randomize_instance"] * bool(self.randomize_instance)]
         if named:
             raise ValueError(f"problem= excludes the scenario arguments ({', '.join(named)}); give one or the other")

@@ -105,8 +105,8 @@ class TrainingReward:
     """A reward to learn from, per robot and step; zero once a robot has docked.
 
     The paper's reward pays a robot for every step that it spends close to its goal, and an episode ends with the
-    arrival: who learns from it does not arrive. This one pays progress, which is a potential (A. Y. Ng, D. Harada
-    and S. Russell, ICML 1999), and the arrival.
+    arrival: a policy that learns from it does not arrive. This one pays progress, which is a potential (A. Y. Ng,
+    D. Harada and S. Russell, ICML 1999), and the arrival.
 
     Attributes:
         progress: For every step's distance at full speed towards the goal.

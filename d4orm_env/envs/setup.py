@@ -44,7 +44,7 @@ class EnvSetup:
         options: Options of the environment.
         num_instances: Choose among so many instances, drawn at first; ``None`` draws a new one each time.
         batched: Whether the instances are to share all but starts, goals and obstacles.
-        slack: Room that the spaces of a problem need beside that of the disturbances.
+        slack: Room that the spaces of a problem need in addition to that of the disturbances.
 
     Attributes:
         problem: The problem, or the instance that the spaces are made for.
@@ -172,7 +172,7 @@ class EnvSetup:
         if not same or (points < region[0]).any() or (points > region[1]).any():
             raise ValueError(
                 f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
-                f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes places only"
+                f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes positions only"
             )
         if self.along_paths:
             drawn.check_reachable()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 
 Info: TypeAlias = dict[str, Any]
-"""Results of an environment beside observations and rewards, by name."""
+"""Infos of an environment, by name."""
 AgentInfos: TypeAlias = dict[str, Info]
 """The same by agent."""
 
@@ -63,7 +63,7 @@ def masked(values: Mapping[str, NDArray[np.generic]], mask: BoolArray) -> Info:
 
 
 def final_infos(observations: FloatArray, infos: Info, ended: BoolArray) -> Info:
-    """Return what is kept of episodes that have ``ended`` ``(B,)``, before their worlds are reset.
+    """Last observations and infos of episodes that have ``ended`` ``(B,)``, kept before their worlds are reset.
 
     ``infos`` go into the result.
     """

@@ -148,7 +148,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 self._generators[world] = seeding.np_random(own_seed)[0] if self._setup.draws else None
         for term in self._simulation.terms.values():
             term[mask] = 0
-        observations = self._unseen()
+        observations = self._new_observations()
         self._simulation.reset_worlds(self._drawn(mask), observations)
         self._running[mask] = True
         return self._simulation.show(observations).reshape(self.num_envs, -1), self._infos(mask)
@@ -167,7 +167,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             ValueError: If the actions have another shape, or a value that is not finite or beyond 1e15.
         """
         self._require_episodes()
-        simulation, worlds, seen = self._simulation, self._simulation.worlds, self._unseen()
+        simulation, worlds, seen = self._simulation, self._simulation.worlds, self._new_observations()
         controls = simulation.controls(joint_controls(actions, self._action_shape, self.problem.num_robots))
         simulation.step_worlds(controls, seen, self._drawn(simulation.ended))
         ended, shown = simulation.ended, simulation.show(seen)
@@ -197,7 +197,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             ValueError: If a state is none that the robot may be in; the message names it.
         """
         self._require_reset()
-        observations, arrived = self._unseen(), self._simulation.worlds.arrived & ~self._simulation.ended[:, None]
+        observations = self._new_observations()
+        arrived = self._simulation.worlds.arrived & ~self._simulation.ended[:, None]
         self._simulation.put_robots(states, arrived, observations)
         return self._simulation.show(observations).reshape(self.num_envs, -1), self._infos()
 
@@ -234,7 +235,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
                 "{'reset_mask': terminations | truncations})"
             )
 
-    def _unseen(self) -> FloatArray:
+    def _new_observations(self) -> FloatArray:
         """``(B, K, D)`` array for observations."""
         return np.empty_like(self._observations) if self._copy else self._observations
 

@@ -28,9 +28,9 @@ PAIRS_AT_ONCE = 2**16
 
 
 class _Cells(NamedTuple):
-    """Cells of one size: ``position`` ``(C, d)``, and pairs of a cell and an obstacle, sorted by cell."""
+    """Cells of one size: ``grid_index`` ``(C, d)``, and pairs of a cell and an obstacle, sorted by cell."""
 
-    position: NDArray[np.int64]
+    grid_index: NDArray[np.int64]
     cell: NDArray[np.int64]
     item: NDArray[np.int64]
 
@@ -49,7 +49,7 @@ def fill_grid(
 ) -> FilledGrid:  # fmt: skip
     """The grid of cells of this size about a middle; see :func:`_refined`."""
     leaves = list(_refined(shapes, middle, hole, size, cell, rounding, nearest, within))
-    number = [np.ravel_multi_index(tuple(part.position.T), tuple(size)) for part, _ in leaves]
+    number = [np.ravel_multi_index(tuple(part.grid_index.T), tuple(size)) for part, _ in leaves]
     clearance, counts = np.empty(size.prod()), np.empty(size.prod(), np.int64)
     for own, (part, gap) in zip(number, leaves, strict=True):
         clearance[own], counts[own] = gap, np.bincount(part.cell, minlength=len(own))
@@ -74,29 +74,29 @@ def _refined(
     while shapes.count * np.ceil(size / 2**levels).prod() > PAIRS_AT_ONCE and 2**levels < size.max():
         levels += 1
     coarse = np.stack(np.meshgrid(*(np.arange(np.ceil(n / 2**levels)) for n in size), indexing="ij"), axis=-1)
-    position = coarse.reshape(-1, len(size)).astype(np.int64)
-    every = np.repeat(np.arange(len(position)), shapes.count)
-    waiting = [(levels, _Cells(position, every, np.tile(np.arange(shapes.count), len(position))))]
+    grid_index = coarse.reshape(-1, len(size)).astype(np.int64)
+    every = np.repeat(np.arange(len(grid_index)), shapes.count)
+    waiting = [(levels, _Cells(grid_index, every, np.tile(np.arange(shapes.count), len(grid_index))))]
     while waiting:
         level, cells = waiting.pop()
         width = cell * 2**level
-        centre = low + (cells.position + 0.5) * width
+        centre = low + (cells.grid_index + 0.5) * width
         # Side by side along each axis, which is quicker to read.
         points = np.stack([column.take(cells.cell) for column in centre.T]).T
         distance = shapes.signed_distance(points, cells.item)
-        bounds = np.searchsorted(cells.cell, np.arange(len(cells.position)))
+        bounds = np.searchsorted(cells.cell, np.arange(len(cells.grid_index)))
         clearance, diagonal = np.minimum.reduceat(distance, bounds), width * np.sqrt(len(size))
         bar = _smallest(distance, cells.cell, bounds, nearest) + diagonal * turn.at_most(centre, diagonal / 2)
         bar = np.maximum(bar, within + diagonal / 2) if within else bar
         unasked: NDArray[np.bool_] = np.all(np.abs(centre - middle) <= hole - width / 2, axis=1)
         bar = np.where(unasked, clearance, bar) + 2 * rounding
         near = np.flatnonzero(distance <= bar.take(cells.cell))
-        cells = _Cells(cells.position, cells.cell.take(near), cells.item.take(near))
+        cells = _Cells(cells.grid_index, cells.cell.take(near), cells.item.take(near))
         if level == 0:
             distance = distance.take(near)
             if nearest == 1 and not within:
                 keep = ~_hidden(shapes, centre, cells, distance, width, 2 * rounding)
-                cells, distance = _Cells(cells.position, cells.cell[keep], cells.item[keep]), distance[keep]
+                cells, distance = _Cells(cells.grid_index, cells.cell[keep], cells.item[keep]), distance[keep]
             yield _nearest_first(cells, distance), clearance
             continue
         for part in _halved(cells):
@@ -106,10 +106,10 @@ def _refined(
 def _nearest_first(cells: _Cells, distance: Floats) -> _Cells:
     """Return cells with the obstacles of each in the order of their distance."""
     # Most cells have one only.
-    several = np.flatnonzero(np.bincount(cells.cell, minlength=len(cells.position))[cells.cell] > 1)
+    several = np.flatnonzero(np.bincount(cells.cell, minlength=len(cells.grid_index))[cells.cell] > 1)
     items = cells.item.copy()
     items[several] = items[several[np.lexsort((distance[several], cells.cell[several]))]]
-    return _Cells(cells.position, cells.cell, items)
+    return _Cells(cells.grid_index, cells.cell, items)
 
 
 def _hidden(
@@ -155,8 +155,8 @@ class _Turn(NamedTuple):
         return cls(axes, (lower + upper) / 2, radius)
 
     def at_most(self, positions: Floats, max_distance: float) -> Floats:
-        """``(N,)`` half of the length of the difference of two such directions, as unit vectors, within reach of places
-        ``(N, d)``: by no more than twice this the distances of two obstacles change differently on the way there.
+        """``(N,)`` half of the length of the difference of two such directions, as unit vectors, anywhere within
+        ``max_distance`` of positions ``(N, d)``: no two obstacles' distances change more differently than by twice it.
         """
         distance = np.linalg.norm((positions - self.middle)[:, self.axes], axis=1) - max_distance
         return np.minimum(1.0, self.radius / np.maximum(distance, 1e-9))
@@ -183,25 +183,25 @@ def _smallest(distance: Floats, cell: NDArray[np.int64], bounds: NDArray[np.int6
 
 def _halved(cells: _Cells) -> Iterator[_Cells]:
     """The cells, in parts small enough to be split."""
-    parts = -(-(len(cells.item) << cells.position.shape[1]) // PAIRS_AT_ONCE)
+    parts = -(-(len(cells.item) << cells.grid_index.shape[1]) // PAIRS_AT_ONCE)
     ends = np.searchsorted(
-        cells.cell, np.linspace(0, len(cells.position), min(parts, len(cells.position)) + 1).astype(int)
+        cells.cell, np.linspace(0, len(cells.grid_index), min(parts, len(cells.grid_index)) + 1).astype(int)
     )
     for begin, end in pairwise(ends):
         if begin < end:
             first, last = cells.cell[begin], cells.cell[end - 1]
-            yield _Cells(cells.position[first : last + 1], cells.cell[begin:end] - first, cells.item[begin:end])
+            yield _Cells(cells.grid_index[first : last + 1], cells.cell[begin:end] - first, cells.item[begin:end])
 
 
 def _split(cells: _Cells, size: Floats) -> _Cells:
     """Every cell cut in two along each axis; parts beyond the grid are left out."""
-    positions, owners, items, count = [], [], [], 0
+    indices, owners, items, count = [], [], [], 0
     for corner in product((0, 1), repeat=len(size)):
-        position = 2 * cells.position + corner
-        inside: NDArray[np.bool_] = np.all(position < size, axis=1)
+        grid_index = 2 * cells.grid_index + corner
+        inside: NDArray[np.bool_] = np.all(grid_index < size, axis=1)
         kept = inside[cells.cell]
-        positions.append(position[inside])
+        indices.append(grid_index[inside])
         owners.append(count + (np.cumsum(inside) - 1)[cells.cell[kept]])
         items.append(cells.item[kept])
         count += int(inside.sum())
-    return _Cells(np.concatenate(positions), np.concatenate(owners), np.concatenate(items))
+    return _Cells(np.concatenate(indices), np.concatenate(owners), np.concatenate(items))

@@ -1,8 +1,8 @@
-"""Polygons in the plane: whether one is simple, which way round it goes, and the triangles that it is made of.
+"""Polygons in the plane: a check that they are simple, and the triangles that fill them.
 
-Simple polygons are told by a sweep line in O(n log n) with exact arithmetic, after M. I. Shamos and D. Hoey, "Geometric
-Intersection Problems", FOCS 1976. Corners are swept in the order of x, then y, so that upright edges are no special
-case. What touches counts as crossing, but for neighbours in the corner that they share.
+The check is a sweep line in O(n log n) with exact arithmetic, after M. I. Shamos and D. Hoey, "Geometric Intersection
+Problems", FOCS 1976. Corners are swept in the order of x, then y, so that upright edges are no special case. What
+touches counts as crossing, but for neighbours in the corner that they share.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ class _Sweep:
         return low
 
     def _side(self, edge: int, position: Corner) -> int:
-        """1 if a place is above an edge, -1 if it is below."""
+        """1 if a position is above an edge, -1 if it is below."""
         return orientation(*self._ends[edge], position)
 
     def _meet(self, one: int, other: int) -> bool:

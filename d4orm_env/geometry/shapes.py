@@ -56,9 +56,7 @@ class Shapes:
         return np.where(ends, lowest, 0.0), np.where(ends, highest, 0.0)
 
     def within(self, points: Floats, max_distance: float) -> tuple[IntArray, IntArray]:
-        """Pairs ``(P,)``, ``(P,)`` of points ``(N, d)`` and obstacles that may be within reach of each other; all that
-        are.
-        """
+        """Pairs ``(P,)``, ``(P,)`` of points ``(N, d)`` and obstacles, among them all within ``max_distance`` [m]."""
         low, high = self.corners()
         pairs = np.ones((len(points), len(low)), bool)
         for axis in range(self.dimension):

@@ -1,4 +1,4 @@
-"""Index of the obstacles: a grid that tells for any point which of them can be nearest, however many there are.
+"""Index of the obstacles: a grid with those that can be nearest to any point, however many there are.
 
 Every cell keeps the clearance at its centre and the obstacles that are nearest to some point in it. Clearance changes
 by no more than the distance between two points (it is 1-Lipschitz), so what it is at the centre decides nearly every
@@ -63,15 +63,11 @@ class WorldIndex(NamedTuple):
 def build_index(
     shapes: Shapes, cell: float, max_distance: float, nearest: int = 1, levels: int = 1, within: float = 0.0
 ) -> WorldIndex:
-    """The index of some obstacles.
+    """The index of some obstacles, in ``levels`` grids, one round the other.
 
-    Args:
-        shapes: The obstacles.
-        cell: Size of a cell [m]; larger where there would be more cells than is worthwhile.
-        max_distance: Distance from the obstacles that the grid covers [m]; at least to where none of them counts.
-        nearest: Number of nearest obstacles of any point that a cell's list is sure to hold.
-        levels: Number of grids, one round the other.
-        within: Distance of all those that a cell's list is sure to hold [m]; zero for the nearest only.
+    Cells have a size ``cell`` [m], or larger where there would be more than is worthwhile. The grid covers what is
+    within ``max_distance`` of the obstacles [m], at least to where none of them counts. A cell's list is sure to hold
+    the ``nearest`` obstacles of any of its points, and all ``within`` a distance [m].
     """
     if not shapes.count:
         nothing = np.zeros(0)

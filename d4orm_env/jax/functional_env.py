@@ -59,7 +59,7 @@ class Transition(NamedTuple):
         finished: ``(K,)`` bool: is done, which is terminated.
         done: ``()`` bool: the episode is over; all have finished, or the time is up.
         success: ``()`` bool: all have arrived, and none was ever in contact.
-        step: The step, as :func:`d4orm_env.jax.functional.step` tells it.
+        step: Result of :func:`d4orm_env.jax.functional.step`.
     """
 
     observations: jax.Array
@@ -75,7 +75,7 @@ class FunctionalEnv:
     """One world; ``jax.vmap`` makes many of it. World for world it is the environment of the same arguments.
 
     Where the scenario draws at random, so many instances are drawn when it is made, and every reset takes one of them
-    by its key: the scenario's own generator draws until places are free, which no traced function does quickly.
+    by its key: the scenario's own generator draws until positions are free, which no traced function does quickly.
 
     Args:
         scenario: As in :class:`~d4orm_env.envs.options.EnvOptions`, like all arguments not named here.
@@ -141,8 +141,8 @@ class FunctionalEnv:
 
     def instance(self, number: int | jax.Array) -> Problem:
         """One of the instances; the number may be traced."""
-        chosen = {place: stack[number] for place, stack in self._varying.items()}
-        leaves = [chosen.get(place, leaf) for place, leaf in enumerate(self._common)]
+        chosen = {index: stack[number] for index, stack in self._varying.items()}
+        leaves = [chosen.get(index, leaf) for index, leaf in enumerate(self._common)]
         return jax.tree.unflatten(self._structure, leaves)
 
     def reset(self, key: jax.Array) -> tuple[EnvState, jax.Array]:
@@ -190,8 +190,8 @@ class FunctionalEnv:
     def _begin(self, key: jax.Array) -> EnvState:
         number = jax.random.randint(key, (), 0, self._num_instances, jnp.int32)
         problem = self.instance(number)
-        nobody = jnp.zeros(problem.num_robots, bool)
-        return EnvState(functional.reset(problem, key), number, nobody, self._draw_ray_noise(key))
+        touched = jnp.zeros(problem.num_robots, bool)
+        return EnvState(functional.reset(problem, key), number, touched, self._draw_ray_noise(key))
 
     def _draw_ray_noise(self, key: jax.Array) -> jax.Array:
         shape = self.problem.num_robots, self.layout.num_rays * bool(self._ray_noise)
@@ -243,7 +243,7 @@ def _refuse(options: EnvOptions) -> None:
 
 
 def _stacked(problems: list[Problem]) -> tuple[dict[int, jax.Array], list[ArrayLike], PyTreeDef]:
-    """Leaves that differ from instance to instance, stacked, by their place; those of the first; and the structure."""
+    """Leaves that differ from instance to instance, stacked, by their index; those of the first; and the structure."""
     flattened: list[tuple[list[ArrayLike], PyTreeDef]] = [jax.tree.flatten(problem) for problem in problems]
     common, structure = flattened[0]
     shapes = [np.shape(leaf) for leaf in common]
@@ -252,6 +252,6 @@ def _stacked(problems: list[Problem]) -> tuple[dict[int, jax.Array], list[ArrayL
             f"instances of scenario {problems[0].name!r} differ in more than numbers, as in how many obstacles there "
             "are; use gymnasium.make_vec, or one instance with randomize_instance=False"
         )
-    columns = [np.stack([np.asarray(leaves[place]) for leaves, _ in flattened]) for place in range(len(common))]
-    varying = {place: jnp.asarray(column) for place, column in enumerate(columns) if (column != column[0]).any()}
+    columns = [np.stack([np.asarray(leaves[index]) for leaves, _ in flattened]) for index in range(len(common))]
+    varying = {index: jnp.asarray(column) for index, column in enumerate(columns) if (column != column[0]).any()}
     return varying, common, structure

@@ -105,10 +105,10 @@ def _move(
     jax.lax.fori_loop(0, controls.shape[0], step, (x, load(arrived, robot) > 0, control_at(0)))
 
 
-def count_near(dimension: int, state: Array, squared_radius_sum: Array) -> Array:
+def count_near(dimension: int, state: Array, squared_distance: Array) -> Array:
     """``(K, S)`` how many others each robot in ``state`` ``(K, n, S)`` is near.
 
-    ``squared_radius_sum`` ``(K, K)`` are squared distances up to which two are near; negative for a robot and itself.
+    ``squared_distance`` ``(K, K)`` is that up to which two are near [m^2]; negative for a robot and itself.
     """
     num_robots, _, num_samples = state.shape
     kernel = pl.pallas_call(
@@ -117,10 +117,10 @@ def count_near(dimension: int, state: Array, squared_radius_sum: Array) -> Array
         grid=(pl.cdiv(num_robots, ROWS), pl.cdiv(num_samples, LANES)),
         compiler_params=_params(),
     )
-    return kernel(state, squared_radius_sum)
+    return kernel(state, squared_distance)
 
 
-def _count_near(dimension: int, state: Any, squared_radius_sum: Any, out: Any) -> None:
+def _count_near(dimension: int, state: Any, squared_distance: Any, out: Any) -> None:
     rows = pl.program_id(0) * ROWS + jnp.arange(ROWS, dtype=jnp.int32)
     samples, inside = _samples(state.shape[-1])
     valid = rows < state.shape[0]
@@ -136,8 +136,8 @@ def _count_near(dimension: int, state: Any, squared_radius_sum: Any, out: Any) -
 
     def compare(other: Array, count: Array) -> Array:
         gaps = [position[axis] - load(other, axis, inside)[None] for axis in range(dimension)]
-        radius_sum = triton.load(squared_radius_sum.at[rows, other], mask=valid, other=-1)
-        return count + (sum(gap * gap for gap in gaps) <= radius_sum[:, None]).astype(jnp.int32)
+        most = triton.load(squared_distance.at[rows, other], mask=valid, other=-1)
+        return count + (sum(gap * gap for gap in gaps) <= most[:, None]).astype(jnp.int32)
 
     count = jax.lax.fori_loop(0, state.shape[0], compare, jnp.zeros((ROWS, LANES), jnp.int32))
     triton.store(out.at[rows[:, None], samples[None]], count, mask=mask)

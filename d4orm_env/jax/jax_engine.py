@@ -23,10 +23,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics import collision, transition
 from d4orm_env.dynamics.models import names_of_codes
 from d4orm_env.engine import noise
-from d4orm_env.engine.types import (
-    StepResult,
-    checked_controls,
-)
+from d4orm_env.engine.types import StepResult, checked_controls
 from d4orm_env.jax import jax_footprints as footprints
 from d4orm_env.jax.gpu_kernels import LANES, count_near, on_gpu
 from d4orm_env.jax.jax_footprints import MovingBodies, PlacedBodies
@@ -41,6 +38,9 @@ BIT_OPS = noise.BitOps(
     sqrt=jnp.sqrt,
 )
 
+FEW = 8
+"""Most obstacles that are tested one and all; more are looked up in their index."""
+
 Contacts: TypeAlias = tuple[Array, Array, Array]
 """Flags of collision and of margin violation, and rewards, each ``(K, S)``."""
 
@@ -48,20 +48,20 @@ Contacts: TypeAlias = tuple[Array, Array, Array]
 def robot_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
     """``(K, S)`` how many others a robot in ``state`` ``(K, n, S)`` is within ``extra`` of."""
     dimension = arrays.goal.shape[1]
-    radius_sum = arrays.radius[:, None] + arrays.radius[None, :] + extra
-    reach2 = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, radius_sum * radius_sum)
+    distance = arrays.radius[:, None] + arrays.radius[None, :] + extra
+    squared_distance = jnp.where(jnp.eye(len(arrays.radius), dtype=bool), -1, distance * distance)
 
-    def count(state: Array, reach2: Array) -> Array:
+    def count(state: Array, squared_distance: Array) -> Array:
         position = state[:, :dimension]
-        near = ((position[:, None] - position[None, :]) ** 2).sum(axis=2) <= reach2[..., None]
+        near = ((position[:, None] - position[None, :]) ** 2).sum(axis=2) <= squared_distance[..., None]
         if arrays.footprints is not None:
             bodies = footprints.place_robots(arrays.footprints, state, dimension)
             near &= _robots_within(arrays.footprints, bodies, arrays.footprints, bodies, extra, near.shape)
         return near.sum(axis=1, dtype=jnp.int32)
 
     if arrays.footprints is not None or state.shape[-1] < LANES:
-        return count(state, reach2)
-    return on_gpu(partial(count_near, dimension), count, jax.lax.stop_gradient(state), reach2)
+        return count(state, squared_distance)
+    return on_gpu(partial(count_near, dimension), count, jax.lax.stop_gradient(state), squared_distance)
 
 
 def _robots_within(
@@ -74,12 +74,12 @@ def _robots_within(
 
 
 def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, extra: Array | np.float32) -> Array:
-    """``(K, S)`` the same towards other bodies."""
+    """``(K, S)`` of how many other bodies a robot is within ``extra``."""
     d = arrays.goal.shape[1]
     position = state[:, :d]
     gaps = (position[:, None] - others.positions[None, :, :, None]) ** 2
-    radius_sum = arrays.radius[:, None] + others.radius[None, :] + extra
-    near = gaps.sum(axis=2) <= (radius_sum * radius_sum)[..., None]
+    distance = arrays.radius[:, None] + others.radius[None, :] + extra
+    near = gaps.sum(axis=2) <= (distance * distance)[..., None]
     if arrays.footprints is not None or others.footprints is not None:
         bodies = footprints.place_robots(arrays.footprints, state, d, arrays.radius)
         its = footprints.place_bodies(others)
@@ -88,47 +88,43 @@ def moving_contacts(arrays: ProblemArrays, state: Array, others: MovingBodies, e
 
 
 def obstacle_contacts(arrays: ProblemArrays, state: Array, extra: Array | np.float32) -> Array:
-    """``(K, S)`` bool: whether it is within that of static obstacles or bounds."""
+    """``(K, S)`` bool: whether a robot is within ``extra`` of a static obstacle or a bound."""
     position = state[:, : arrays.goal.shape[1]]
     if arrays.footprints is not None:
         return footprints.static_contacts(arrays, state, extra)
-    radius_sum = (arrays.radius + extra)[:, None]
+    radius = (arrays.radius + extra)[:, None]
     hit = jnp.zeros((position.shape[0], position.shape[2]), bool)
     for axis in range(position.shape[1]):
-        hit |= collision.leaves(position[:, axis], radius_sum, arrays.bounds[0, axis], arrays.bounds[1, axis])
+        hit |= collision.leaves(position[:, axis], radius, arrays.bounds[0, axis], arrays.bounds[1, axis])
     if len(arrays.boxes) + len(arrays.triangles) > FEW and arrays.grid is not None:
-        return hit | _indexed_contacts(arrays, position, radius_sum)
+        return hit | _indexed_contacts(arrays, position, radius)
     if len(arrays.boxes):
         box = jnp.moveaxis(arrays.boxes, 1, 0)[..., None, :, None]
-        hit |= _touches_box(box, radius_sum[:, None], position[:, None]).any(axis=1)
+        hit |= _touches_box(box, radius[:, None], position[:, None]).any(axis=1)
     if len(arrays.triangles):
         corners = jnp.moveaxis(arrays.triangles, 1, 0)[..., None, :, None]
-        hit |= _touches_triangle(corners, radius_sum[:, None], position[:, None]).any(axis=1)
+        hit |= _touches_triangle(corners, radius[:, None], position[:, None]).any(axis=1)
     return hit
 
 
-FEW = 8
-"""So many obstacles are sooner tested all than looked up."""
-
-
-def _touches_box(box: Given, radius_sum: Given, position: Array) -> Array:
-    """Return where places ``(K, ., d, S)`` are within radius_sum of rounded boxes, given as ``2 d + 1`` columns."""
+def _touches_box(box: Given, radius: Given, position: Array) -> Array:
+    """Flags of bodies at ``(K, ., d, S)`` that touch rounded boxes, given as ``2 d + 1`` columns."""
     d, gap2 = position.shape[-2], jnp.float32(0)
     for axis in range(d):
         gap = collision.axis_gap(position[..., axis, :], box[axis], box[d + axis], jnp.float32(0), OPS)
         gap2 = gap2 + gap * gap
-    total = radius_sum + box[2 * d]
+    total = radius + box[2 * d]
     return gap2 <= total * total
 
 
-def _touches_triangle(corners: Given, radius_sum: Given, position: Array) -> Array:
+def _touches_triangle(corners: Given, radius: Given, position: Array) -> Array:
     """The same for triangles, ``corners`` being their six columns."""
     return collision.meets_triangle(
-        tuple(corners), position[..., 0, :], position[..., 1, :], radius_sum, jnp.float32(0), OPS
+        tuple(corners), position[..., 0, :], position[..., 1, :], radius, jnp.float32(0), OPS
     )
 
 
-def _indexed_contacts(arrays: ProblemArrays, position: Array, radius_sum: Given) -> Array:
+def _indexed_contacts(arrays: ProblemArrays, position: Array, radius: Given) -> Array:
     """``(K, S)`` bool: contacts with obstacles, see :mod:`d4orm_env.engine.obstacles`."""
     index, cell = arrays.grid, jnp.int32(0)
     for axis in range(position.shape[1]):
@@ -137,7 +133,7 @@ def _indexed_contacts(arrays: ProblemArrays, position: Array, radius_sum: Given)
         step = jnp.minimum(jnp.where(step > 0, step, 0), (index.size[axis] - 1).astype(jnp.float32))
         cell = cell * index.size[axis] + step.astype(jnp.int32)
     clearance, begin, end = index.clearance[cell], index.first[cell], index.first[cell + 1]
-    sure, near = clearance <= radius_sum - index.slack, clearance <= radius_sum + index.slack
+    sure, near = clearance <= radius - index.slack, clearance <= radius + index.slack
     num_boxes = len(arrays.boxes)
 
     def test(number: Array, hit: Array) -> Array:
@@ -145,10 +141,10 @@ def _indexed_contacts(arrays: ProblemArrays, position: Array, radius_sum: Given)
         here = jnp.zeros_like(hit)
         if num_boxes:
             box = jnp.moveaxis(arrays.boxes[jnp.minimum(item, num_boxes - 1)], -1, 0)
-            here |= _touches_box(box, radius_sum, position) & (item < num_boxes)
+            here |= _touches_box(box, radius, position) & (item < num_boxes)
         if len(arrays.triangles):
             corners = jnp.moveaxis(arrays.triangles[jnp.maximum(item - num_boxes, 0)], -1, 0)
-            here |= _touches_triangle(corners, radius_sum, position) & (item >= num_boxes)
+            here |= _touches_triangle(corners, radius, position) & (item >= num_boxes)
         return hit | (near & here)
 
     return jax.lax.fori_loop(jnp.int32(0), index.longest, test, sure)
@@ -158,7 +154,7 @@ def goal_distance(arrays: ProblemArrays, position: Array) -> Array:
     """``(K, S)`` distance of every robot to its goal; its gradient at the goal itself is zero."""
     gap2 = ((position - arrays.goal[..., None]) ** 2).sum(axis=1)
     tiny = arrays.squared_goal_radius * jnp.float32(2.0**-32)
-    # Asked this way round, a place that is not a number stays one: it must not pass for the goal.
+    # Asked this way round, a position that is not a number stays one: it must not pass for the goal.
     return jnp.where(gap2 <= tiny, jnp.float32(0), jnp.sqrt(jnp.maximum(gap2, tiny)))
 
 

@@ -36,7 +36,7 @@ class PlacedBodies(NamedTuple):
 
     position: Array  #: ``(d, R, S)`` reference points
     corners: Array  #: ``(2, n, R, S)`` of the cores, relative to them; ``None`` in space
-    axes: Array  #: ``(2, m, R, S)``; zeros tell nothing
+    axes: Array  #: ``(2, m, R, S)``; zeros for none
     extents: Array  #: ``(m, R, S)`` how far the cores reach along them
     rounding: Array  #: ``(R, 1)``
     semi_axes: Array  #: ``(3, R, 1)`` of ellipsoids
@@ -112,19 +112,19 @@ def _bodies(f: FootprintArrays, position: Array, heading: Array) -> PlacedBodies
     return PlacedBodies(position, turned(f.corners), turned(f.axes), extents, rounding, semi_axes)
 
 
-def pairs_within(bodies: PlacedBodies, others: PlacedBodies, radius_sum: Given) -> Array:
-    """``(R, O, S)`` whether bodies are within ``radius_sum`` of others."""
+def pairs_within(bodies: PlacedBodies, others: PlacedBodies, extra: Given) -> Array:
+    """``(R, O, S)`` whether bodies are within ``extra`` of others."""
     a = PlacedBodies(*(jnp.expand_dims(part, part.ndim - 1) for part in bodies))
     b = PlacedBodies(*(jnp.expand_dims(part, part.ndim - 2) for part in others))
-    offset, radius_sum = b.position - a.position, jnp.asarray(radius_sum)
+    offset, extra = b.position - a.position, jnp.asarray(extra)
     if len(offset) == 3:
-        return _balls_within(offset, a.semi_axes + radius_sum / 2, b.semi_axes + radius_sum / 2)
-    return _cores_within(a, b, offset, radius_sum)
+        return _balls_within(offset, a.semi_axes + extra / 2, b.semi_axes + extra / 2)
+    return _cores_within(a, b, offset, extra)
 
 
-def _cores_within(a: PlacedBodies, b: PlacedBodies, offset: Array, radius_sum: Array) -> Array:
-    """Check whether cores, those of ``b`` offset by ``offset`` ``(2, ...)``, are within reach of each other."""
-    total = a.rounding + b.rounding + radius_sum
+def _cores_within(a: PlacedBodies, b: PlacedBodies, offset: Array, extra: Array) -> Array:
+    """Check whether widened cores, those of ``b`` offset by ``(2, ...)``, are within ``extra`` of each other."""
+    total = a.rounding + b.rounding + extra
     corners = b.corners + offset[:, None]
     apart = jnp.maximum(
         _separation(a.axes, a.extents, corners), _separation(b.axes, b.extents, a.corners - offset[:, None])
@@ -134,17 +134,17 @@ def _cores_within(a: PlacedBodies, b: PlacedBodies, offset: Array, radius_sum: A
 
 
 def _separation(axes: Array, extents: Array, corners: Array) -> Array:
-    """The most by which an axis tells the corners from the core that it is of."""
+    """The widest gap between a core and the corners along the core's axes."""
     widest = jnp.full((), -jnp.inf, jnp.float32)
     for i in range(axes.shape[1]):
         least = (axes[0, None, i] * corners[0] + axes[1, None, i] * corners[1]).min(axis=0)
-        tells = axes[0, i] ** 2 + axes[1, i] ** 2 > 0
-        widest = jnp.where(tells, jnp.maximum(widest, least - extents[i]), widest)
+        is_axis = axes[0, i] ** 2 + axes[1, i] ** 2 > 0
+        widest = jnp.where(is_axis, jnp.maximum(widest, least - extents[i]), widest)
     return widest
 
 
-def _corner_near_edge(corners: Array, others: Array, radius_sum: Array) -> Array:
-    """Check whether one of the first corners is within reach of an edge between the others."""
+def _corner_near_edge(corners: Array, others: Array, distance: Array) -> Array:
+    """Check whether one of the first corners is within ``distance`` of an edge between the others."""
     near = jnp.zeros((), bool)
     for j in range(others.shape[1]):
         begin, along = others[:, j], others[:, (j + 1) % others.shape[1]] - others[:, j]
@@ -153,7 +153,7 @@ def _corner_near_edge(corners: Array, others: Array, radius_sum: Array) -> Array
             jnp.clip((offset * along[:, None]).sum(axis=0), 0, square[None]) / jnp.where(square > 0, square, 1)[None]
         )
         gap = offset - share[None] * along[:, None]
-        near = near | ((gap * gap).sum(axis=0) <= (radius_sum * radius_sum)[None]).any(axis=0)
+        near = near | ((gap * gap).sum(axis=0) <= (distance * distance)[None]).any(axis=0)
     return near
 
 

@@ -73,7 +73,7 @@ def numbers_of(model: Model, robots: np.ndarray[Any, Any], arrays: ProblemArrays
 def advance_robots(
     model: Model, numbers: Numbers, x: Components, control: Components, arrived: Array
 ) -> tuple[Components, Components, Array]:
-    """One step of robots of one model, docking included: states, executed controls, and who has docked."""
+    """One step of robots of one model, docking included: states, executed controls, and flags of arrival."""
     functions, limits = model.functions, numbers.limits
     u = functions.limit_control(control, limits, OPS)
     y = transition.advance(functions, x, u, limits, transition.TimeStep(*numbers.time_step), OPS)
@@ -83,13 +83,13 @@ def advance_robots(
     if numbers.facing and model.heading_index is not None:
         heading = y[model.heading_index]
         arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), *numbers.facing)
-    standing = transition.absorbed(arrived, numbers.docks > 0)
+    at_rest = transition.absorbed(arrived, numbers.docks > 0)
     docks, zero = transition.absorbed(arrives, numbers.docks > 0), jnp.zeros_like(gap2)
     after = tuple(
-        jnp.where(standing, old, jnp.where(docks, rest, new))
+        jnp.where(at_rest, old, jnp.where(docks, rest, new))
         for old, rest, new in zip(x, functions.rest(y, zero), y, strict=True)
     )
-    return after, tuple(jnp.where(standing, zero, component) for component in u), standing | arrives
+    return after, tuple(jnp.where(at_rest, zero, component) for component in u), at_rest | arrives
 
 
 def by_model(models: tuple[str, ...]) -> Iterator[tuple[Model, np.ndarray[Any, Any]]]:

@@ -65,9 +65,9 @@ def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds) -> tu
         limits = tuple(arrays.limits[:, i] for i in range(len(model.limit_names)))
         x = tuple(world.state[:, i] for i in range(model.state_size))
         u = tuple(world.control[:, i] for i in range(model.control_size))
-        standing = transition.absorbed(world.arrived, arrays.docks)
+        at_rest = transition.absorbed(world.arrived, arrays.docks)
         for axis, component in enumerate(model.functions.velocity(x, u, limits, OPS)):
-            velocity[axis] = jnp.where(own & ~standing, component, velocity[axis])
+            velocity[axis] = jnp.where(own & ~at_rest, component, velocity[axis])
         if model.heading_index is not None:
             angle = x[model.heading_index]
             heading = [jnp.where(own, turn(angle), old) for turn, old in zip((jnp.cos, jnp.sin), heading)]

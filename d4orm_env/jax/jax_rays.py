@@ -29,8 +29,8 @@ def cast_rays(
 ) -> list[Array]:
     """``R`` columns ``(K,)``: how far each ray of every robot reaches [m].
 
-    Places are two columns ``(K,)``, and headings cosines and sines, both zero for robots without. ``arrays.bounds`` is
-    ``None`` where the world has none.
+    Positions are two columns ``(K,)``, and headings cosines and sines, both zero for robots without.
+    ``arrays.bounds`` is ``None`` where the world has none.
     """
     if not layout.num_rays:
         return []
@@ -47,11 +47,11 @@ def cast_rays(
         own = owner == robot
         others = OtherBodies(bodies[0] - x, bodies[1] - y, jnp.where(own, -1, radius), cores)
         aim = cosine * fan[:, 0] - sine * fan[:, 1], sine * fan[:, 0] + cosine * fan[:, 1]
-        reach = jax.vmap(lambda ray_x, ray_y: _nearest(arrays, others, x, y, ray_x, ray_y))(*aim)
-        return jnp.minimum(reach, layout.ray_range)
+        distances = jax.vmap(lambda ray_x, ray_y: _nearest(arrays, others, x, y, ray_x, ray_y))(*aim)
+        return jnp.minimum(distances, layout.ray_range)
 
-    reach = jax.vmap(of_robot)(robots, x, y, cosine, sine)
-    return [reach[:, i] for i in range(layout.num_rays)]
+    distances = jax.vmap(of_robot)(robots, x, y, cosine, sine)
+    return [distances[:, i] for i in range(layout.num_rays)]
 
 
 def _nearest(arrays: ProblemArrays, others: OtherBodies, x: Array, y: Array, ray_x: Array, ray_y: Array) -> Array:
@@ -85,9 +85,9 @@ def _to_others(f: FootprintArrays | None, others: OtherBodies, ray_x: Array, ray
     enter, leave = jnp.zeros(len(x)), jnp.full(len(x), jnp.inf)
     for j in range(cores.axes.shape[1]):
         along_x, along_y = cores.axes[:, j]
-        # Beyond the sides of a segment, not beyond its ends; zeros tell nothing.
-        reach = cores.extents[j] + jnp.where(j < jnp.asarray(f.num_corners), cores.rounding, 0)
-        inside, growth = reach + (along_x * x + along_y * y), -(along_x * ray_x + along_y * ray_y)
+        # Beyond the sides of a segment, not beyond its ends; zeros are no axes.
+        extent = cores.extents[j] + jnp.where(j < jnp.asarray(f.num_corners), cores.rounding, 0)
+        inside, growth = extent + (along_x * x + along_y * y), -(along_x * ray_x + along_y * ray_y)
         enter, leave = _cut(enter, leave, inside, growth)
     solid = (jnp.asarray(f.num_axes) > 0) & (radius >= 0)
     return jnp.minimum(jnp.minimum(*found), jnp.where(solid & (leave >= enter), enter, jnp.inf))
@@ -141,7 +141,7 @@ def _to_triangles(triangles: Array | FloatArray, x: Array, y: Array, ray_x: Arra
 
 
 def _through(low: Array, high: Array, ray: Array) -> tuple[Array, Array]:
-    """Where a ray enters and leaves what lies between two parallel lines; behind its beginning is negative."""
+    """Distances at which a ray enters and leaves the strip between parallel lines; negative behind its beginning."""
     still, inside = ray == 0, (low <= 0) & (high >= 0)
     a, b = low / jnp.where(still, 1, ray), high / jnp.where(still, 1, ray)
     enter = jnp.where(still, jnp.where(inside, -jnp.inf, jnp.inf), jnp.minimum(a, b))

@@ -30,7 +30,7 @@ from d4orm_env.mujoco.scene import (
 
 _HELD = 1e6
 """Weight added to a docked robot, per degree of freedom [kg]: nothing moves it."""
-_SPIN, _FREE_DOFS, _FREE_PLACE = 2, 6, 7
+_SPIN, _FREE_DOFS, _FREE_POSITIONS = 2, 6, 7
 
 
 class TeamBodies:
@@ -131,8 +131,8 @@ class TeamBodies:
                 data.qvel[dof : dof + 2] = state[list(model.speed_indices)]
             return
         self._headings[robot] = heading = state[model.heading_index]
-        data.qpos[joint + 2 : joint + _FREE_PLACE] = [0, math.cos(heading / 2), 0, 0, math.sin(heading / 2)]
-        data.qpos[joint + _FREE_PLACE : joint + _FREE_PLACE + 2] = 0
+        data.qpos[joint + 2 : joint + _FREE_POSITIONS] = [0, math.cos(heading / 2), 0, 0, math.sin(heading / 2)]
+        data.qpos[joint + _FREE_POSITIONS : joint + _FREE_POSITIONS + 2] = 0
         self._wanted[robot] = speed = float(sum(state[index] for index in model.speed_indices))
         data.qvel[dof : dof + 2] = speed * math.cos(heading), speed * math.sin(heading)
         data.qvel[dof + _FREE_DOFS : dof + _FREE_DOFS + 2] = speed / (

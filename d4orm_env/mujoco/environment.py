@@ -69,9 +69,9 @@ class Camera:
         if problem.world.lower is not None:
             positions = np.concatenate([positions, problem.world.bounds])
         low, high = positions.min(axis=0), positions.max(axis=0)
-        reach = float(np.linalg.norm(high - low)) / 2 + 2 * float(problem.team.radius.max())
+        extent = float(np.linalg.norm(high - low)) / 2 + 2 * float(problem.team.radius.max())
         self._view.lookat[:] = [*((low + high) / 2), 0]
-        self._view.distance = reach / math.tan(math.radians(_VIEW_ANGLE / 2))
+        self._view.distance = extent / math.tan(math.radians(_VIEW_ANGLE / 2))
         self._view.elevation, self._view.azimuth = -60, 90
 
     def draw(self, data: mujoco.MjData, goals: FloatArray) -> NDArray[np.uint8]:

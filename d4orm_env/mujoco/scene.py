@@ -59,10 +59,10 @@ GRAVITY = 9.81
 PUCKS, DRIVES = ("holonomic2d", "velocity2d"), ("differential_drive", "unicycle")
 """Models of robots that are pushed, and of those on two wheels."""
 
-WHEEL_RADIUS, HALF_TRACK, WHEEL_HALF_WIDTH, CASTER_RADIUS, CASTER_PLACE = 0.3, 0.65, 0.08, 0.1, 0.75
+WHEEL_RADIUS, HALF_TRACK, WHEEL_HALF_WIDTH, CASTER_RADIUS, CASTER_POSITION = 0.3, 0.65, 0.08, 0.1, 0.75
 CLEARANCE, HEIGHT, FRONT_GAP = 0.25, 0.85, 0.02
 """Measures of a robot, over its radius. The caster is behind; one in front, off the floor, keeps the nose up."""
-WHEEL_SHARE, BATTERY_SHARE, BATTERY_PLACE = 0.1, 0.5, (-0.15, 0.0, 0.2)
+WHEEL_SHARE, BATTERY_SHARE, BATTERY_POSITION = 0.1, 0.5, (-0.15, 0.0, 0.2)
 """Shares of the mass: of each wheel, and of what lies low and behind the axle."""
 _WALL = 0.2
 """Thickness of the walls round a bounded world [m]."""
@@ -76,7 +76,7 @@ class MujocoScene(NamedTuple):
     """A compiled scene and where things are in it."""
 
     model: mujoco.MjModel  #: The scene
-    #: ``(K,)`` first address of a robot's positions; a puck has ``x, y, angle`` there, a drive place and quaternion,
+    #: ``(K,)`` first address of a robot's positions; a puck has ``x, y, angle`` there, a drive position and quaternion,
     #: and then two wheels
     joints: NDArray[np.int64]
     dofs: NDArray[np.int64]  #: ``(K,)`` first address of its velocities
@@ -242,13 +242,13 @@ def _add_drive(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physi
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=[0.3 * radius, 0.3 * radius, 0.05 * radius],
-        pos=[radius * part for part in BATTERY_PLACE],
+        pos=[radius * part for part in BATTERY_POSITION],
         mass=BATTERY_SHARE * mass,
         contype=0,
         conaffinity=0,
     )
     size = CASTER_RADIUS * radius
-    for position, gap in ((-CASTER_PLACE, 0.0), (CASTER_PLACE, FRONT_GAP)):
+    for position, gap in ((-CASTER_POSITION, 0.0), (CASTER_POSITION, FRONT_GAP)):
         # Without friction: it turns and rolls as it likes. Its priority has the floor's own friction not count.
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[size, 0, 0], pos=[position * radius, 0, size + gap * radius],

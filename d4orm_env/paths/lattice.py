@@ -20,8 +20,8 @@ MAX_POINTS = 2**24
 STRETCH = 1.05
 """Least factor by which the next grid is coarser where one has too many points."""
 _PUSHES, _SLACK = 4, 0.03
-"""Number of times a node is pushed away from an obstacle, and the excess of a push, as a share of the reach; a third of
-it each time, so as to end in the middle of narrow gaps."""
+"""Number of times a node is pushed away from an obstacle, and the excess of a push, as a share of the safety
+distance; a third of it each time, so as to end in the middle of narrow gaps."""
 
 
 class Lattice(NamedTuple):
@@ -44,7 +44,7 @@ def indices_of(size: IntArray, n: Whole) -> tuple[int, int, int]:
 
 @inlined
 def corner_below(low: Floats, step: float, size: IntArray, q: Position) -> tuple[int, int, int]:
-    """Steps along each axis to the point below a place, or to the outermost one."""
+    """Steps along each axis to the point below a position, or to the outermost one."""
     i = min(max(np.int64((q[0] - low[0]) / step), 0), size[0] - 1)
     j = min(max(np.int64((q[1] - low[1]) / step), 0), size[1] - 1)
     return i, j, min(max(np.int64((q[2] - low[2]) / step), 0), size[2] - 1)
@@ -62,10 +62,7 @@ def neighbour(lattice: Lattice, move: int, i: int, j: int, k: int) -> np.int64:
 
 @compiled
 def settled(space: Space, lattice: Lattice, safety_distance: float, position: Position) -> tuple[Position, bool]:
-    """The place, or if a body of this reach does not fit there one less than half a step away where it does.
-
-    And whether it does.
-    """
+    """A position, or where it is not clear by ``safety_distance`` one within half a step; and whether that is clear."""
     half, probe, slack = lattice.step / 2, lattice.step / 64, safety_distance * _SLACK
     x, y, z = position
     clearance = clearance_at(space, x, y, z)
@@ -89,10 +86,9 @@ def settled(space: Space, lattice: Lattice, safety_distance: float, position: Po
 
 @cached_kernel(variant="settle", **OPTIONS)
 def settle_nodes(space: Space, lattice: Lattice, safety_distance: float) -> int:
-    """Find the points of a lattice where a body of this reach fits, if that is less than half a step away.
+    """Find the points of a lattice that are clear by ``safety_distance`` [m], or less than half a step away from it.
 
-    Returns:
-        How many there are; as many as there is room for are written as nodes.
+    Returned is their number; as many as there is room for are written as nodes.
     """
     low, step, count = lattice.low, lattice.step, 0
     for n in range(lattice.nodes.shape[0]):
@@ -123,16 +119,11 @@ def lay_lattice(
     most_points: int = MAX_POINTS,
     pad: float = 0.0,
 ) -> Lattice:
-    """Nodes so far apart wherever paths may lead; farther apart where there would be too many.
+    """Nodes wherever paths of a problem may lead and ``safety_distance`` [m] is clear, ``step`` [m] apart.
 
-    Args:
-        problem: The starts, goals and bounds.
-        space: Its obstacles; ``None`` where there are none.
-        safety_distance: Radius that must fit at a node [m].
-        step: Distance of neighbouring nodes [m], at least: that of the lattice is said by its ``step``.
-        most: Most nodes.
-        most_points: Most points, blocked ones included.
-        pad: Distance beyond starts, goals and obstacles that paths may lead, at least twice the reach [m].
+    They are farther apart where there would be more than ``most`` nodes or ``most_points`` points, blocked ones
+    included. ``space`` is the problem's obstacles, ``None`` where there are none. Paths may lead ``pad`` beyond starts,
+    goals and obstacles, or twice the safety distance where that is more [m].
     """
     low, high = _extent(problem, space, max(pad, 2 * safety_distance))
     most_points = most if space is None else most_points

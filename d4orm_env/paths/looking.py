@@ -12,21 +12,21 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.lattice import Lattice, corner_below
 from d4orm_env.paths.spaces import Position, Space, clearance_at, distance, position_of, sees
-from d4orm_env.paths.wavefront import NOBODY, Front
+from d4orm_env.paths.wavefront import NO_ANCHOR, Front
 
 
 class Fields(NamedTuple):
     """The wavefronts of a team, one behind the other, and the lattices that they are on."""
 
     safety_distance: Floats  #: ``(K,)`` the distance that each robot keeps [m]
-    room: Floats  #: ``(K,)`` clearance at its goal [m]
+    goal_clearance: Floats  #: ``(K,)`` clearance at its goal [m]
     lattice: IntArray  #: ``(K,)`` int64 number of its lattice
     low: Floats  #: ``(L, 3)`` the first nodes of the lattices [m]
     step: Floats  #: ``(L,)`` between neighbours along an axis [m]
     size: IntArray  #: ``(L, 3)`` int64 points along each axis
     first_node: IntArray  #: ``(L + 1,)`` int64 where the part of ``nodes`` of each lattice begins, and the end
     nodes: Ints  #: int32 the node of each point; -1 where it is not free
-    first_place: IntArray  #: ``(L + 1,)`` int64 where the part of ``positions`` of each lattice begins, and the end
+    first_position: IntArray  #: ``(L + 1,)`` int64 where the part of ``positions`` of each lattice begins, and the end
     positions: Floats  #: ``(., 3)`` where the nodes are [m]
     first_anchor: IntArray  #: ``(K + 1,)`` int64 where the part of ``anchor`` of each robot begins, and the end
     anchor: Ints  #: int32, see :class:`Front`
@@ -41,14 +41,14 @@ def gather(safety_distance: Floats, lattices: Sequence[Lattice], number: IntArra
     """The wavefronts of robots that keep ``safety_distance`` ``(K,)``, on the lattices of these numbers ``(K,)``."""
     return Fields(
         safety_distance=safety_distance,
-        room=np.array([front.room for front in fronts]),
+        goal_clearance=np.array([front.goal_clearance for front in fronts]),
         lattice=number,
         low=np.stack([lattice.low for lattice in lattices]),
         step=np.array([lattice.step for lattice in lattices]),
         size=np.stack([lattice.size for lattice in lattices]),
         first_node=_beginnings([lattice.nodes for lattice in lattices]),
         nodes=_joined([lattice.nodes for lattice in lattices]),
-        first_place=_beginnings([lattice.positions for lattice in lattices]),
+        first_position=_beginnings([lattice.positions for lattice in lattices]),
         positions=_joined([lattice.positions for lattice in lattices]),
         first_anchor=_beginnings([front.anchor for front in fronts]),
         anchor=_joined([front.anchor for front in fronts]),
@@ -73,17 +73,18 @@ def _joined(arrays: list[np.ndarray]) -> Any:
 def _look_from(space: Space, fields: Fields, robot: int, q: Position) -> tuple[Position, float, np.int32]:
     """Return the next position for a robot at ``q``, the length of the whole path, and the anchor."""
     safety_distance, lattice, first = fields.safety_distance[robot], fields.lattice[robot], fields.first_point[robot]
-    step, size, first_place = fields.step[lattice], fields.size[lattice], fields.first_place[lattice]
+    step, size, first_position = fields.step[lattice], fields.size[lattice], fields.first_position[lattice]
     first_node, first_anchor = fields.first_node[lattice], fields.first_anchor[robot]
-    goal, own_goal, own = position_of(fields.points, first), fields.room[robot], clearance_at(space, q[0], q[1], q[2])
-    if sees(space, safety_distance, goal, own_goal, q, own):
+    goal, goal_clearance = position_of(fields.points, first), fields.goal_clearance[robot]
+    clearance = clearance_at(space, q[0], q[1], q[2])
+    if sees(space, safety_distance, goal, goal_clearance, q, clearance):
         return goal, distance(goal, q), np.int32(0)
     i, j, k = corner_below(fields.low[lattice], step, size, q)
     # From deep inside an obstacle there may be none.
-    rings = 2 + np.int64(2 * min(max(0.0, safety_distance - own), 2 * safety_distance) / step)
-    ring, target, length, anchor = 0, q, np.inf, NOBODY
+    rings = 2 + np.int64(2 * min(max(0.0, safety_distance - clearance), 2 * safety_distance) / step)
+    ring, target, length, anchor = 0, q, np.inf, NO_ANCHOR
     while ring < rings and anchor < 0:
-        last = NOBODY
+        last = NO_ANCHOR
         for ni in range(max(0, i - ring), min(size[0], i + ring + 2)):
             for nj in range(max(0, j - ring), min(size[1], j + ring + 2)):
                 for nk in range(max(0, k - ring), min(size[2], k + ring + 2)):
@@ -97,12 +98,13 @@ def _look_from(space: Space, fields: Fields, robot: int, q: Position) -> tuple[P
                     straight = value + distance(at, q)
                     if straight < length and a != last:
                         last = a
-                        if sees(space, safety_distance, at, own_goal if a == 0 else safety_distance, q, own):
+                        kept = goal_clearance if a == 0 else safety_distance
+                        if sees(space, safety_distance, at, kept, q, clearance):
                             target, length, anchor = at, straight, a
                             continue
-                    position = position_of(fields.positions, first_place + n)
+                    position = position_of(fields.positions, first_position + n)
                     bent = value + distance(at, position) + distance(position, q)
-                    if bent < length and sees(space, safety_distance, position, safety_distance, q, own):
+                    if bent < length and sees(space, safety_distance, position, safety_distance, q, clearance):
                         target, length, anchor = position, bent, a
         ring += 1
     return target, length, anchor

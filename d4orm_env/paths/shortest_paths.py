@@ -40,17 +40,13 @@ REFINEMENTS = 2
 class ShortestPaths:
     """The shortest path of every robot of a problem to its goal, other robots not counted.
 
-    A free path keeps the radius of the robot and the margin to obstacles and bounds. A place that is nearer to
+    A free path keeps the radius of the robot and the margin to obstacles and bounds. A position that is nearer to
     something, as a goal may be, is left and reached on lines that come no nearer than it is. Lengths are at most 2%
     above the least. Gaps that are wider than radius and margin need by less than a sixteenth of that may be missed.
-
-    Attributes:
-        problem: The problem.
-        length: ``(K,)`` float64 from start to goal [m]; infinite where there is no path.
     """
 
-    problem: Problem
-    length: Floats
+    problem: Problem  #: The problem
+    length: Floats  #: ``(K,)`` float64 from start to goal [m]; infinite where there is no path
     _world: tuple[Space, Fields] | None
 
     def distance(self, points: ArrayLike) -> Floats:
@@ -164,7 +160,7 @@ def shortest_paths(problem: Problem) -> ShortestPaths:
 
 
 def _towards(positions: Floats, targets: Floats) -> Floats:
-    """Unit vectors ``(..., d)`` from places to targets; zero where these are the same."""
+    """Unit vectors ``(..., d)`` from positions to targets; zero where these are the same."""
     offset = targets - positions
     norm = np.sqrt((offset * offset).sum(axis=-1, keepdims=True))
     return offset / np.where(norm > 0, norm, 1.0)
@@ -174,7 +170,7 @@ def ahead_in_each(paths: Sequence[ShortestPaths], positions: FloatArray) -> tupl
     """:meth:`ShortestPaths.ahead` in ``B`` worlds, each with paths of its own, from positions ``(B, K, d)``."""
     given = positions.astype(np.float64)
     target, length = np.empty(given.shape), np.empty(given.shape[:-1])
-    # Each robot is one row of one place.
+    # Each robot is one row of one position.
     spatial = in_space(given.reshape(-1, given.shape[-1])).reshape(*given.shape[:-1], 1, 3)
     found, lengths, anchors = np.empty(spatial.shape), length[:, :, None], np.empty(spatial.shape[:3], np.int32)
     for world, own in enumerate(paths):
@@ -212,5 +208,5 @@ def _first_or_finer(problem: Problem, space: Space, safety_distance: float, befo
 
 
 def in_space(positions: Floats) -> Floats:
-    """Places ``(Q, d)`` in three dimensions."""
+    """Positions ``(Q, d)`` in three dimensions."""
     return np.hstack([positions, np.zeros((len(positions), 3 - positions.shape[1]))])

@@ -19,7 +19,7 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 
 TOLERANCE = 5e-6
-"""Rounding of clearances, as a share of the reach."""
+"""Rounding of clearances, as a share of the safety distance."""
 
 Position: TypeAlias = tuple[float, float, float]
 
@@ -118,7 +118,7 @@ def _to_extent(space: Space, x: float, y: float, z: float) -> float:
 
 @inlined
 def _cell(space: Space, x: float, y: float, z: float) -> tuple[int, float, float, float]:
-    """Number of the cell of a place, of the outermost one beyond the index, and offsets from its centre in cells."""
+    """Number of the cell of a position, of the outermost one beyond the index, and offsets from its centre in cells."""
     low, scale, size = space.low, space.scale, space.size
     x, y, z = (x - low[0]) * scale, (y - low[1]) * scale, (z - low[2]) * scale
     i = min(max(np.int64(x), 0), size[0] - 1)
@@ -152,7 +152,7 @@ def about_to_obstacles(space: Space, x: float, y: float, z: float) -> float:
 
 @inlined
 def clearance_at(space: Space, x: float, y: float, z: float) -> float:
-    """Distance of a place from the nearest obstacle or bound, negative inside [m]."""
+    """Distance of a position from the nearest obstacle or bound, negative inside [m]."""
     return min(_to_obstacles(space, x, y, z), to_bounds(space, x, y, z))
 
 
@@ -163,17 +163,19 @@ def distance(a: Position, b: Position) -> float:
 
 
 @compiled
-def sees(space: Space, safety_distance: float, a: Position, own_a: float, b: Position, own_b: float) -> bool:
+def sees(
+    space: Space, safety_distance: float, a: Position, clearance_a: float, b: Position, clearance_b: float
+) -> bool:
     """Check whether a line is free.
 
-    ``own_a`` and ``own_b`` are the clearances at the ends: a position that lies nearer to something than
+    ``clearance_a`` and ``clearance_b`` are the clearances at the ends: a position that lies nearer to something than
     ``safety_distance`` is left on lines that come no nearer than it is.
     """
     length = distance(a, b)
     if length == 0.0:
         return True
     ux, uy, uz = (b[0] - a[0]) / length, (b[1] - a[1]) / length, (b[2] - a[2]) / length
-    need_a, need_b = min(safety_distance, own_a), min(safety_distance, own_b)
+    need_a, need_b = min(safety_distance, clearance_a), min(safety_distance, clearance_b)
     zone_a, zone_b = 2 * (safety_distance - need_a), length - 2 * (safety_distance - need_b)
     s = 0.0
     while s < length:

@@ -1,8 +1,8 @@
-"""Shortest free paths to one place, compiled with numba: a wavefront over a grid, any-angle, in the plane and in space.
+"""Shortest free paths to one position, compiled with numba: an any-angle wavefront over a grid, in plane and space.
 
 As in Lazy Theta* (A. Nash, S. Koenig and C. Tovey, AAAI 2010) a node of the grid is worth the value of its anchor and
 the straight line to it, which is tested when the node's turn comes. Anchors are not tied to the grid: where a line is
-blocked, it is turned about its far end until it just passes, and the place where it then touches is the new anchor. So
+blocked, it is turned about its far end until it just passes, and the point where it then touches is the new anchor. So
 paths are nearly as short as they can be on grids that are no finer than the robot.
 """
 
@@ -22,7 +22,7 @@ from d4orm_env.paths.spaces import Position, Space, clearance_at, distance, posi
 
 _HALVINGS = 6
 """Number of halvings of the angle by which a blocked line is turned, and of the length by which a corner is cut."""
-NOBODY = np.int32(-1)
+NO_ANCHOR = np.int32(-1)
 """In place of an anchor that is not there."""
 
 
@@ -33,7 +33,7 @@ class Front(NamedTuple):
     points: Floats  #: ``(A, 3)`` the anchors; the first is the goal [m]
     values: Floats  #: ``(A,)`` length of the path from each to the goal [m]
     parents: Ints  #: ``(A,)`` int32 the anchor that comes next on that path; -1 for the goal
-    room: float  #: Clearance at the goal [m]
+    goal_clearance: float  #: Clearance at the goal [m]
 
 
 @inlined
@@ -43,13 +43,13 @@ def _between(a: Position, b: Position, share: float) -> Position:
 
 @compiled
 def _turned(
-    space: Space, safety_distance: float, a: Position, own: float, p: Position, q: Position
+    space: Space, safety_distance: float, a: Position, clearance: float, p: Position, q: Position
 ) -> tuple[Position, Position]:
-    """Two places to go round on the way from ``a`` to ``q``, which it does not see and ``p`` beside it does."""
+    """Two points to go round on the way from ``a`` to ``q``, which it does not see; it sees the neighbour ``p``."""
     low, high = 0.0, 1.0
     for _ in range(_HALVINGS):
         share = (low + high) / 2
-        if sees(space, safety_distance, a, own, _between(q, p, share), safety_distance):
+        if sees(space, safety_distance, a, clearance, _between(q, p, share), safety_distance):
             high = share
         else:
             low = share
@@ -80,9 +80,9 @@ class _Nodes(NamedTuple):
 
 
 @inlined
-def _kept(anchor: Whole, own_goal: float, safety_distance: float) -> float:
+def _kept(anchor: Whole, goal_clearance: float, safety_distance: float) -> float:
     """Return the clearance kept around an anchor: all but the goal are clear."""
-    return own_goal if anchor == 0 else safety_distance
+    return goal_clearance if anchor == 0 else safety_distance
 
 
 @compiled
@@ -90,7 +90,7 @@ def _seen_anchor(
     space: Space,
     lattice: Lattice,
     safety_distance: float,
-    own_goal: float,
+    goal_clearance: float,
     nodes: _Nodes,
     points: Floats,
     values: Floats,
@@ -98,7 +98,7 @@ def _seen_anchor(
 ) -> tuple[np.int32, float]:
     """The best anchor of the neighbours of a node that it sees, and the path by it; -1 for none."""
     (i, j, k), q, tried = indices_of(lattice.size, lattice.points[n]), position_of(lattice.positions, n), nodes.tried
-    best, chosen, count = np.inf, NOBODY, 0
+    best, chosen, count = np.inf, NO_ANCHOR, 0
     for move in range(lattice.moves.shape[0]):
         p = neighbour(lattice, move, i, j, k)
         if p < 0 or not nodes.done[p]:
@@ -113,7 +113,8 @@ def _seen_anchor(
         count += 1
         at = position_of(points, a)
         length = values[a] + distance(at, q)
-        if length < best and sees(space, safety_distance, at, _kept(a, own_goal, safety_distance), q, safety_distance):
+        kept = _kept(a, goal_clearance, safety_distance)
+        if length < best and sees(space, safety_distance, at, kept, q, safety_distance):
             best, chosen = length, a
     return chosen, best
 
@@ -124,7 +125,7 @@ def _detour(
 ) -> tuple[np.int64, float, Position]:
     """The best neighbour to go on from to a node at ``q``, -1 for none, the path by it, and where it bends.
 
-    In a narrow gap neighbours may see each other by way of a place between them only; elsewhere it is ``q``.
+    In a narrow gap neighbours may see each other by way of a point between them only; elsewhere it is ``q``.
     """
     i, j, k = indices_of(lattice.size, lattice.points[n])
     best, through, bend = np.inf, np.int64(-1), q
@@ -159,7 +160,7 @@ def _add_anchor(points: Floats, values: Floats, parents: Ints, number: int, posi
 
 @register_jitable(nogil=True, **OPTIONS)
 def _twice_as_many(points: Floats, values: Floats, parents: Ints) -> tuple[Floats, Floats, Ints]:
-    """Return arrays of anchors with room for twice as many."""
+    """Arrays of the same anchors with room for twice as many."""
     count = len(values)
     return (
         np.concatenate((points, np.empty((count, 3)))),
@@ -196,11 +197,11 @@ def _pass_on(
     n: Whole,
     a: Whole,
     at: Position,
-    own: float,
+    clearance: float,
     value: float,
     heap: Heap,
 ) -> None:
-    """Give the neighbours of node ``n`` paths by its anchor ``a`` at a position of clearance ``own``, if shorter."""
+    """Give the neighbours of node ``n`` paths by its anchor ``a``, at a position of this clearance, if shorter."""
     i, j, k = indices_of(lattice.size, lattice.points[n])
     for move in range(lattice.moves.shape[0]):
         p = neighbour(lattice, move, i, j, k)
@@ -211,7 +212,7 @@ def _pass_on(
         # What is hidden from one that has no path yet may still be reached by going round.
         if length >= nodes.value[p] or (nodes.hidden[p] == a and nodes.value[p] < np.inf):
             continue
-        if nodes.tested[p] and not sees(space, safety_distance, at, own, position, safety_distance):
+        if nodes.tested[p] and not sees(space, safety_distance, at, clearance, position, safety_distance):
             nodes.hidden[p] = a
             continue
         nodes.value[p], nodes.anchor[p] = length, a
@@ -226,25 +227,25 @@ def _spread(
     value, anchor, hidden = nodes.value, nodes.anchor, nodes.hidden
     points, values, parents = np.empty((256, 3)), np.empty(256), np.empty(256, np.int32)
     points[0, 0], points[0, 1], points[0, 2] = goal[0], goal[1], goal[2]
-    values[0], parents[0], used = 0.0, NOBODY, 1
+    values[0], parents[0], used = 0.0, NO_ANCHOR, 1
     at = position_of(points, 0)
-    own_goal = clearance_at(space, at[0], at[1], at[2])
-    heap = _begin_at(lattice, at, 2 + int(2 * max(0.0, safety_distance - own_goal) / lattice.step), nodes)
+    goal_clearance = clearance_at(space, at[0], at[1], at[2])
+    heap = _begin_at(lattice, at, 2 + int(2 * max(0.0, safety_distance - goal_clearance) / lattice.step), nodes)
     while len(heap) > 0:
         length, n = heapq.heappop(heap)
         if nodes.done[n] or length != value[n]:
             continue
         q, a = position_of(lattice.positions, n), anchor[n]
-        at, kept = position_of(points, a), _kept(a, own_goal, safety_distance)
+        at, kept = position_of(points, a), _kept(a, goal_clearance, safety_distance)
         if not nodes.tested[n] and not sees(space, safety_distance, at, kept, q, safety_distance):
             hidden[n] = a
-            a, value[n] = _seen_anchor(space, lattice, safety_distance, own_goal, nodes, points, values, n)
+            a, value[n] = _seen_anchor(space, lattice, safety_distance, goal_clearance, nodes, points, values, n)
             p, via, bend = _detour(space, lattice, safety_distance, nodes, n, q)
             if via < value[n]:
                 b, c, parent = position_of(lattice.positions, p), bend, anchor[p]
                 if c == q:
                     at = position_of(points, parent)
-                    b, c = _turned(space, safety_distance, at, _kept(parent, own_goal, safety_distance), b, q)
+                    b, c = _turned(space, safety_distance, at, _kept(parent, goal_clearance, safety_distance), b, q)
                 if used + 2 > len(values):
                     points, values, parents = _twice_as_many(points, values, parents)
                 _add_anchor(points, values, parents, used, b, parent)
@@ -257,9 +258,9 @@ def _spread(
             if a < 0 or value[n] > length:
                 continue
         nodes.done[n] = True
-        at, kept = position_of(points, a), _kept(a, own_goal, safety_distance)
+        at, kept = position_of(points, a), _kept(a, goal_clearance, safety_distance)
         _pass_on(space, lattice, safety_distance, nodes, n, a, at, kept, values[a], heap)
-    return points[:used].copy(), values[:used].copy(), parents[:used].copy(), own_goal
+    return points[:used].copy(), values[:used].copy(), parents[:used].copy(), goal_clearance
 
 
 def spread(space: Space, lattice: Lattice, safety_distance: float, goal: Floats) -> Front:
@@ -267,11 +268,11 @@ def spread(space: Space, lattice: Lattice, safety_distance: float, goal: Floats)
     count = len(lattice.positions)
     nodes = _Nodes(
         value=np.full(count, np.inf),
-        anchor=np.full(count, NOBODY),
-        hidden=np.full(count, NOBODY),
+        anchor=np.full(count, NO_ANCHOR),
+        hidden=np.full(count, NO_ANCHOR),
         tested=np.zeros(count, np.bool_),
         done=np.zeros(count, np.bool_),
         tried=np.empty(len(lattice.moves), np.int32),
     )
     found = _spread(space, lattice, safety_distance, goal, nodes)
-    return Front(np.where(nodes.done, nodes.anchor, NOBODY), *found)
+    return Front(np.where(nodes.done, nodes.anchor, NO_ANCHOR), *found)

@@ -57,8 +57,8 @@ def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, pan
     rows = -(-len(shown) // 3)
     limits = view_limits(problem)
     figure = Figure(figsize=(9.6, 3.5 * rows), layout="constrained")
-    for place, step in enumerate(shown):
-        panel = Axes2D(figure.add_subplot(rows, 3, place + 1), problem, limits)
+    for number, step in enumerate(shown, 1):
+        panel = Axes2D(figure.add_subplot(rows, 3, number), problem, limits)
         panel.axes.set_title(denoising.labels[step].partition(" of ")[0], fontsize=10)
         panel.axes.label_outer()
         _draw_step(TeamLayer(panel, problem), denoising, int(step))
@@ -72,6 +72,5 @@ def _draw_step(layer: TeamLayer, denoising: Denoising, step: int) -> None:
     for sample, alpha in zip(denoising.samples[step], denoising.alpha[step]):
         paths = panel.flatten(sample).swapaxes(0, 1)
         panel.segments(paths, colors=layer.colors, linewidths=0.6, alpha=float(alpha), zorder=3)
-    waiting = np.zeros(problem.num_robots, bool)
-    nobody = np.empty((0, problem.dimension))
-    layer.update(problem.start, waiting, problem.goal, denoising.paths[step], nobody)
+    arrived, contacts = np.zeros(problem.num_robots, bool), np.empty((0, problem.dimension))
+    layer.update(problem.start, arrived, problem.goal, denoising.paths[step], contacts)

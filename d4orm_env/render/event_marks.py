@@ -76,9 +76,9 @@ class MarkLayer:
 
     def _draw_stalls(self, positions: Array, where: Array) -> None:
         centres = self.panel.flatten(positions[where])
-        reach = 1.2 * np.broadcast_to(self.radius, where.shape)[where][:, None]
+        arms = 1.2 * np.broadcast_to(self.radius, where.shape)[where][:, None]
         one, other = self.panel.right + self.panel.up, self.panel.right - self.panel.up
-        crosses = [np.stack([centres - reach * arm, centres + reach * arm], axis=1) for arm in (one, other)]
+        crosses = [np.stack([centres - arms * along, centres + arms * along], axis=1) for along in (one, other)]
         self.stalls.set_segments(np.concatenate(crosses))
 
 

@@ -68,13 +68,13 @@ class FrameRenderer:
 
     def _panels(self, figure: Figure, limits: Array) -> list[Axes2D]:
         if self.problem.dimension == 2:
-            positions = [("plane", (0.12, 0.1, 0.85, 0.83))]
+            views = [("plane", (0.12, 0.1, 0.85, 0.83))]
         elif self.size[0] >= 1.6 * self.size[1]:
-            positions = [("space", (0.015, 0.04, 0.44, 0.84)), ("above", (0.57, 0.1, 0.42, 0.83))]
+            views = [("space", (0.015, 0.04, 0.44, 0.84)), ("above", (0.57, 0.1, 0.42, 0.83))]
         else:
-            positions = [("space", (0.01, 0.04, 0.86, 0.86))]
+            views = [("space", (0.01, 0.04, 0.86, 0.86))]
         panels = []
-        for view, rectangle in positions:
+        for view, rectangle in views:
             panel = Axes2D(make_axes(figure, 111, view), self.problem, limits)
             panel.axes.set_position(rectangle)
             panels.append(panel)
@@ -113,12 +113,12 @@ class FrameRenderer:
         """
         team, d = self._checked(np.asarray(states)), self.problem.dimension
         arrived = np.asarray(arrived, bool)
-        positions = self.problem.goal if goals is None else np.asarray(goals)
+        goals = self.problem.goal if goals is None else np.asarray(goals)
         path = np.empty((0, len(team), d)) if trail is None else np.asarray(trail)
         stars = np.concatenate([np.reshape(contacts, (-1, d)), team[np.asarray(collided, bool), :d]])
-        self._keep_in_view(np.concatenate([team[:, :d], positions]))
+        self._keep_in_view(np.concatenate([team[:, :d], goals]))
         for layer in self._layers:
-            layer.update(team, arrived, positions, path, stars)
+            layer.update(team, arrived, goals, path, stars)
         if events is not None:
             for mark_layer in self._mark_layers:
                 mark_layer.show_last(events, path[-len(events.pushed) :])
@@ -134,8 +134,8 @@ class FrameRenderer:
         return states
 
     def _keep_in_view(self, positions: Array) -> None:
-        reach = np.max(self.problem.team.radius)
-        lower, upper = positions.min(axis=0) - reach, positions.max(axis=0) + reach
+        radius = np.max(self.problem.team.radius)
+        lower, upper = positions.min(axis=0) - radius, positions.max(axis=0) + radius
         low, high = self._limits
         if (lower < low).any() or (upper > high).any():
             room = 0.15 * (high - low)

@@ -71,14 +71,14 @@ def view_limits(problem: Problem, points: ArrayLike = ()) -> Array:
     That is every start, goal, obstacle and further robot position ``(..., d)`` with some room around them, and the
     bounds where they are near. Neither side of the plane is shown at less than 0.4 of the other.
     """
-    d, world, reach = problem.dimension, problem.world, float(np.max(problem.team.radius))
+    d, world, radius = problem.dimension, problem.world, float(np.max(problem.team.radius))
     positions = np.concatenate([problem.start[:, :d], problem.goal, np.reshape(points, (-1, d))]).astype(np.float64)
-    nearest, farthest = positions.min(axis=0) - reach, positions.max(axis=0) + reach
+    nearest, farthest = positions.min(axis=0) - radius, positions.max(axis=0) + radius
     corners = np.where(np.isfinite(every := np.stack(world.shapes.corners())), every, nearest)
     lower, upper = corners[0].min(axis=0, initial=np.inf), corners[1].max(axis=0, initial=-np.inf)
     lower, upper = np.minimum(lower, nearest), np.maximum(upper, farthest)
     span = float(np.max(upper - lower))
-    room = max(1.5 * reach, 0.05 * span)
+    room = max(1.5 * radius, 0.05 * span)
     bounds = world.bounds.astype(np.float64)
     below = np.where(bounds[0] > lower - 0.3 * span, bounds[0] - 0.25 * room, lower - room)
     above = np.where(bounds[1] < upper + 0.3 * span, bounds[1] + 0.25 * room, upper + room)

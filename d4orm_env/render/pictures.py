@@ -41,7 +41,7 @@ PICTURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def _contact_starts(collided: Array) -> Array:
-    """Return where in ``(T, K)`` flags a contact begins."""
+    """Flags of the moments at which a contact begins, of flags ``(T, K)`` of contact."""
     return collided & ~np.concatenate([np.zeros_like(collided[:1]), collided[:-1]])
 
 
@@ -74,7 +74,7 @@ def last_moment(problem: Problem, trajectory: Trajectory, aftermath: float) -> i
 def plot_trajectory(
     problem: Problem, trajectory: Trajectory, *, title: str | None = None, events: DisturbanceEvents | None = None
 ) -> Figure:
-    """Draw a whole trajectory, to scale: what the world is, where every robot went, and what went wrong.
+    """Draw a whole trajectory, to scale: the world, every robot's path, and what went wrong.
 
     A circle in a robot's colour is its start, a diamond its goal, the filled disc where it ends (paler when it has
     arrived), the line in it the heading of a differential drive. A star marks where a contact begins, a red disc each
@@ -101,8 +101,8 @@ def plot_trajectory(
     spatial = problem.dimension == 3
     figure = Figure(figsize=(11.0 if spatial else 5.8, height + 0.9), layout="constrained")
     layer = None
-    for place, view in ((121, "space"), (122, "above")) if spatial else ((111, "plane"),):
-        panel = Axes2D(make_axes(figure, place, view), problem, limits)
+    for position, view in ((121, "space"), (122, "above")) if spatial else ((111, "plane"),):
+        panel = Axes2D(make_axes(figure, position, view), problem, limits)
         layer = TeamLayer(panel, problem)
         _draw_history(layer, trajectory)
         if events is not None:
@@ -162,14 +162,6 @@ def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | No
     elif axes.name == "3d" and problem.dimension == 2:
         raise ValueError("the axes are spatial and the problem is planar; give axes without projection='3d'")
     return _plot_on(axes, problem, trajectory)
-
-
-@own_style()
-def plot_problem(problem: Problem) -> Figure:
-    """A problem alone, as :func:`plot` draws it, in a figure that belongs to no window."""
-    figure = Figure(figsize=(4.6, 4.6), layout="constrained")
-    _plot_on(make_axes(figure, 111, "space" if problem.dimension == 3 else "plane"), problem, None)
-    return figure
 
 
 @own_style()
@@ -255,9 +247,12 @@ def motion_html(problem: Problem, trajectory: Trajectory, title: str, rows: Iter
     return _page(title, rows, plot_trajectory(problem, trajectory, title=""))
 
 
+@own_style()
 def problem_html(problem: Problem, title: str, rows: Iterable[KeyFigure]) -> str:
     """A problem: its picture and its key figures, escaped."""
-    return _page(title, rows, plot_problem(problem))
+    figure = Figure(figsize=(4.6, 4.6), layout="constrained")
+    _plot_on(make_axes(figure, 111, "space" if problem.dimension == 3 else "plane"), problem, None)
+    return _page(title, rows, figure)
 
 
 @own_style()

@@ -64,16 +64,17 @@ def motion(
         ValueError: If the trajectory, the goals or the bodies do not fit the problem, or are not finite.
     """
     checked_trajectory(problem, trajectory)
-    positions = problem.goal[None] if goals is None else _checked_goals(problem, goals, len(trajectory.states))
+    goals = problem.goal[None] if goals is None else _checked_goals(problem, goals, len(trajectory.states))
     end = last_moment(problem, trajectory, _AFTERMATH) + 1
+    limits = view_limits(problem, np.concatenate([trajectory.positions, goals]))
     flags = trajectory.arrived * 1 + trajectory.collided * 2 + trajectory.margin_violated * 4
     content = {
         "title": title,
         "figures": figures,
-        "limits": _in_space(view_limits(problem, np.concatenate([trajectory.positions, positions])).tolist()),
+        "limits": [[*corner, 0.0][:3] for corner in limits.tolist()],
         **_setting(problem),
         "states": rounded(trajectory.states[:end]),
-        "goals": rounded(positions[:end]),
+        "goals": rounded(goals[:end]),
         "world_clearance": _clearance(problem, trajectory.positions[:end]),
         "flags": _text(flags[:end].astype(np.uint8)),
     }
@@ -86,11 +87,11 @@ def motion(
 
 def _checked_goals(problem: Problem, goals: ArrayLike, moments: int) -> FloatArray:
     """``(T+1, K, d)`` goals, or ``(1, K, d)`` where they are always the same."""
-    positions: FloatArray = np.asarray(goals, np.float32)
+    array: FloatArray = np.asarray(goals, np.float32)
     shape = (moments, *problem.goal.shape)
-    if positions.shape != shape or not np.isfinite(positions).all():
-        raise ValueError(f"goals have shape {positions.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
-    return positions[:1] if (positions == positions[0]).all() else positions
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"goals have shape {array.shape}; they must be finite and of shape (T+1, K, d) = {shape}")
+    return array[:1] if (array == array[0]).all() else array
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +165,17 @@ def rounded(array: ArrayLike) -> dict[str, object]:
 
 def _setting(problem: Problem) -> dict[str, object]:
     """Team and world, which do not change."""
-    models = problem.team.robot_models
+    models, world = problem.team.robot_models, problem.world
     return {
         "dimension": problem.dimension,
         "dt": problem.dt,
-        "bounds": None if problem.world.lower is None else problem.world.bounds.tolist(),
-        "world": _obstacles(problem),
+        "bounds": None if world.lower is None else world.bounds.tolist(),
+        "world": {
+            "balls": world.balls.tolist(),
+            "cylinders": world.cylinders.tolist(),
+            "boxes": world.boxes.tolist(),
+            "polygons": [corners.tolist() for corners in world.polygons],
+        },
         "radius": np.asarray(problem.team.radius).tolist(),
         "outlines": [footprint.outline().tolist() for footprint in problem.team.shapes] or None,
         "trailers": [_trailers(problem.team, robot) for robot in range(problem.num_robots)],
@@ -216,20 +222,6 @@ def _bodies(problem: Problem, bodies: FloatArray, steps: int, end: int) -> dict[
 def _clearance(problem: Problem, positions: FloatArray) -> dict[str, object]:
     clearance = problem.world.clearance(positions)
     return rounded(np.where(np.isfinite(clearance), clearance, _NO_CLEARANCE)[..., None])
-
-
-def _obstacles(problem: Problem) -> dict[str, object]:
-    world = problem.world
-    return {
-        "balls": world.balls.tolist(),
-        "cylinders": world.cylinders.tolist(),
-        "boxes": world.boxes.tolist(),
-        "polygons": [corners.tolist() for corners in world.polygons],
-    }
-
-
-def _in_space(limits: list[list[float]]) -> list[list[float]]:
-    return [[*corner, 0.0][:3] for corner in limits]
 
 
 def _text(array: NDArray[np.generic]) -> str:

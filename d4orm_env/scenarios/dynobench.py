@@ -19,7 +19,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import Floats, short_repr
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import read_yaml
+from d4orm_env.core.files import naming, read_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -84,9 +84,9 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
 
     Args:
         path: Its YAML file, with ``environment`` and ``robots``.
-        models: Parameters of robot types by name, beside or instead of :data:`MODELS`; each as in one of dynobench's
-            model files, such as ``{"dynamics": "integrator2_2d", "max_vel": 0.5, "max_acc": 2.0, "shape": "sphere",
-            "radius": 0.1}``.
+        models: Parameters of robot types by name, which add to :data:`MODELS` or replace them; each as in one of
+            dynobench's model files, such as ``{"dynamics": "integrator2_2d", "max_vel": 0.5, "max_acc": 2.0, "shape":
+            "sphere", "radius": 0.1}``.
 
     Returns:
         The problem, in steps of 0.1 s, with rectangles and headings. Robots may leave their goals for others
@@ -96,15 +96,15 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
         ValueError: If the file cannot be read or is no such problem, or a type is unknown; the message names the file,
             and all types that are unknown.
     """
-    try:
-        return _problem(read_yaml(path), MODELS | {name: dict(given) for name, given in (models or {}).items()}, path)
-    except (KeyError, TypeError, IndexError) as error:
-        raise ValueError(
-            f"{path}: no multi-robot problem of dynobench, {first_line(error)} is missing or is not what was expected; "
-            f"it has environment: min, max, obstacles, and robots: type, start, goal"
-        ) from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+    known = MODELS | {name: dict(given) for name, given in (models or {}).items()}
+    with naming(path):
+        try:
+            return _problem(read_yaml(path), known, path)
+        except (KeyError, TypeError, IndexError) as error:
+            raise ValueError(
+                f"no multi-robot problem of dynobench, {first_line(error)} is missing or is not what was expected; "
+                f"it has environment: min, max, obstacles, and robots: type, start, goal"
+            ) from error
 
 
 def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.PathLike[str]) -> Problem:

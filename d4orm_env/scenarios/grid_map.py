@@ -73,7 +73,7 @@ class GridMap:
         return np.array(self.low) + self.cell * np.column_stack([column + 0.5, len(self.blocked) - row - 0.5])
 
     def lattice_step(self, safety_distance: float) -> float:
-        """Step of a lattice that finds every path one cell wide which robots of that reach have [m]."""
+        """Step of a lattice that finds every path one cell wide which robots with that safety distance have [m]."""
         half = self.cell / 2
         if half <= safety_distance:
             return half * max(1, int(safety_distance / 2 / half))
@@ -144,10 +144,11 @@ def grid_of_fields(fields: dict[str, Any], folder: Path) -> GridMap:
     occupied = _share(fields.get("occupied_thresh", 0.65), "occupied_thresh")
     if free > occupied:
         raise ValueError(f"free_thresh is {free:g}; it must be at most occupied_thresh, which is {occupied:g}")
-    low = _corner(fields["origin"])
+    x, y, yaw = _checked_origin(fields["origin"])
     blocked = ~(_occupancy(read_limited(folder / image, "an image", MAX_BYTES), mode, bool(negate)) < free)
-    _require_no_turn(fields["origin"], blocked.shape)
-    return _grid_map(blocked.tobytes(), blocked.shape, resolution, low)
+    if abs(math.remainder(yaw, math.tau)) * math.hypot(*blocked.shape) > LEAST_TURN:
+        raise ValueError(f"origin has a yaw of {yaw:g} rad; only maps with a yaw of 0 can be read, so turn the image")
+    return _grid_map(blocked.tobytes(), blocked.shape, resolution, (x, y))
 
 
 @lru_cache(maxsize=4)
@@ -219,8 +220,8 @@ def _share(value: object, name: str) -> float:
     return positive_number(value, name, zero_allowed=True, most=1.0)
 
 
-def _numbers(origin: object) -> list[float]:
-    """x, y and yaw.
+def _checked_origin(origin: object) -> list[float]:
+    """X and y [m], and yaw [rad].
 
     Some saved maps have ``-nan`` as their yaw, where a mapper sent no valid orientation. Nothing in ROS's navigation
     uses a yaw, and its maintainers advise to write zero there (ros-planning/navigation, issue 993): it is read as zero.
@@ -231,15 +232,3 @@ def _numbers(origin: object) -> list[float]:
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in numbers):
         raise ValueError(f"origin is {short_repr(origin)}; it must be three numbers, x, y and yaw")
     return [float(value) for value in numbers]
-
-
-def _corner(origin: object) -> tuple[float, float]:
-    x, y, _ = _numbers(origin)
-    return x, y
-
-
-def _require_no_turn(origin: object, shape: tuple[int, ...]) -> None:
-    """Refuse a yaw that moves a cell of a map of that many rows and columns."""
-    yaw = _numbers(origin)[2]
-    if abs(math.remainder(yaw, math.tau)) * math.hypot(*shape) > LEAST_TURN:
-        raise ValueError(f"origin has a yaw of {yaw:g} rad; only maps with a yaw of 0 can be read, so turn the image")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -13,7 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from d4orm_env.core.arrays import short_repr
-from d4orm_env.core.files import is_yaml_path, read_limited
+from d4orm_env.core.files import is_yaml_path, naming, read_limited
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, grid_of_fields, read_occupancy_image
@@ -28,13 +26,9 @@ BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 """Prefix that some editors put before UTF-8 text."""
 
 
+@lru_cache(maxsize=4)
 def parse_map(content: bytes, cell: float) -> GridMap:
-    """A ``.map`` file.
-
-    Args:
-        content: Of the file.
-        cell: Side of a cell [m].
-    """
+    """The map of a ``.map`` file's content, of cells with this side [m]."""
     lines = content.removeprefix(BYTE_ORDER_MARK).splitlines()
     height, width = _size(lines)
     rows = [row.rstrip() for row in lines[4:]]
@@ -85,13 +79,7 @@ class MapTask(NamedTuple):
 
 
 def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[MapTask]:
-    """The first rows of a ``.scen`` file.
-
-    Args:
-        content: Of the file.
-        shape: Rows and columns of its map.
-        count: Number of rows.
-    """
+    """The first ``count`` rows of a ``.scen`` file's content; ``shape`` is rows and columns of its map."""
     # Split as bytes: of text more would end a line, such as the ellipsis of a map's name.
     lines = [line.decode("latin-1") for line in content.removeprefix(BYTE_ORDER_MARK).splitlines()]
     if not lines or lines[0].split()[:1] != ["version"]:
@@ -162,7 +150,7 @@ def read_map(path: PathLike, cell: float = 0.6, resolution: float | None = None)
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"the path of a map must be text or a path, not {short_repr(path)}")
     file = Path(path)
-    with _named(file):
+    with naming(file):
         if file.suffix.lower() in IMAGES:
             if resolution is None:
                 file.stat()  # where there is none, that is what to tell
@@ -173,10 +161,7 @@ def read_map(path: PathLike, cell: float = 0.6, resolution: float | None = None)
             raise ValueError(f"is no {kinds} image, and only these take a resolution; leave it out, or convert it")
         if is_yaml_path(file):
             return read_occupancy_image(file)
-        return _parse(read_limited(file, "a map", MAX_BYTES), cell)
-
-
-_parse = lru_cache(maxsize=4)(parse_map)
+        return parse_map(read_limited(file, "a map", MAX_BYTES), cell)
 
 
 def map(
@@ -185,7 +170,7 @@ def map(
 ) -> Problem:  # fmt: skip
     """A map from a file; starts and goals anywhere on it, or those of a Moving AI scenario.
 
-    Places are drawn from the largest connected region that is wide enough for the largest robot, and set by the seed.
+    Positions are drawn from the largest connected region that is wide enough for the largest robot, by the seed.
 
     Args:
         settings: The common arguments.
@@ -208,13 +193,13 @@ def map(
         return populate(settings, grid.world, step, space.longest_path, remedy)
     starts, goals, travel = _listed_positions(settings, grid, space, Path(scenario_file))
     world = with_obstacles(settings, grid.world, np.vstack([starts, goals]))
-    with _named(Path(scenario_file)):  # whose rows may start or end in one place
+    with naming(Path(scenario_file)):  # whose rows may start or end in one cell
         return build(settings, Layout(starts, goals, world, travel))
 
 
 def _listed_positions(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:
     """Starts and goals of a Moving AI scenario, and the longest path [m]."""
-    with _named(path):
+    with naming(path):
         tasks = parse_scenario(read_limited(path, "a map", MAX_BYTES), grid.blocked.shape, settings.num_robots)
         for task in tasks:
             for what, cell in (("start", task.start), ("goal", task.goal)):
@@ -229,14 +214,3 @@ def _listed_positions(settings: Settings, grid: GridMap, space: FreeSpace, path:
     starts, goals = (grid.centres(np.array([getattr(task, what) for task in tasks])) for what in ("start", "goal"))
     straight = np.linalg.norm(goals - starts, axis=1)
     return starts, goals, float(max(straight.max(), grid.cell * max(task.path_length for task in tasks)))
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Errors as one line that begins with the file."""
-    try:
-        yield
-    except OSError as error:
-        raise ValueError(f"{error.filename or path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error

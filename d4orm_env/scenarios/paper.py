@@ -47,9 +47,6 @@ def paper_random(settings: Settings) -> Problem:
     Goals take the first points, row by row, of a ``ceil(sqrt K)`` by ``ceil(sqrt K)`` grid over ``[-5, 5]^2``. A start
     is the first of 1 000 uniform points of the square that is 5 to 6 m from its goal and six radii from all starts
     before it; where none is, all are drawn again, up to 20 times. That places 64 robots, and never 100.
-
-    Args:
-        settings: The common arguments.
     """
     require_plane(settings)
     goals = _grid(settings.num_robots)

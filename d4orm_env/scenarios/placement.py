@@ -1,4 +1,4 @@
-"""Places for robots: the free space among obstacles, and random places, drawn again until they are free."""
+"""Positions for robots: the free space among obstacles, and random positions, drawn again until they are free."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FEW, MANY, ROUNDS = 8, 512, 70
-"""Candidates drawn at first and at most at once, and how often, before a place is held to be impossible."""
+"""Candidates drawn at first and at most at once, and how often, before a position is held to be impossible."""
 
 DENSITY = {2: 0.4, 3: 0.25}
 """Share of the area (volume) that random placement fills without fail; it jams at 0.547 (0.384)."""
@@ -47,7 +47,7 @@ class PlacementArea(NamedTuple):
 def scatter(settings: Settings, size: float) -> tuple[Points, Points]:
     """Random starts and goals ``(K, d)`` in the square (cube) of side ``size`` around the origin.
 
-    Starts keep more than the margin to each other, goals likewise, and no robot starts at its goal. Each place is drawn
+    Starts keep more than the margin to each other, goals likewise, and no robot starts at its goal. Each is drawn
     uniformly, and drawn again until it is free.
     """
     count, dimension = settings.num_robots, settings.team.dimension
@@ -147,7 +147,7 @@ def _first(
 
 
 def _gaps(candidates: Points, points: Points, safety_distance: Points | float) -> Points:
-    """``(C,)`` how far each candidate is from all points, less their reach; infinite where there are none [m]."""
+    """``(C,)`` least distance of each candidate to points, less what they keep; infinite where there are none [m]."""
     if not len(points):
         return np.full(len(candidates), np.inf)
     return (np.linalg.norm(candidates[:, None] - points, axis=-1) - safety_distance).min(axis=1)
@@ -171,7 +171,7 @@ class FreeSpace:
     inside: Mask
 
     def points(self, indices: NDArray[np.int64]) -> Points:
-        """``(..., d)`` places of the lattice points of these indices, as float32 holds them [m]."""
+        """``(..., d)`` positions of the lattice points of these indices, as float32 holds them [m]."""
         return (self.low + self.step * indices).astype(np.float32).astype(np.float64)
 
     def contains(self, position: Points) -> bool:
@@ -224,7 +224,7 @@ def free_space(world: World, safety_distance: float, step: float) -> FreeSpace:
             f"{step:.2g} m apart to find free places in; use a smaller world or larger robots"
         )
     space = FreeSpace(low, step, np.zeros(shape, np.bool_))
-    # A robot keeps its reach between two neighbours that are further from everything than this.
+    # Between two neighbours that are further from everything than this a robot keeps its safety distance.
     needed = math.sqrt(safety_distance * safety_distance + step * step / 4)
     free = np.empty(shape, np.bool_)
     rows = max(1, _POINTS_AT_ONCE // int(np.prod(shape[1:])))

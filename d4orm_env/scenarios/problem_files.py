@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from d4orm_env.core.files import read_yaml, replaced_when_done
+from d4orm_env.core.files import naming, read_yaml, replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.footprints import Disc
@@ -39,12 +39,10 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     """
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
-    try:
+    with naming(path):
         content = read_yaml(path)
         is_dynobench = isinstance(content, dict) and "environment" in content
         problem = None if is_dynobench else parse(content)
-    except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
     problem = load_dynobench(path) if problem is None else problem
     proofs = [f"robot_{robot} {proof}" for robot, proof in prove_infeasible(problem).items()]
     if proofs:

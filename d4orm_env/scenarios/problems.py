@@ -53,7 +53,7 @@ def register_scenario(name: str, generator: Callable[..., Problem] | Scenario) -
 
 
 _in_space = partial(built_in, model="holonomic3d")
-# Instances of others, who let robots stop dead at their goals.
+# Instances of other publications, in which robots stop dead at their goals.
 _paper = partial(built_in, horizon=100, goal_speed=np.inf)
 _amswarm = partial(_in_space, num_robots=10, radius=0.29, margin=0.05, goal_speed=np.inf)
 _drawn = partial(built_in, draws=True)
@@ -125,12 +125,9 @@ def find_scenario(scenario: ScenarioLike) -> Scenario:
 
 
 def unknown_argument(scenario: ScenarioLike | None, names: Iterable[str], others: Iterable[str] = ()) -> str:
-    """Describe the first of ``names`` that is no argument of that scenario; the empty string if there is none.
+    """Describe the first of ``names`` that neither the scenario nor the caller, ``others``, takes; ``""`` for none.
 
-    Args:
-        scenario: As for :func:`make_problem`; ``None`` is any of the registered ones.
-        names: The arguments given.
-        others: Further arguments that the caller takes.
+    ``None`` is any of the registered scenarios.
     """
     if scenario is not None:
         return find_scenario(scenario).complaint(names, others)
@@ -148,8 +145,8 @@ def make_problem(
     ``num_obstacles`` (0), ``obstacle_radius``, ``bounds`` (if it is open), ``radius``, ``margin``, ``dt``, ``horizon``,
     ``goal_radius``, ``goal_speed``, ``arrival``, ``max_speed``, ``max_acceleration`` and ``max_turn_rate``; see
     :class:`~d4orm_env.scenarios.settings.Settings` for units and defaults, which are the paper's, and
-    :mod:`~d4orm_env.scenarios.generators` and the modules beside it for each scenario's own arguments. An argument that
-    is ``None`` takes its default. Robots start at rest; those with a heading face their goals.
+    :mod:`~d4orm_env.scenarios.generators` and the modules next to it for each scenario's own arguments. An argument
+    that is ``None`` takes its default. Robots start at rest; those with a heading face their goals.
 
     Without ``horizon`` the problem has 100 steps (the paper's), and more where robots have further to go than those
     allow for: see :func:`~d4orm_env.scenarios.layout.default_horizon`.

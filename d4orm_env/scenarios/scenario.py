@@ -58,7 +58,7 @@ class Scenario:
     name: str  #: Its name in tables and messages
     generator: Callable[..., Problem]  #: ``(seed, num_robots, **settings) -> Problem``
     about: str = ""  #: What describes it; the generator's docstring by default
-    draws: bool = False  #: Every seed is known to give other places, and never another team
+    draws: bool = False  #: Every seed is known to give other positions, and never another team
     known: tuple[str, ...] = ()  #: All arguments of a generator that does not name them itself
 
     def __post_init__(self) -> None:
@@ -91,26 +91,11 @@ class Scenario:
         settings = [parameter.name for parameter in self._parameters[2:] if parameter.kind in _KEYWORDS]
         return (*settings, "num_robots", "seed")
 
-    @property
-    def takes_any(self) -> bool:
-        """True if the generator looks at its settings itself."""
-        several = any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in self._parameters)
-        return several and not self.known
-
-    @property
-    def has_own_size(self) -> bool:
-        """True if the generator has a team size of its own, for when none is asked for."""
-        second = self._parameters[1:2]
-        return bool(second) and second[0].default is not inspect.Parameter.empty
-
     def complaint(self, names: Iterable[str], others: Iterable[str] = ()) -> str:
-        """Describe the first of ``names`` that is no argument of this; the empty string if there is none.
-
-        Args:
-            names: The arguments given.
-            others: Further arguments that the caller takes.
-        """
-        return "" if self.takes_any else complain(f"scenario {self.name!r}", {*others, *self.arguments}, names)
+        """Describe the first of ``names`` that neither this nor the caller, ``others``, takes; ``""`` for none."""
+        if not self.known and any(parameter.kind is parameter.VAR_KEYWORD for parameter in self._parameters):
+            return ""  # the generator checks its settings itself
+        return complain(f"scenario {self.name!r}", {*others, *self.arguments}, names)
 
     def problem(self, num_robots: int | None = None, seed: int | None = None, **arguments: object) -> Problem:
         """See :func:`~d4orm_env.scenarios.problems.make_problem`."""
@@ -124,8 +109,8 @@ class Scenario:
     def _make(self, num_robots: int | None, seed: int | None, settings: Mapping[str, object]) -> Problem:
         """The problem for that seed, checked to be one and to have that many robots."""
         seed = 0 if seed is None else whole_number(seed, "seed", 0)
-        if num_robots is None and not self.has_own_size:
-            num_robots = DEFAULT_ROBOTS
+        if num_robots is None and all(parameter.default is parameter.empty for parameter in self._parameters[1:2]):
+            num_robots = DEFAULT_ROBOTS  # for the generator has no default of its own
         size = () if num_robots is None else (whole_number(num_robots, "num_robots", 1),)
         try:
             self._signature.bind(seed, *size, **settings)

@@ -239,7 +239,7 @@ KINDS = ("float", "list[float]")
 
 
 def start_fields(model: Model) -> tuple[str, ...]:
-    """Return the parts of a start state of that model beside its position, or ``state`` for all that there is."""
+    """Return the parts of a start state of that model after its position, or ``state`` for all of them."""
     rest = model.state_names[model.dimension :]
     if rest in ((), ("heading",), ("heading", "speed")):
         return rest

@@ -77,13 +77,9 @@ def _draw(random: np.random.Generator, columns: int, rows: int, share: float) ->
 
 
 def wall_world(openings: Openings, side: float, width: float, random: np.random.Generator) -> World:
-    """The world of that plan, centred on the origin.
+    """The world of squares with these openings, centred on the origin.
 
-    Args:
-        openings: Openings in the walls.
-        side: Of a square, from wall to wall [m].
-        width: Of an opening, somewhere along the square's side; the whole side if it is as wide [m].
-        random: Generator of their positions.
+    Squares have a ``side`` from wall to wall [m], and openings a ``width`` [m], at random along a side.
     """
     columns, rows = openings.above.shape[1], openings.right.shape[0]
     pitch = side + WALL
@@ -129,17 +125,12 @@ def rooms(
         extra_doors: Share of the walls without a door that get one all the same.
     """
     require_plane(settings)
-    columns, rows = default_squares(settings.num_robots / 2, 3) if rooms is None else grid_size(rooms, "rooms")
+    size = default_squares(settings.num_robots / 2, 3) if rooms is None else grid_size(rooms, "rooms")
     side, width = bounded(room_size, "room_size"), bounded(door_width, "door_width")
     share = positive_number(extra_doors, "extra_doors", zero_allowed=True, most=1.0)
     if width > side:
         raise ValueError(f"door_width is {width:g}; it must be at most the room_size, which is {side:g}")
-    step = lattice_step(settings, np.array([columns, rows]) * (side + WALL), ("door_width", width))
-    random = settings.generator(WALLS)
-    openings = draw_openings(random, columns, rows, share)
-    world = wall_world(openings, side, width, random)
-    travel = (openings.longest + 1) * (side + WALL)
-    return populate(settings, world, step, travel, "more rooms or a larger room_size")
+    return _populate_squares(settings, size, side, ("door_width", width), share, "more rooms or a larger room_size")
 
 
 def maze(
@@ -158,14 +149,19 @@ def maze(
     require_plane(settings)
     width = bounded(corridor_width, "corridor_width")
     if cells is None:
-        # Where two robots cannot pass each other, every place takes a dead end.
+        # Where two robots cannot pass each other, every position takes a dead end.
         is_wide = width > 1.1 * (2 * safety_distance_of(settings) + settings.spacing + settings.goal_radius)
         cells = default_squares((2.5 if is_wide else 12) * settings.num_robots, 6)
-    columns, rows = grid_size(cells, "cells")
+    size, remedy = grid_size(cells, "cells"), "more cells or a larger corridor_width"
     share = positive_number(loops, "loops", zero_allowed=True, most=1.0)
-    step = lattice_step(settings, np.array([columns, rows]) * (width + WALL), ("corridor_width", width))
-    random = settings.generator(WALLS)
-    openings = draw_openings(random, columns, rows, share)
-    world = wall_world(openings, width, width, random)
-    travel = (openings.longest + 1) * (width + WALL)
-    return populate(settings, world, step, travel, "more cells or a larger corridor_width")
+    return _populate_squares(settings, size, width, ("corridor_width", width), share, remedy)
+
+
+def _populate_squares(
+    settings: Settings, size: tuple[int, int], side: float, opening: tuple[str, float], share: float, remedy: str
+) -> Problem:
+    """The problem of a team among ``size`` squares, columns and rows, whose openings have a name and a width [m]."""
+    step, random = lattice_step(settings, np.array(size) * (side + WALL), opening), settings.generator(WALLS)
+    openings = draw_openings(random, *size, share)
+    world = wall_world(openings, side, opening[1], random)
+    return populate(settings, world, step, (openings.longest + 1) * (side + WALL), remedy)

@@ -33,31 +33,28 @@ from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
 ndimage: Any = LazyModule("scipy.ndimage")
 
 RESERVE = 1 / 150
-"""More than float32 rounds away over a map, and left free beside the margin, in radii of the largest robot."""
+"""More than float32 rounds away over a map, and left free in addition to the margin, in radii of the largest robot."""
 
 ENOUGH_POINTS = 2**18
 """Lattice points that do where nothing is narrow."""
 
 WINDOW = {2: 32, 3: 8}
-"""Least distance, in lattice points, within which a path round a place is looked for."""
+"""Least distance, in lattice points, within which a path round a position is looked for."""
 
 TRIES, ROUNDS = 200, 3
-"""Places looked at for each start or goal in one attempt to find all of them, and attempts."""
+"""Positions tried for each start or goal in one attempt to find all of them, and attempts."""
 
 
-class _Placing:
-    """Places taken one by one from a region, the rest of which stays connected and in touch with each of them.
+class _FreeRegion:
+    """Positions, ``most`` of them, taken from a region, the rest of which stays connected and in touch with each.
 
-    Args:
-        inside: The region.
-        separation: Distance of robots that pass by from a place, in steps of the lattice.
-        most: Number of places there will be.
+    Robots that pass by keep the ``separation`` to a position, in steps of the lattice.
     """
 
     def __init__(self, inside: Mask, separation: float, most: int) -> None:
         self._label, self._dilation = ndimage.label, ndimage.binary_dilation
         self.positions, self.count = np.empty((most, inside.ndim), np.int64), 0
-        # Whoever goes round a place finds a path within the wide window about it, or is held to find none.
+        # A robot finds a path round a position within the wide window about it, or is held to find none.
         self._narrow = 2 * int(separation) + 1
         self._wide = max(self._narrow, WINDOW[inside.ndim])
         self._free = np.pad(inside, self._wide)
@@ -67,7 +64,7 @@ class _Placing:
         self._disc = self._wide_disc[self._about(np.zeros(inside.ndim, np.int64), self._narrow)]
 
     def add(self, position: NDArray[np.int64]) -> bool:
-        """Take a place if that leaves every robot a path."""
+        """Take a position if that leaves every robot a path."""
         if self._taken[tuple(position + self._wide)] or not self._goes_round(position):
             return False
         taken = self._taken[self._about(position, self._narrow)]
@@ -92,7 +89,7 @@ class _Placing:
         return len(np.unique(touched[touched > 0])) == 1
 
     def _in_touch(self, position: NDArray[np.int64]) -> bool:
-        """Check whether a robot gets from a place to the untaken region through no disc but its own."""
+        """Check whether a robot gets from a position to the untaken region through no disc but its own."""
         about = self._about(position, self._narrow)
         free, taken = self._free[about], self._taken[about]
         untaken = free & (taken == 0)
@@ -103,28 +100,28 @@ class _Placing:
 def draw_positions(
     random: np.random.Generator, space: FreeSpace, groups: Sequence[tuple[Mask | None, int]], separation: float
 ) -> Points:
-    """Random places ``(P, d)``, far enough apart that a robot gets from each to each while robots are on all others.
+    """Random positions ``(P, d)``, far enough apart that a robot gets from each to each while robots are at all others.
 
     Each of the ``groups`` has the part of the region that its positions are drawn from, or ``None`` for all of it, and
-    their number. Robots that pass by keep the ``separation`` to a place [m]. There are fewer than asked for if there is
-    no room.
+    their number. Robots that pass by keep the ``separation`` to a position [m]. There are fewer than asked for if no
+    more fit.
     """
-    placing = _Placing(space.inside, separation / space.step, sum(number for _, number in groups))
+    region = _FreeRegion(space.inside, separation / space.step, sum(number for _, number in groups))
     for part, number in groups:
         candidates = np.flatnonzero(space.inside if part is None else space.inside & part)
         some = random.choice(candidates, min(len(candidates), TRIES * max(number, 100)), replace=False)
-        wanted = placing.count + number
+        wanted = region.count + number
         for index in zip(*np.unravel_index(some, space.inside.shape), strict=True):
-            if placing.count == wanted:
+            if region.count == wanted:
                 break
-            placing.add(np.array(index))
-        if placing.count < wanted:
+            region.add(np.array(index))
+        if region.count < wanted:
             break
-    return space.points(placing.positions[: placing.count])
+    return space.points(region.positions[: region.count])
 
 
 def reserve_of(settings: Settings) -> float:
-    """Return the distance left free beside the margin [m]."""
+    """Return the distance left free in addition to the margin [m]."""
     return RESERVE * settings.team.largest_radius
 
 
@@ -160,16 +157,11 @@ def populate(
     remedy: str,
     exchange: tuple[float, float] | None = None,
 ) -> Problem:
-    """The problem of a team at random places of a world with walls, all of which are free for all others to pass.
+    """The problem of a team at random positions in a world with walls, at which robots leave all others a path.
 
-    Args:
-        settings: The common arguments; random obstacles are placed before the robots.
-        world: Walls and bounds.
-        step: Of the lattice that places are drawn from [m].
-        travel: The distance the horizon is made for [m].
-        remedy: Remedy where the robots do not fit.
-        exchange: Half of the robots start at an x below the first of them and end above the second [m], the others the
-            other way round; everywhere by default.
+    Positions are drawn from a lattice of this ``step`` [m], after random obstacles; ``travel`` is the distance that the
+    horizon is made for [m], and ``remedy`` ends the error where the robots do not fit. With ``exchange`` half of the
+    robots start at an x below the first value and end above the second [m], the others the other way round.
     """
     world = with_obstacles(settings, world)
     starts, goals = draw_team(settings, free_space(world, safety_distance_of(settings), step), remedy, exchange)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core import portable
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch
 from d4orm_env.verify.convex_bodies import ConvexBodies
-from d4orm_env.verify.discs import surroundings
+from d4orm_env.verify.discs import CHORD_ERROR, surroundings
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
 from d4orm_env.verify.footprints import TurningPairs, turning_watches
 from d4orm_env.verify.geometry import Floats, norm
@@ -34,8 +34,6 @@ __all__ = ["VerificationReport", "Violation", "verify"]
 MIN_SUB_STEPS = 10
 MAX_SUB_STEPS = 1000
 """More in one step are not taken: the robot would leave the straight line by 70 of its radii within the step."""
-CHORD_ERROR = 1 / 15_000
-"""Largest distance between a robot's curve and the chord that stands for it, as a share of its radius."""
 LIMIT_TOLERANCE = 1e-5
 """Relative excess over a control limit that float32 rounding may cause."""
 
@@ -89,7 +87,7 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
     contacts = (violation for watch in watches for violation in watch.violations())
     violations = [
         *_control_limits(motion, docking.last_steps),
-        *(_with_notes(violation, docking, problem.dt) for violation in contacts),
+        *(replace(one, detail=one.detail + docking.notes(one.robots, problem.dt)) for one in contacts),
         *docking.violations,
     ]
     return VerificationReport(
@@ -123,7 +121,7 @@ class _Course:
         ends = np.zeros((horizon + 1, num_robots, motion.size))
         ends[0] = start[:, : motion.size]
         for steps in self._parts(self._moving, self._numbers):
-            ends[1:][steps] = self._displacement(steps)[:, -1]
+            ends[1:][steps] = self._motion.displacement(steps, sub_steps)[:, -1]
         self.ends: Floats = np.cumsum(ends, axis=0)
 
     def bodies(self, docking: Docking) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -161,9 +159,6 @@ class _Course:
             last[reading[number]] = number
         return offset
 
-    def _displacement(self, steps: slice) -> Floats:
-        return self._motion.displacement(steps, self._sub_steps)
-
     def _parts(self, horizon: int, numbers: int) -> Iterator[slice]:
         size = max(1, MAX_NUMBERS // numbers)
         return (slice(first, min(first + size, horizon)) for first in range(0, horizon, size))
@@ -173,24 +168,24 @@ class _Course:
         horizon, dt, robot = len(self.ends) - 1, self._motion.dt, docking.robot
         stop = np.minimum(docking.steps, horizon)
         horizon = min(horizon, int(docking.steps.max()) + 1, self._moving + 1)
-        arrived = self.ends[stop, robot]
+        rest = self.ends[stop, robot]
         for steps in self._parts(horizon, max(self._numbers, num_pairs // BLOCKS[0])):
-            displacement, position = self._displacement(steps), self.ends[:-1][steps]
+            displacement, position = self._motion.displacement(steps, self._sub_steps), self.ends[:-1][steps]
             if len(robot) > displacement.shape[2]:  # copying is not free, and one reading each is the rule
                 displacement, position = displacement[:, :, robot], position[:, robot]
             absorbed = np.arange(horizon)[steps, None] >= docking.steps
             displacement[np.broadcast_to(absorbed[:, None], displacement.shape[:3])] = 0.0
-            position = np.where(absorbed[..., None], arrived, position)
-            path, reach, turn = position[:, None] + displacement, norm(displacement).max(axis=1), np.zeros((0, 0, 0))
+            position = np.where(absorbed[..., None], rest, position)
+            path, travel, turn = position[:, None] + displacement, norm(displacement).max(axis=1), np.zeros((0, 0, 0))
             if self._shapes is not None:
                 turn, (reading, body) = self._turns(steps, docking, stop), self._readings(docking)
                 if len(body) > len(robot):
                     offset = self._hitched(docking, turn)
                     path, displacement = path[:, :, reading] + offset, displacement[:, :, reading] + offset
-                    reach = norm(displacement - displacement[:, :1]).max(axis=1)
+                    travel = norm(displacement - displacement[:, :1]).max(axis=1)
                 turned = np.abs(turn - turn[:, :1]).max(axis=1)
-                reach = self._shapes.stretch[body] * (reach + self._shapes.outer[body] * turned)
-            yield Stretch(path, reach, steps.start * dt, dt, turn)
+                travel = self._shapes.stretch[body] * (travel + self._shapes.outer[body] * turned)
+            yield Stretch(path, travel, steps.start * dt, dt, turn)
 
 
 def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
@@ -211,8 +206,8 @@ def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
 
 
 def _left_out(problem: Problem, violations: list[Violation]) -> VerificationReport:
-    nobody = np.full(len(problem.team.models), np.inf)
-    return VerificationReport(np.nan, np.nan, nobody, np.full_like(nobody, np.nan), False, violations)
+    never = np.full(len(problem.team.models), np.inf)
+    return VerificationReport(np.nan, np.nan, never, np.full_like(never, np.nan), False, violations)
 
 
 def _braked_away(problem: Problem) -> Floats:
@@ -256,8 +251,3 @@ def _control_limits(motion: TeamMotion, docked_after: NDArray[np.intp]) -> Itera
             f"limit {limits[robot, column]:.7g}; {len(steps)} steps over it, at most {values.max():.7g}"
         )
         yield Violation("control limit", (int(robot),), float(steps[0] * motion.dt), detail)
-
-
-def _with_notes(violation: Violation, docking: Docking, dt: float) -> Violation:
-    notes = "".join(docking.note(robot, dt) for robot in violation.robots)
-    return replace(violation, detail=violation.detail + notes)

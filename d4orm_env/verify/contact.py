@@ -38,7 +38,7 @@ class Stretch:
     """Some steps of all bodies."""
 
     path: Floats  #: ``(T, S+1, B, d)`` positions at the ends of the sub-steps [m]
-    reach: Floats  #: ``(T, B)`` how far from where it began a body, or any point of it, gets in each step [m]
+    travel: Floats  #: ``(T, B)`` distance that any point of a body gets from where it began, in each step [m]
     start: float  #: Time at which it begins [s]
     dt: float  #: Length of a step [s]
     #: ``(T, S+1, B)`` headings at the ends of the sub-steps [rad]; of size zero where all bodies are discs
@@ -80,7 +80,7 @@ class Watch(ABC):
 
     @abstractmethod
     def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
-        """``(N, S)`` smallest gap in every sub-step of that step and pair, and at what fraction of the sub-step."""
+        """``(N, S)`` smallest gap in every sub-step of that step and pair, and the fraction of the sub-step then."""
 
     @abstractmethod
     def thing(self, column: Indices) -> Indices:
@@ -92,7 +92,7 @@ class Watch(ABC):
     def observe(self, stretch: Stretch) -> None:
         """Judge a stretch. Only pairs that may touch, or come closer than any so far, are looked at closely."""
         self.select(stretch)
-        travelled = np.concatenate([np.zeros((1, stretch.reach.shape[1])), np.cumsum(stretch.reach, axis=0)])
+        travelled = np.concatenate([np.zeros((1, stretch.travel.shape[1])), np.cumsum(stretch.travel, axis=0)])
         begins, pairs = np.arange(0, len(stretch.path), BLOCKS[0]), np.arange(len(self.rows))
         steps, pairs = np.repeat(begins, len(pairs)), np.tile(pairs, len(begins))
         size = max(1, MAX_NUMBERS // (stretch.path.shape[1] * stretch.path.shape[3]))
@@ -162,15 +162,15 @@ class Pairs(Watch):
 
     def __init__(self, robot: Indices, radius: Floats) -> None:
         names = [f"robot_{index}" for index in range(int(robot.max()) + 1)]
-        nobody = np.empty(0, np.intp)
-        super().__init__("robot contact", robot, names, nobody, nobody)
+        none = np.empty(0, np.intp)
+        super().__init__("robot contact", robot, names, none, none)
         self._radius = radius
 
     def select(self, stretch: Stretch) -> None:
         lower, upper = stretch.path.min(axis=(0, 1)), stretch.path.max(axis=(0, 1))
         axis = int((upper.max(axis=0) - lower.min(axis=0)).argmax())
         order = np.argsort(lower[:, axis], kind="stable")
-        # Who is further apart than any two are known to come does not matter.
+        # Bodies further apart than any two are known to come do not matter.
         a, b = order[:-1], order[1:]
         gap = self.near_gap(stretch, a, b)
         least = min(self.minimum, float(gap[self._robot[a] != self._robot[b]].min(initial=np.inf)))
@@ -178,9 +178,9 @@ class Pairs(Watch):
         lower, upper = lower - widening, upper + widening
         # Boxes that overlap along one axis: each with those that begin before it ends.
         order = np.argsort(lower[:, axis], kind="stable")
-        positions = np.arange(len(order))
-        count = np.searchsorted(lower[order, axis], upper[order, axis], side="right") - positions - 1
-        first = np.repeat(positions, count)
+        ranks = np.arange(len(order))
+        count = np.searchsorted(lower[order, axis], upper[order, axis], side="right") - ranks - 1
+        first = np.repeat(ranks, count)
         second = first + 1 + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         a, b = order[first], order[second]
         near = np.all((lower[a] <= upper[b]) & (lower[b] <= upper[a]), axis=1)
@@ -210,32 +210,44 @@ class Pairs(Watch):
         return self._robot[column]
 
 
+def side_names(dimension: int) -> list[str]:
+    """Names of the bounds of a world, the lower ones first."""
+    return [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in "xyz"[:dimension]]
+
+
 class Static(Watch):
     """Robots against static things, one column each."""
 
-    def __init__(self, kind: str, robot: Indices, radius: Floats, names: Sequence[str]) -> None:
+    def __init__(self, kind: str, robot: Indices, names: Sequence[str]) -> None:
         rows, columns = (index.ravel() for index in np.indices((len(robot), len(names))))
         super().__init__(kind, robot, names, rows, columns)
-        self._radius = radius[rows]
+
+    def bodies(self, pairs: Indices) -> Sequence[Indices]:
+        return (self.rows[pairs],)
+
+    def thing(self, column: Indices) -> Indices:
+        return column
+
+
+class StaticDiscs(Static):
+    """The same of discs or balls."""
+
+    def __init__(self, kind: str, robot: Indices, radius: Floats, names: Sequence[str]) -> None:
+        super().__init__(kind, robot, names)
+        self._radius = radius[self.rows]
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
         distance = self.distance(stretch.path[steps, 0, self.rows[pairs]], self.columns[pairs])
         return distance - self._radius[pairs]
-
-    def bodies(self, pairs: Indices) -> Sequence[Indices]:
-        return (self.rows[pairs],)
 
     def approach(self, stretch: Stretch, steps: Indices, pairs: Indices) -> tuple[Floats, Floats]:
         path = stretch.of(steps, self.rows[pairs])
         distance, fraction = self.pass_by(path[:, :-1], path[:, 1:], self.columns[pairs][:, None])
         return distance - self._radius[pairs][:, None], fraction
 
-    def thing(self, column: Indices) -> Indices:
-        return column
-
     @abstractmethod
     def distance(self, positions: Floats, columns: Indices) -> Floats:
-        """Signed distance from places to the surface of the things in ``columns`` [m]."""
+        """Signed distance from positions to the surface of the things in ``columns`` [m]."""
 
     @abstractmethod
     def pass_by(self, start: Floats, end: Floats, columns: Indices) -> tuple[Floats, Floats]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.verify.contact import MAX_NUMBERS, Indices, Pairs, Static, Stretch, Watch
+from d4orm_env.verify.contact import MAX_NUMBERS, Indices, Pairs, StaticDiscs, Stretch, Watch, side_names
 from d4orm_env.verify.geometry import (
     Floats,
     box_approach,
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from d4orm_env.core.world import World
 
 
-class Round(Static):
+class Round(StaticDiscs):
     """Robots against circles, spheres or vertical cylinders."""
 
     def __init__(self, robot: Indices, radius: Floats, obstacles: Floats, shape: str) -> None:
@@ -43,7 +43,7 @@ class Round(Static):
         return positions[..., : self._centres.shape[1]] - self._centres[columns]
 
 
-class Boxes(Static):
+class Boxes(StaticDiscs):
     """Robots against axis-aligned boxes."""
 
     def __init__(self, robot: Indices, radius: Floats, boxes: Floats) -> None:
@@ -57,7 +57,7 @@ class Boxes(Static):
         return box_approach(start, end, self._boxes[columns])
 
 
-class PolygonObstacle(Static):
+class PolygonObstacle(StaticDiscs):
     """Robots against one polygon."""
 
     def __init__(self, robot: Indices, radius: Floats, corners: Floats, name: str) -> None:
@@ -71,13 +71,11 @@ class PolygonObstacle(Static):
         return polygon_approach(start, end, self._corners)
 
 
-class Bounds(Static):
+class Bounds(StaticDiscs):
     """Robots against the sides of the world."""
 
     def __init__(self, robot: Indices, radius: Floats, lower: Floats, upper: Floats) -> None:
-        axes = "xyz"[: len(lower)]
-        names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
-        super().__init__("bounds contact", robot, radius, names)
+        super().__init__("bounds contact", robot, radius, side_names(len(lower)))
         self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
         self._position = np.concatenate([lower, -upper])
 
@@ -115,7 +113,7 @@ CHORD_ERROR = 1 / 15_000
 def verify_curves(
     problem: Problem, position: Callable[[Floats], Floats], duration: float, bend: Floats
 ) -> VerificationReport:
-    """Judge curves: does everybody end at its goal, and does nobody touch anything at any time?
+    """Judge curves: do all robots end at their goals, and touch nothing at any time?
 
     As :func:`d4orm_env.verify.verify` judges controls, known to ``CHORD_ERROR`` of the radius for each robot. Curves
     have no headings: a footprint counts as the disc or ball round it, which may refuse what is fine. Of
@@ -140,9 +138,9 @@ def verify_curves(
         begins = np.arange(first, min(first + size, steps)) * dt
         times = begins[:, None] + np.linspace(0, dt, sub_steps + 1)
         path = position(times.ravel()).reshape(*times.shape, len(radius), problem.dimension)
-        reach = norm(path - path[:, :1]).max(axis=1)
+        travel = norm(path - path[:, :1]).max(axis=1)
         for watch in watches:
-            watch.observe(Stretch(path, reach, first * dt, dt, np.zeros((0, 0, 0))))
+            watch.observe(Stretch(path, travel, first * dt, dt, np.zeros((0, 0, 0))))
     violations = [violation for watch in watches for violation in watch.violations()]
     violations += _not_arrived(problem, position, duration)
     nearest = min((watch.minimum for watch in obstacles), default=np.inf)

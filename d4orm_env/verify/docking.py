@@ -8,7 +8,7 @@ team are those of its robots.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -47,12 +47,14 @@ class Docking:
     last_steps: NDArray[np.intp]  #: ``(K,)`` steps of each robot's last reading
     violations: list[Violation]  #: Robots that do not dock in every reading
 
-    def note(self, robot: int, dt: float) -> str:
-        """Describe a robot with several readings, for the details of a violation."""
-        steps = self.steps[self.robot == robot]
-        if len(steps) == 1:
-            return ""
-        return f"; rounding decides whether robot_{robot} docks at {steps[0] * dt:.3f} s, and both are judged"
+    def notes(self, robots: Iterable[int], dt: float) -> str:
+        """Describe which of some robots have several readings, for the details of a violation."""
+        notes = ""
+        for robot in robots:
+            steps = self.steps[self.robot == robot]
+            if len(steps) > 1:
+                notes += f"; rounding decides whether robot_{robot} docks at {steps[0] * dt:.3f} s, and both are judged"
+        return notes
 
 
 def find_docking(problem: Problem, motion: TeamMotion, ends: Floats) -> Docking:

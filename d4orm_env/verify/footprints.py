@@ -1,18 +1,19 @@
 """Closest approach of bodies that are no discs: polygons that turn, and ellipsoids in space.
 
-Written again from the footprints' corners, roundings and semi-axes, as everything here. Within a sub-step places and
+Written again from the footprints' corners, roundings and semi-axes, as everything here. Within a sub-step positions and
 headings change linearly, and a gap by no more than its bodies' points move: sub-steps are halved where, by that bound,
 the gap may be less than what is known. Shapes are asked only where the discs or balls round them leave it open.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.verify.contact import WIDER, Indices, Pairs, Static, Stretch, Watch
+from d4orm_env.verify.contact import WIDER, Indices, Pairs, Static, Stretch, Watch, side_names
 from d4orm_env.verify.convex_bodies import ConvexBodies
 from d4orm_env.verify.geometry import Floats, ball_gap, box_distance, core_gap, norm, polygon_distance
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from d4orm_env.core.world import World
 
 _Gap = Callable[[Indices, Indices, Floats, Floats], Floats]
-"""``(N,)`` gaps of things and bodies at places and headings."""
+"""``(N,)`` gaps of things and bodies at positions and headings."""
 HALVINGS = 20
 """Most times that a sub-step is halved."""
 RESOLUTION = 1 / 15_000
@@ -32,13 +33,13 @@ class Turning(Watch):
 
     shapes: ConvexBodies
 
+    @abstractmethod
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
         """``(N,)`` gap of these pairs, their bodies at positions ``(N, d)`` and headings ``(N,)``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
         """``(N,)`` gap of the discs or balls round these pairs, no more than theirs, bodies at positions ``(N, d)``."""
-        raise NotImplementedError
 
     def gap(self, stretch: Stretch, steps: Indices, pairs: Indices, lead: Floats) -> Floats:
         positions = [stretch.path[steps, 0, bodies] for bodies in self.bodies(pairs)]
@@ -134,20 +135,21 @@ class TurningStatic(Turning, Static):
     """Robots against the obstacles of a world, or its bounds: one column each."""
 
     def __init__(self, kind: str, robot: Indices, shapes: ConvexBodies, names: Sequence[str]) -> None:
-        super().__init__(kind, robot, shapes.outer, names)
+        super().__init__(kind, robot, names)
         self.shapes = shapes
-
-    def distance(self, positions: Floats, columns: Indices) -> Floats:
-        raise NotImplementedError("the gap of a footprint is not that of its place")
-
-    pass_by = distance  # type: ignore[assignment]
 
 
 class Obstacles(TurningStatic):
     """Robots against obstacles, each a convex core with a rounding, or a polygon."""
 
     def __init__(self, robot: Indices, shapes: ConvexBodies, world: World) -> None:
-        super().__init__("obstacle contact", robot, shapes, _names(world))
+        self._gap_to: dict[str, _Gap]
+        if world.dimension == 2:
+            self._gap_to = {"circles": self._to_circle, "boxes": self._to_rectangle, "polygons": self._to_polygon}
+        else:
+            self._gap_to = {"spheres": self._to_ball, "cylinders": self._to_cylinder, "boxes": self._to_box}
+        names = [f"{kind}[{index}]" for kind in self._gap_to for index in range(len(getattr(world, kind)))]
+        super().__init__("obstacle contact", robot, shapes, names)
         self._world = world
         self._round = np.asarray(world.circles if world.dimension == 2 else world.spheres, np.float64)
         self._cylinders, self._boxes = np.asarray(world.cylinders, np.float64), np.asarray(world.boxes, np.float64)
@@ -160,18 +162,14 @@ class Obstacles(TurningStatic):
 
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
         ((position, turn),), gaps = poses, np.empty(len(pairs))
-        gap_to: dict[str, _Gap] = {"polygons": self._to_polygon, "cylinders": self._to_cylinder}
-        planar = self._world.dimension == 2
-        gap_to |= {"circles": self._to_circle, "boxes": self._to_rectangle if planar else self._to_box}
-        gap_to["spheres"] = self._to_ball
         for kind, here, thing in self._by_kind(pairs):
-            gaps[here] = gap_to[kind](thing, self.rows[pairs[here]], position[here], turn[here])
+            gaps[here] = self._gap_to[kind](thing, self.rows[pairs[here]], position[here], turn[here])
         return gaps
 
     def _by_kind(self, pairs: Indices) -> Iterator[tuple[str, Indices, Indices]]:
-        """Kinds of obstacles, which of these pairs ``(N,)`` concern one of them, and which one."""
+        """Yield each kind of obstacle with the pairs, of ``(N,)``, that concern one, and its number."""
         column, first = self.columns[pairs], 0
-        for kind in _kinds(self._world):
+        for kind in self._gap_to:
             end = first + len(getattr(self._world, kind))
             here = np.flatnonzero((column >= first) & (column < end))
             if len(here):
@@ -179,7 +177,7 @@ class Obstacles(TurningStatic):
             first = end
 
     def _distance(self, kind: str, thing: Indices, position: Floats) -> Floats:
-        """``(N,)`` signed distance from places to obstacles."""
+        """``(N,)`` signed distance from positions to obstacles."""
         if kind == "boxes":
             return box_distance(position, self._boxes[thing])
         if kind == "polygons":
@@ -239,17 +237,14 @@ class Sides(TurningStatic):
     """Robots against the sides of the world."""
 
     def __init__(self, robot: Indices, shapes: ConvexBodies, lower: Floats, upper: Floats) -> None:
-        axes = "xyz"[: len(lower)]
-        names = [f"the {side} bound of {axis}" for side in ("lower", "upper") for axis in axes]
-        super().__init__("bounds contact", robot, shapes, names)
+        super().__init__("bounds contact", robot, shapes, side_names(len(lower)))
         self._position, self._dimension = np.concatenate([lower, -upper]), len(lower)
 
     def _inside(self, pairs: Indices, position: Floats) -> Floats:
-        """``(N,)`` how far positions ``(N, d)`` are inside of their sides."""
-        side, axis = np.divmod(self.columns[pairs], self._dimension)
-        return (
-            np.where(side == 0, 1.0, -1.0) * position[np.arange(len(axis)), axis] - self._position[self.columns[pairs]]
-        )
+        """``(N,)`` distance of positions ``(N, d)`` from their sides, negative outside."""
+        column = self.columns[pairs]
+        side, axis = np.divmod(column, self._dimension)
+        return np.where(side == 0, 1.0, -1.0) * position[np.arange(len(axis)), axis] - self._position[column]
 
     def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
         return self._inside(pairs, *positions) - WIDER * self.shapes.outer[self.rows[pairs]]
@@ -269,14 +264,6 @@ class Sides(TurningStatic):
 
 def _ball(radius: Floats) -> Floats:
     return np.repeat(radius[:, None], 3, axis=1)
-
-
-def _names(world: World) -> list[str]:
-    return [f"{kind}[{index}]" for kind in _kinds(world) for index in range(len(getattr(world, kind)))]
-
-
-def _kinds(world: World) -> tuple[str, ...]:
-    return ("circles", "boxes", "polygons") if world.dimension == 2 else ("spheres", "cylinders", "boxes")
 
 
 def turning_watches(world: World, robot: Indices, shapes: ConvexBodies) -> list[Watch]:

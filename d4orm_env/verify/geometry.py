@@ -28,7 +28,7 @@ def norm(a: Floats) -> Floats:
 
 
 def closest_approach(start: Floats, end: Floats) -> tuple[Floats, Floats]:
-    """Smallest distance to the origin of points moving from ``start`` to ``end``, and at what fraction of the way."""
+    """Smallest distance to the origin of points moving from ``start`` to ``end``, and the fraction of the way there."""
     move = end - start
     square = dot(move, move)
     fraction = np.clip(-dot(start, move) / np.where(square > 0, square, 1.0), 0.0, 1.0)
@@ -49,7 +49,7 @@ def box_distance(points: Floats, boxes: Floats) -> Floats:
 
 
 def box_approach(start: Floats, end: Floats, boxes: Floats) -> tuple[Floats, Floats]:
-    """Return what :func:`closest_approach` does, for the signed distance to boxes.
+    """:func:`closest_approach` by the signed distance to boxes.
 
     That distance is convex along a chord, so its minimum lies next to the best of any grid of points: a search in ever
     finer grids brackets it without fail.
@@ -64,11 +64,11 @@ def box_approach(start: Floats, end: Floats, boxes: Floats) -> tuple[Floats, Flo
     return distance.min(axis=0), best
 
 
-def segment_distance(points: Floats, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
-    """Distance from points in the plane to a segment, and at what fraction of it the nearest point lies."""
+def segment_distance(points: Floats, begin: Floats, end: Floats) -> Floats:
+    """Distance from points in the plane to a segment."""
     along, offset = end - begin, points - begin
     fraction = np.clip(dot(offset, along) / dot(along, along), 0.0, 1.0)
-    return norm(offset - fraction[..., None] * along), fraction
+    return norm(offset - fraction[..., None] * along)
 
 
 def polygon_distance(points: Floats, corners: Floats) -> Floats:
@@ -76,7 +76,7 @@ def polygon_distance(points: Floats, corners: Floats) -> Floats:
     nearest, inside = np.full(points.shape[:-1], np.inf), np.zeros(points.shape[:-1], bool)
     x, y = points[..., 0], points[..., 1]
     for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        nearest = np.minimum(nearest, segment_distance(points, begin, end)[0])
+        nearest = np.minimum(nearest, segment_distance(points, begin, end))
         # A ray to the right crosses the outline of what it starts inside of an odd number of times.
         spans = (begin[1] > y) != (end[1] > y)
         if begin[1] != end[1]:
@@ -85,15 +85,15 @@ def polygon_distance(points: Floats, corners: Floats) -> Floats:
 
 
 def polygon_approach(start: Floats, end: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """Return what :func:`closest_approach` does, for the signed distance to a simple polygon; where a chord crosses its
-    outline from outside to outside, zero at the crossing.
+    """:func:`closest_approach` by the signed distance to a simple polygon; where a chord crosses its outline from
+    outside to outside, zero at the crossing.
     """
     before, after = polygon_distance(start, corners), polygon_distance(end, corners)
     smallest, fraction = np.minimum(before, after), (after < before).astype(np.float64)
     move = end - start
     for one, other in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         # Two segments that do not cross are nearest to each other at an end of one of them.
-        distance, at = _chord_distance(one, start, move)
+        distance, at = closest_approach(start - one, end - one)
         closer = (distance < smallest) & (smallest > 0)
         smallest, fraction = np.where(closer, distance, smallest), np.where(closer, at, fraction)
         edge, offset = other - one, start - one
@@ -104,13 +104,6 @@ def polygon_approach(start: Floats, end: Floats, corners: Floats) -> tuple[Float
         crosses = (turn != 0) & (at >= 0) & (at <= 1) & (along >= 0) & (along <= 1) & (smallest > 0)
         smallest, fraction = np.where(crosses, 0.0, smallest), np.where(crosses, at, fraction)
     return smallest, fraction
-
-
-def _chord_distance(point: Floats, start: Floats, move: Floats) -> tuple[Floats, Floats]:
-    """Distance from one point to chords, and at what fraction of them."""
-    square = dot(move, move)
-    fraction = np.clip(dot(point - start, move) / np.where(square > 0, square, 1.0), 0.0, 1.0)
-    return norm(start + fraction[..., None] * move - point), fraction
 
 
 WEIGHTS, GOLDEN_STEPS = np.linspace(0.0, 1.0, 33)[1:-1], 48

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from d4orm_env.core.team import Team
 
 SIZE = np.float32(0.15)
-"""Radius of robots whose places are judged in metres [m]: those of others in proportion, and speeds by their limits."""
+"""Radius of robots whose positions are judged in metres [m]; others in proportion, and speeds by their limits."""
 SUB_STEPS = 20
 """To find how much the path bends within a control step."""
 STATE_ERROR = 1e-7

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, short_repr
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
-from d4orm_env.core.registry import load_reference, source_digest, written
+from d4orm_env.core.registry import load_reference, source_digest, source_object
 from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
@@ -195,7 +195,7 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
     else:
         _check_keywords(kind, config, owner)
         settings = {**attributes(kind), **config}
-    code = written(kind.planner if isinstance(kind, OpenLoop) and kind.planner is not None else kind)
+    code = source_object(kind.planner if isinstance(kind, OpenLoop) and kind.planner is not None else kind)
     foreign = code.__module__.partition(".")[0] != __name__.partition(".")[0]
     return {**settings, "source": source_digest(code)} if foreign else settings
 

@@ -166,7 +166,7 @@ def route_kernel(name: str) -> RouteStep:
     """One compiled step of the robots of the model with this name that drive to where they are directed.
 
     Args of the kernel: the team, the numbers ``(B,)`` of these robots, the whole team's :class:`Progress`, ``arrived``
-    ``(K,)`` and ``states`` ``(2, K, n)`` before the step and after it, changed in position, and ``controls`` ``(1, K,
+    ``(K,)`` and ``states`` ``(2, K, n)`` before the step and after it, changed in place, and ``controls`` ``(1, K,
     m)``, output.
     """
     model = MODELS[name]

@@ -484,7 +484,7 @@ def test_warmup_says_beforehand_that_nothing_can_be_kept(
         assert outcome.status == 2
         assert outcome.err.count("\n") == 1
         assert "cannot be written to (No space left on device); set NUMBA_CACHE_DIR" in outcome.err
-    monkeypatch.setattr("d4orm_env.engine.caching._Place._locator_classes", [])
+    monkeypatch.setattr("d4orm_env.engine.caching._CacheFolder._locator_classes", [])
     monkeypatch.setattr("d4orm_env.engine.caching._is_private", lambda folder: True)
     assert "no cache folder can be written to; set NUMBA_CACHE_DIR" in d4orm("warmup").err
 

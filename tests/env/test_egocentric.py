@@ -87,8 +87,9 @@ def turned(problem: Problem, angle: float) -> Problem:
     return Problem(problem.team, start, problem.goal @ rotation, dt=problem.dt, horizon=problem.horizon)
 
 
-def test_a_turned_world_is_the_same_world() -> None:
-    problem = make_problem("random", num_robots=3, seed=4)
+@pytest.mark.parametrize("model", ["holonomic2d", "velocity2d", "holonomic2d_jerk"])
+def test_a_turned_world_is_the_same_world(model: str) -> None:
+    problem = make_problem("random", num_robots=3, seed=4, model=model)
     envs = [navigation_v0.parallel_env(problem=one, egocentric=True) for one in (problem, turned(problem, 2.1))]
     seen = [stacked(env.reset(seed=0)[0]) for env in envs]
     for _ in range(20):

@@ -58,6 +58,7 @@ def test_files_keep_goal_headings(tmp_path: object) -> None:
     ("settings", "message"),
     [
         ({"goal_heading": [0.0, 0.0]}, "goal_heading of robot_1 is 0, and a velocity2d has no heading; give NaN"),
+        ({"goal_heading": "north"}, "goal_heading must be a number or one per robot, not 'north'"),
         ({"goal_heading": [0.0]}, "goal_heading has shape (1,); expected one number, or (2,), NaN for any"),
         ({"goal_heading": [90.0, np.nan]}, "90 rad; it must be at most 2 pi in magnitude, so give radians"),
         ({"goal_heading": [0.0, np.nan], "goal_heading_tolerance": 4.0}, "must be from 0.001 to pi"),

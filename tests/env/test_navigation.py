@@ -626,7 +626,7 @@ def test_lifelong_without_room_says_so() -> None:
     # Centres may be 0 to 0.2 m in x, nowhere far enough from the robot to be a new goal.
     problem = line_problem([0.2], world=World(lower=[-0.2, -0.25], upper=[0.4, 0.25]))
     env = navigation_v0.parallel_env(problem=problem, lifelong=True)
-    with pytest.raises(RuntimeError, match="no free place for a new goal of robot_0"):
+    with pytest.raises(RuntimeError, match="no free position for a new goal of robot_0"):
         chase(env)
 
 

@@ -74,6 +74,7 @@ def test_bad_teams_are_refused(arguments: dict[str, Any], message: str) -> None:
     ("arguments", "message"),
     [
         ({"dimension": 4}, "dimension of the world is 4; it must be 2 or 3"),
+        ({"dimension": 2.0}, "dimension of the world is 2.0; it must be 2 or 3"),
         ({"circles": [[0, 0]]}, r"circles has shape \(1, 2\); expected \(any, 3\)"),
         ({"circles": [0, 0, 1]}, r"circles has shape \(3,\); expected \(any, 3\)"),
         ({"circles": [[0, 0, 1], [0, 0, 0]]}, r"radius of circles\[1\] is 0; it must be positive"),
