@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import math
+import secrets
 import socket
 import threading
 import time
@@ -20,9 +21,8 @@ from numpy.typing import NDArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import view_limits
 from d4orm_planners.play.meshes import Points, in_space
-from d4orm_planners.play.origin_check import LOOPBACK, OriginCheck
+from d4orm_planners.play.origin_check import LOOPBACK, MessageValidator, OriginCheck
 from d4orm_planners.play.panel import THEME, Panel
-from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 from d4orm_planners.play.viewport_view import LaneView
@@ -205,21 +205,19 @@ class Playground:
         **observation: Any,
     ) -> None:
         local = host in LOOPBACK
-        chosen = _free_port(host, port)
+        where, chosen = LOOPBACK[0] if local else host, _free_port(host, port)
+        token = None if local else secrets.token_urlsafe(24)
         self.session = Session(problem, *policies, seed=seed, **observation)
-        with contextlib.redirect_stdout(io.StringIO()):  # its own words on where it is
-            self._server = _Server(
-                host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False
-            )
-        self._gate = None if local else AuthenticatingProxy(host, chosen, self._server.get_port())
+        with (
+            contextlib.redirect_stdout(io.StringIO()),  # its own words on where it is
+            OriginCheck(token, f"d4orm_play_{chosen}").installed(),
+        ):
+            self._server = _Server(host=where, port=chosen, verbose=False)
         # Otherwise Python prints every request that cannot be read, which anybody can make.
         logging.getLogger("websockets").addHandler(logging.NullHandler())
-        OriginCheck(self._server, None if self._gate is None else self._gate.token, self.session.refuse)
-        if self._gate is None:
-            self.address = f"http://127.0.0.1:{self._server.get_port()}/"
-        else:
-            named = socket.gethostname() if host in ("0.0.0.0", "::") else host
-            self.address = f"http://{named}:{self._gate.port}/?token={self._gate.token}"
+        MessageValidator(self._server, self.session.refuse)
+        named = socket.gethostname() if host in ("0.0.0.0", "::") else where
+        self.address = f"http://{named}:{self._server.get_port()}/" + ("" if local else f"?token={token}")
         self._server.scene.configure_default_lights(enabled=False)
         self._server.scene.add_light_ambient("/light", intensity=1.1)
         self._server.scene.add_light_directional("/sun", intensity=0.5, position=(-1.0, -0.5, 2.0))
@@ -261,8 +259,7 @@ class Playground:
 
     def close(self) -> None:
         """Leave no thread and no port, but for what does not end in :data:`LAST_WAIT`, which the process's end ends."""
-        ends = [self.session.close, self._server.stop, *([] if self._gate is None else [self._gate.close])]
-        ending = [threading.Thread(target=end, daemon=True) for end in ends]
+        ending = [threading.Thread(target=end, daemon=True) for end in (self.session.close, self._server.stop)]
         deadline = time.perf_counter() + LAST_WAIT
         for thread in ending:
             thread.start()

@@ -430,7 +430,7 @@ def test_elsewhere_the_playground_asks_for_its_token(page: Page) -> None:
     with running(make_problem("circle", num_robots=2), "go-to-goal", host="127.0.0.2") as playground:
         page.offline(False)
         page.open(playground.address.partition("?")[0])
-        assert page.evaluate("document.body.textContent").startswith("open the address with the token")
+        assert page.evaluate("document.body.textContent").startswith("open the address that d4orm play has printed")
         assert not playground.clients
         page.open("about:blank")
         page.open(playground.address)

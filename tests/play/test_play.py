@@ -1,4 +1,4 @@
-"""The playground: what may be done to a scene, a session that goes on by itself, the door before a page."""
+"""The playground: what may be done to a scene, and a session that goes on by itself."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits
-from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.scene_frame import closest_approach
 from d4orm_planners.play.session import Session
 
@@ -434,61 +433,6 @@ def test_a_file_that_is_no_scene_is_refused(content: bytes, complaint: str) -> N
 
 def test_messages_are_shown_as_they_are() -> None:
     assert markdown_text("<b>[x](y)</b> *\n{z}") == "\\<b\\>\\[x\\](y)\\</b\\> \\* \\{z\\}"
-
-
-@pytest.fixture
-def gate() -> Iterator[AuthenticatingProxy]:
-    """A gate before something that echoes the first line."""
-    with socket.create_server(("127.0.0.1", 0)) as behind:
-
-        def answer() -> None:
-            while True:
-                try:
-                    connection, _ = behind.accept()
-                except OSError:
-                    return
-                with connection:
-                    line = connection.recv(65536).split(b"\r\n")[0]
-                    connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(line), line))
-
-        threading.Thread(target=answer, daemon=True).start()
-        gate = AuthenticatingProxy("127.0.0.1", 0, behind.getsockname()[1])
-        yield gate
-        gate.close()
-
-
-def asked(gate: AuthenticatingProxy, path: str, **headers: str) -> tuple[int, str, str]:
-    """Status, cookie and body of an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=TIMEOUT)
-    connection.request("GET", path, headers=headers)
-    answer = connection.getresponse()
-    body = answer.read().decode()
-    connection.close()
-    return answer.status, answer.getheader("Set-Cookie") or "", body
-
-
-def test_only_who_has_the_token_comes_in(gate: AuthenticatingProxy) -> None:
-    assert asked(gate, "/")[0] == 403
-    assert asked(gate, "/?token=guess")[0] == 403
-    assert asked(gate, "/", Cookie=f"d4orm_play_{gate.port}=guess")[0] == 403
-    status, cookie, _ = asked(gate, f"/?token={gate.token}")
-    assert status == 303
-    assert "HttpOnly" in cookie
-    shown = cookie.partition(";")[0]
-    assert asked(gate, "/page", Cookie=shown) == (200, "", "GET /page HTTP/1.1")
-
-
-def test_pages_of_others_do_not_come_in_with_the_token(gate: AuthenticatingProxy) -> None:
-    cookie = f"d4orm_play_{gate.port}={gate.token}"
-    assert asked(gate, "/", Cookie=cookie, Origin="http://elsewhere.example")[0] == 403
-    assert asked(gate, "/", Cookie=cookie, Origin=f"http://127.0.0.1:{gate.port}")[0] == 200
-
-
-def test_a_closed_gate_leaves_no_port(gate: AuthenticatingProxy) -> None:
-    other = AuthenticatingProxy("127.0.0.1", 0, gate.port)
-    other.close()
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", other.port), timeout=TIMEOUT)
 
 
 def test_without_the_extra_one_line_names_it() -> None:
