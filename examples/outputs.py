@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -26,6 +26,8 @@ from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, wilson_interval
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
+
+Row = TypeVar("Row", bound=Mapping[str, Any])
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""
@@ -172,6 +174,19 @@ def success_of_seeds(successes: Sequence[float], column: str = "success") -> dic
     return {column: f"{mean:.0f}%", "95% interval": interval, "least, most": ends}
 
 
+def grouped(rows: Iterable[Row], *columns: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by what they have in some columns, in order of appearance."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[column] for column in columns), []).append(row)
+    return groups
+
+
+def mean_text(values: Sequence[float], form: str = ".2f", none: str = "-") -> str:
+    """The mean of some values as text, or what stands for it where there are none."""
+    return f"{np.mean(values):{form}}" if values else none
+
+
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
     """A row for each label of ``groups``, in ``column``: success, denoising steps, travel time, and tests.
 
@@ -185,7 +200,7 @@ def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], refe
         rows.append(
             {"team": team, column: label, **solved_columns(trials),
              "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
-             "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
+             "travel time [s]": mean_text(travel),
              "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
         )  # fmt: skip
     return rows

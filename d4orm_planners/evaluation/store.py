@@ -152,6 +152,13 @@ class Trial:
         return [BestSoFar(*point) for point in json.loads(self.history)]
 
     @property
+    def decision_time(self) -> float | None:
+        """Mean seconds of choosing the actions of one step, after the preparation; ``None`` where it is not known."""
+        if self.wall_time is None or self.preparation is None or not self.steps:
+            return None
+        return (self.wall_time - self.preparation) / self.steps
+
+    @property
     def denoising_steps(self) -> int | None:
         """Denoising steps until the last better plan; ``None`` where they are not known."""
         return self.progress[-1].steps if self.progress else None

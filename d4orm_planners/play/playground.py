@@ -25,7 +25,7 @@ from d4orm_planners.play.origin_check import LOOPBACK, MessageValidator, OriginC
 from d4orm_planners.play.panel import THEME, Panel
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.viewport_view import LaneView
+from d4orm_planners.play.viewport_view import ViewportView
 
 GAP = 0.12
 """Between two scenes, in sizes of one."""
@@ -56,7 +56,7 @@ class View:
             "dark": False,
         }
         self._camera = Viewpoint(server)
-        self._lanes: list[LaneView] = []
+        self._viewports: list[ViewportView] = []
         self._built: object = None
         self._looked_at: object = None
 
@@ -69,24 +69,24 @@ class View:
             self._rebuild(frames)
         now = time.perf_counter()
         with self._server.atomic():
-            for lane, frame in zip(self._lanes, frames):
-                lane.update(frame, now)
+            for viewport, frame in zip(self._viewports, frames):
+                viewport.update(frame, now)
 
     def _rebuild(self, frames: tuple[Frame, ...]) -> None:
         """Make all shapes anew."""
         limits = in_space(view_limits(frames[0].problem))
         positions = _positions(len(frames), limits)
         with self._server.atomic():
-            for lane in self._lanes:
-                lane.remove()
-            self._lanes = [
-                LaneView(self._server, self._session, index, frame, position, self.shown)
+            for viewport in self._viewports:
+                viewport.remove()
+            self._viewports = [
+                ViewportView(self._server, self._session, index, frame, position, self.shown)
                 for index, (frame, position) in enumerate(zip(frames, positions, strict=True))
             ]
             if len(frames) > 1:
                 top = np.array([limits[:, 0].mean(), limits[1, 1], limits[:, 2].mean()], np.float32)
-                for lane, frame in zip(self._lanes, frames):
-                    lane.name(frame.policy, top)
+                for viewport, frame in zip(self._viewports, frames):
+                    viewport.name(frame.policy, top)
         problem = frames[0].problem
         scene = (problem.name, problem.num_robots, problem.dimension, len(frames))
         if scene != self._looked_at:
@@ -120,18 +120,18 @@ class Viewpoint:
         camera.position, camera.look_at = view_from(limits, dimension, WIDE)
         camera.up, camera.fov = up, FIELD_OF_VIEW
         for client in self._server.get_clients().values():
-            with _looking_nowhere():
+            with _bad_camera_left_alone():
                 client.camera.up_direction = up
             self._look(client)
 
     def _look(self, client: viser.ClientHandle) -> None:
         camera = client.camera
-        with _looking_nowhere():
+        with _bad_camera_left_alone():
             camera.position, camera.look_at = view_from(self._limits, self._dimension, camera.aspect)
 
 
 @contextmanager
-def _looking_nowhere() -> Iterator[None]:
+def _bad_camera_left_alone() -> Iterator[None]:
     """A context that leaves a camera alone whose browser says that it looks nowhere, or that has nothing to see yet."""
     with suppress(ValueError, FloatingPointError), np.errstate(divide="raise", invalid="raise"):
         yield

@@ -117,15 +117,15 @@ class Viewport:
     """
 
     def __init__(
-        self, name: str, policy: Policy, scene: Problem, terms: EpisodeOptions, recording: EpisodeBuffer | None = None
+        self, name: str, policy: Policy, scene: Problem, options: EpisodeOptions, recording: EpisodeBuffer | None = None
     ) -> None:
-        self.name, self._policy, self._scene, self._seed = name, policy, scene, terms.seed
+        self.name, self._policy, self._scene, self._seed = name, policy, scene, options.seed
         # A robot stalls within the scene's usual duration, after which this episode goes on all the same.
-        options: dict[str, Any] = {
-            "lifelong": terms.lifelong, "disturbances": terms.disturbances, **terms.observation
-        }  # fmt: skip
-        self._env = open_env(scene, policy=policy, max_cycles=scene.horizon, **options)
-        self._observations, _ = self._env.reset(seed=terms.seed)
+        self._env = open_env(
+            scene, policy=policy, max_cycles=scene.horizon, lifelong=options.lifelong,
+            disturbances=options.disturbances, **options.observation,
+        )  # fmt: skip
+        self._observations, _ = self._env.reset(seed=options.seed)
         self._env.max_cycles = MOST_CYCLES
         begin = time.perf_counter()
         self.regain()

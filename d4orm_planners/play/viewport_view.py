@@ -35,7 +35,8 @@ from d4orm_planners.play.meshes import (
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 
-Whose: TypeAlias = NDArray[np.intp] | None
+Numbers: TypeAlias = NDArray[np.intp] | None
+"""Numbers ``(N,)`` of what shapes stand for, where they are others than the shapes' own."""
 Moved: TypeAlias = Callable[[int, Points, Points, bool], None]
 
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
@@ -56,7 +57,7 @@ LINES_EVERY = 0.1
 """Seconds between new trails and plans."""
 
 
-class LaneView:
+class ViewportView:
     """View of one that drives."""
 
     def __init__(
@@ -69,7 +70,7 @@ class LaneView:
         shown: Mapping[str, bool],
     ) -> None:
         self._scene, self._session, self._index, self._shown = server.scene, session, index, shown
-        self._root = f"/lane_{index}"
+        self._root = f"/viewport_{index}"
         self._seen, self._lines_at = (-1, False), 0.0
         self._held: dict[tuple[str, int], Points] = {}
         self._trail: list[FloatArray] = []
@@ -205,7 +206,7 @@ class LaneView:
             )  # fmt: skip
 
     def _drag(
-        self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit], whose: Whose = None
+        self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit], numbers: Numbers = None
     ) -> None:
         """Let a shape be dragged: it follows the pointer, and where it is let go the scene is changed."""
         node = self._nodes[name]
@@ -220,7 +221,7 @@ class LaneView:
             d = self._frame.problem.dimension
             self._session.edit(edit(index, (at + shift)[:d], shift[:d]), self._index)
 
-        self._follow_hand(node, kind, moved, whose=whose)
+        self._follow_hand(node, kind, moved, numbers=numbers)
 
     def _drag_pushes(self, group: BodyGroup) -> None:
         """Let robots be pushed: the page draws an arrow, and where it is let go the robot gets its velocity."""
@@ -232,18 +233,18 @@ class LaneView:
         self._follow_hand(self._nodes[group.name], "robot", moved, "shift", group.robots)
 
     def _follow_hand(
-        self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, whose: Whose = None
+        self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, numbers: Numbers = None
     ) -> None:
         """Call ``moved(number, position, shift so far, ended)`` while one of a node's shapes is dragged.
 
-        The number is that of the shape, or what ``whose`` ``(N,)`` has for it.
+        The number is that of the shape, or what ``numbers`` has for it.
         """
         grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 
         @node.on_drag("left", modifier=modifier)
         async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:  # one after the other
             instance = event.instance_index or 0
-            index, hand = instance if whose is None else int(whose[instance]), (event.client_id, instance)
+            index, hand = instance if numbers is None else int(numbers[instance]), (event.client_id, instance)
             if event.phase == "start":
                 at = self._position_of(kind, index)
                 grips[hand] = (at, self._pointed(event, at))

@@ -98,9 +98,9 @@ class Header(BaseModel):
         return self.model_dump_json(exclude=unsaid)
 
 
-def range_sensors(number: int, reach: float) -> str:
+def range_sensors(number: int, ray_range: float) -> str:
     """The arguments of an environment whose robots have so many rays of this range [m]."""
-    return f"observed_rays={number}, ray_range={reach:g}" if number else "observed_rays=0"
+    return f"observed_rays={number}, ray_range={ray_range:g}" if number else "observed_rays=0"
 
 
 @dataclass(frozen=True, eq=False)

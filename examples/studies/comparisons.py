@@ -18,6 +18,7 @@ import numpy as np
 from examples.outputs import (
     first_solutions,
     is_solved,
+    mean_text,
     penalised_steps,
     save_table,
     solved_columns,
@@ -229,7 +230,7 @@ def samples_needed(team: str, column: str, groups: dict[str, list[Trial]], refer
         rows.append(
             {"robots": team, column: label, **solved_columns(trials), "1000 samples": f"{quartiles[1]:.0f}",
              "quartiles": f"{quartiles[0]:.0f}-{quartiles[2]:.0f}",
-             "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
+             "travel time [s]": mean_text(travel),
              "p (samples)": f"{paired(trials, groups[reference], samples).cost_p:.2g}"}
         )  # fmt: skip
     return rows
@@ -242,7 +243,7 @@ def with_iterations(team: str, column: str, groups: dict[str, list[Trial]], refe
         solved = [
             trial.iterations for trial in groups[row[column]] if is_solved(trial) and trial.iterations is not None
         ]
-        rows.append(dict(list(row.items())[:4]) | {"iterations": f"{np.mean(solved):.1f}" if solved else "-"} | row)
+        rows.append(dict(list(row.items())[:4]) | {"iterations": mean_text(solved, ".1f")} | row)
     return rows
 
 
@@ -257,7 +258,7 @@ def with_jerk(team: str, column: str, groups: dict[str, list[Trial]], reference:
     """:func:`first_solutions` without the tests, and the mean squared norm of the solutions' jerk."""
     jerks = [trial.mean_squared_jerk for trial in groups[reference] if is_solved(trial)]
     shown = list(first_solutions(team, column, groups, reference)[0].items())[:-2]
-    return [dict(shown) | {"jerk [m²/s⁶]": f"{np.mean(jerks):.3g}" if jerks else "-"}]
+    return [dict(shown) | {"jerk [m²/s⁶]": mean_text(jerks, ".3g")}]
 
 
 COMPARISONS: Mapping[str, Comparison] = {

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.outputs import grouped, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, load_dynobench
 from d4orm_planners import Plan, make_planner
@@ -67,10 +67,7 @@ def main() -> None:
     rows = study_rows(
         arguments, "dynobench", lambda: [row_of(path, seed) for path in paths for seed in range(arguments.seeds)]
     )
-    instances: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        if not row["refused"]:
-            instances.setdefault(row["instance"], []).append(row)
+    instances = grouped((row for row in rows if not row["refused"]), "instance")
     save_table([described(own) for own in instances.values()], arguments.out / "dynobench.csv")
 
 
@@ -86,7 +83,3 @@ def described(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "solved": f"{len(solved)} of {len(rows)}", "planning [s]": median("seconds"),
         "makespan [s]": median("makespan"), "sum of costs [s]": median("sum_of_costs"),
     }  # fmt: skip
-
-
-if __name__ == "__main__":
-    main()

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.outputs import grouped, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, verify
@@ -173,8 +173,7 @@ def measure(chosen: Mapping[str, Cases], seeds: int, preset: str | None, improve
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A row of the table per team and planner; travel times and makespans are those of plans that solve."""
     table = []
-    for team, planner in dict.fromkeys((row["team"], row["planner"]) for row in rows):
-        plans = [row for row in rows if (row["team"], row["planner"]) == (team, planner)]
+    for (team, planner), plans in grouped(rows, "team", "planner").items():
         solved = [row for row in plans if row["solved"]]
         iterations, seconds = ([row[name] for row in plans] for name in ("iterations", "seconds"))
         makespans = [row["makespan"] for row in solved] or [np.inf]
@@ -213,8 +212,8 @@ def main() -> None:
         return measure(chosen, seeds, arguments.preset, arguments.improve)
 
     rows = study_rows(arguments, "solve_rates", plans)
-    for name in dict.fromkeys(row["set"] for row in rows):
-        save_table(summary([row for row in rows if row["set"] == name]), arguments.out / f"solve_rates_{name}.csv")
+    for (name,), own in grouped(rows, "set").items():
+        save_table(summary(own), arguments.out / f"solve_rates_{name}.csv")
     shown = [row for row in rows if row["team"] in README.get(row["set"], ())]
     if shown:
         columns = ("team", "planner", "solved", "first plan [s] (median, most)", "travel time [s]", "least [s]")

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from examples.outputs import require, save_table, study_parser, study_rows
+from examples.outputs import grouped, require, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.core.robot_types import find_robot
@@ -142,7 +142,5 @@ def main() -> None:
     if arguments.trials is None:
         require("drones", "crazyflow")
     rows = study_rows(arguments, "zero_shot", lambda: measure(1 if arguments.quick else arguments.seeds))
-    groups = {(row["scenario"], row["condition"]): [] for row in rows}
-    for row in rows:
-        groups[row["scenario"], row["condition"]].append(row)
+    groups = grouped(rows, "scenario", "condition")
     save_table([row_of(*key, group) for key, group in groups.items()], arguments.out / "zero_shot.csv")
