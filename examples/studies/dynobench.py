@@ -37,15 +37,8 @@ def loaded(path: Path) -> Problem | str:
 def row_of(path: Path, seed: int) -> dict[str, Any]:
     """The row of a file and a seed."""
     problem = loaded(path)
-    row: dict[str, Any] = {
-        "instance": path.stem,
-        "seed": seed,
-        "robots": 0,
-        "models": "",
-        "refused": "",
-        "solved": False,
-    }
-    row |= {"seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
+    row: dict[str, Any] = {"instance": path.stem, "seed": seed, "robots": 0, "models": "", "refused": ""}
+    row |= {"solved": False, "seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
     if isinstance(problem, str):
         return row | {"refused": problem}
     row |= {"robots": problem.num_robots, "models": ", ".join(sorted(set(problem.team.models)))}

@@ -72,21 +72,9 @@ def main() -> int:
             parser.error(f"--kill names robot {robot}; of {robots} robots the last one is {robots - 1}")
     world_endpoint, team_endpoint = free_endpoints(2)
     mission = Mission(
-        robots=robots,
-        seed=arguments.seed,
-        side=4.0,
-        horizon=80,
-        samples=arguments.samples,
-        denoising_steps=50,
-        iterations=2,
-        think=7,
-        agree=3,
-        timeout=arguments.timeout,
-        silence=30.0,
-        namespace=f"onboard-{secrets.token_hex(4)}",
-        world=world_endpoint,
-        team=team_endpoint,
-    )
+        robots=robots, seed=arguments.seed, samples=arguments.samples, timeout=arguments.timeout,
+        namespace=f"onboard-{secrets.token_hex(4)}", world=world_endpoint, team=team_endpoint,
+    )  # fmt: skip
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with tempfile.TemporaryDirectory() as folder:

@@ -49,7 +49,7 @@ def timeline(record: Record, logs: Sequence[Path]) -> list[Row]:
     return sorted(rows, key=lambda row: row["time"])
 
 
-def makers(rows: Sequence[Row]) -> dict[str, int]:
+def authors_of(rows: Sequence[Row]) -> dict[str, int]:
     """Return the robot that computed each plan first, by the plan's digest."""
     found: dict[str, int] = {}
     for row in rows:
@@ -87,7 +87,7 @@ def run_row(record: Record, rows: Sequence[Row], dt: float) -> Row:
 
 def robot_rows(record: Record, rows: Sequence[Row]) -> list[Row]:
     """Each robot in figures."""
-    made = makers(rows)
+    made = authors_of(rows)
     taken = {row["plan"] for row in rows if row["event"] == "takes over"}
     table = []
     for robot in range(len(record.reached[0])):
@@ -171,7 +171,7 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
     own = [row for row in rows if row["round"] == number]
     start = min(row["time"] for row in own if row["event"] == "begins")
     colors = robot_colors(num_robots)
-    made = makers(rows)
+    made = authors_of(rows)
 
     def ms(seconds: float) -> float:
         return 1000 * (seconds - start)
@@ -180,12 +180,10 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
     for row in own:
         if row["event"] == "computed":
             span = [(ms(row["time"]), ms(row["until"]) - ms(row["time"]))]
-            style = {
-                "facecolor": colors[row["robot"]],
-                "edgecolor": "white",
-                "hatch": None if row["solved"] else "////",
-            }
-            axes.broken_barh(span, (row["robot"] - HEIGHT / 2, HEIGHT), zorder=2, **style)
+            axes.broken_barh(
+                span, (row["robot"] - HEIGHT / 2, HEIGHT), zorder=2, facecolor=colors[row["robot"]], edgecolor="white",
+                hatch=None if row["solved"] else "////",
+            )  # fmt: skip
     first = {event: {} for event in ("announces", "takes over")}
     for row in own:
         if row["event"] in first and row["plan"]:
@@ -194,14 +192,10 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
         axes.plot(time, robot, "D", color="white", mec=INK, ms=5, zorder=6)
     for robot, time in first["takes over"].items():
         axes.plot(time, robot, ">", color=INK, ms=7, zorder=6)
-    plans = {row["plan"] for row in own if row["event"] == "takes over"}
-    maker = {made.get(plan) for plan in plans}
-    whose = f"robot {maker.pop()}" if len(maker) == 1 and None not in maker else "an unknown robot"
-    axes.set(
-        xlabel="time since the round began [ms]",
-        ylabel="robot",
-        title=f"Round {number}: the plan of {whose} is taken over",
-    )
+    authors = {made.get(row["plan"]) for row in own if row["event"] == "takes over"}
+    author = f"robot {authors.pop()}" if len(authors) == 1 and None not in authors else "an unknown robot"
+    title = f"Round {number}: the plan of {author} is taken over"
+    axes.set(xlabel="time since the round began [ms]", ylabel="robot", title=title)
     _rows_of(axes, num_robots)
     _explain_round(axes)
 

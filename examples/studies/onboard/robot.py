@@ -8,6 +8,7 @@ every tick, so that all of them execute the same one.
 
 from __future__ import annotations
 
+import json
 import logging
 import signal
 import sys
@@ -162,7 +163,7 @@ def drive(mission: Mission, number: int, robot: Robot, world: Transport) -> None
 def main() -> None:
     """Run one robot."""
     path, number, log_path = sys.argv[1:]
-    mission, own = Mission.read(Path(path).read_text()), int(number)
+    mission, own = Mission(**json.loads(Path(path).read_text())), int(number)
     # Ctrl-C is for the one that started the robots, and the world tells them when it is over.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Candidates that come too late for their round are counted, not worth a line each.

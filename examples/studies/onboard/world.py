@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,7 +24,7 @@ from d4orm_planners.d_d4orm.transport import Transport
 AGAIN = 0.25
 """Seconds after which robots that have not answered are told again, as messages may get lost."""
 
-FAREWELLS, FAREWELL = 3, 0.1
+ENDS, END_PERIOD = 3, 0.1
 """Number of times that the robots are told that it is over, and the seconds between."""
 
 START = 300.0
@@ -129,9 +130,9 @@ class World:
 
     def end(self) -> None:
         """Tell the robots that it is over."""
-        for _ in range(FAREWELLS):
+        for _ in range(ENDS):
             self._robots.publish(encode(END))
-            time.sleep(FAREWELL)
+            time.sleep(END_PERIOD)
         self._env.close()
 
     def _ask(self, tick: int, seconds: float) -> set[int]:
@@ -142,7 +143,7 @@ class World:
         rewards = [0.0 if command is None else command.reward for command in former]
         question = encode(Tick(tick, state, sorted(self._lost), ballots, rewards))
         deadline, again = time.perf_counter() + seconds, 0.0
-        while missing := {robot for robot in range(len(self.agents)) if self._is_awaited(robot, tick)}:
+        while missing := set(range(len(self.agents))) - self._lost - self._answered(tick):
             now = time.perf_counter()
             if now >= deadline:
                 break
@@ -158,8 +159,8 @@ class World:
         """Names of the robots."""
         return list(self._env.possible_agents)
 
-    def _is_awaited(self, robot: int, tick: int) -> bool:
-        return robot not in self._lost and (robot not in self._commands or self._commands[robot].number != tick)
+    def _answered(self, tick: int) -> set[int]:
+        return {robot for robot, command in self._commands.items() if command.number == tick}
 
     def _take(self, command: Command | None, tick: int) -> None:
         if command is None or command.number != tick or not 0 <= command.robot < len(self.agents):
@@ -197,16 +198,14 @@ class RobotProcesses:
         self.logs = [folder / f"robot_{robot}.csv" for robot in range(mission.robots)]
         self.killed: set[int] = set()
         path = folder / "mission.json"
-        path.write_text(mission.written())
+        path.write_text(json.dumps(asdict(mission)))
         root = str(Path(__file__).resolve().parents[3])
-        environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
-        }
+        paths = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
         command = [sys.executable, "-m", "examples.studies.onboard.robot", str(path)]
-        self._processes: list[subprocess.Popen[bytes]] = []
-        for robot, log in enumerate(self.logs):
-            self._processes.append(subprocess.Popen([*command, str(robot), str(log)], env=environment))
+        self._processes = [
+            subprocess.Popen([*command, str(robot), str(log)], env={**os.environ, "PYTHONPATH": paths})
+            for robot, log in enumerate(self.logs)
+        ]
 
     def __enter__(self) -> Self:
         return self
