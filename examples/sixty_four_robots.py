@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from examples.outputs import argument_parser, count, save_table
+from examples.common import argument_parser, count, save_table
 
 from d4orm_env import make_problem, verify
 from d4orm_env.render import save_animation, save_picture

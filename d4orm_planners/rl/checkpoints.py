@@ -221,17 +221,15 @@ class Checkpoint:
         room = _room(model, env)
         numbers = {}
         with (self.folder / "state.npz").open("rb") as stream, ArrayArchive(stream, room) as archive:
-            for name, position in room.items():
+            for name, largest in room.items():
                 if not (fresh or name.startswith(tuple(f"{running}_" for running in _running(env)))):
                     continue
-                numbers[name] = array = archive.array(name, position.nbytes)
-                same = (
-                    array.shape[1:] == position.shape[1:]
-                    and array.ndim == position.ndim
-                    and array.dtype == position.dtype
-                )
-                if not same or (not name.startswith("replay_") and array.shape != position.shape):
-                    raise ValueError(f"{name} is {array.dtype} {array.shape}, not {position.dtype} {position.shape}")
+                numbers[name] = array = archive.array(name, largest.nbytes)
+                # A replay buffer may be filled in part.
+                skipped = 1 if name.startswith("replay_") else 0
+                same = (array.ndim, array.shape[skipped:]) == (largest.ndim, largest.shape[skipped:])
+                if not same or array.dtype != largest.dtype:
+                    raise ValueError(f"{name} is {array.dtype} {array.shape}, not {largest.dtype} {largest.shape}")
         return numbers
 
     def _set_parameters(self, model: BaseAlgorithm) -> None:

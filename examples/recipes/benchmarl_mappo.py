@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import require, save_table
+from examples.common import require, save_table
 from examples.recipes.task import WORLD, recipe_arguments
 
 require("rl", "torchrl")

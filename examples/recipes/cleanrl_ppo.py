@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from examples.outputs import require, save_table
+from examples.common import require, save_table
 from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "torch")

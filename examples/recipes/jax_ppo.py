@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from examples.outputs import require, save_table
+from examples.common import require, save_table
 from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("jaxrl", "optax")

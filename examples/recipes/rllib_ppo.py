@@ -10,7 +10,7 @@ import sys
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table
+from examples.common import save_table
 from examples.recipes.task import WORLD, recipe_arguments, solved
 
 try:

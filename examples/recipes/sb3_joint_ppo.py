@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from examples.outputs import require
+from examples.common import require
 from examples.recipes.task import SEEDS, WORLD, recipe_arguments
 
 require("rl", "stable_baselines3")

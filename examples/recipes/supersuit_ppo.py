@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from examples.outputs import require
+from examples.common import require
 from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "supersuit", "stable_baselines3")

@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from examples.outputs import argument_parser, count
+from examples.common import argument_parser, count
 
 from d4orm_env import navigation_v0
 from d4orm_env.envs.rewards import TrainingReward

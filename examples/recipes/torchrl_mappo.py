@@ -14,7 +14,7 @@ import time
 from typing import Any
 
 import numpy as np
-from examples.outputs import require, save_table
+from examples.common import require, save_table
 from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "torchrl")

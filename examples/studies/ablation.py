@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any
 
-from examples.outputs import mean_text, save_table, study_trials, trials_parser
+from examples.common import mean_text, save_table, study_trials, trials_parser
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 from examples.studies.disturbance_study import (
     DISTURBANCES,

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from examples.outputs import is_solved, mean_text, save_table, solved_columns, study_trials, trials_parser
+from examples.common import is_solved, mean_text, save_table, solved_columns, study_trials, trials_parser
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners.evaluation.study import Study

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner

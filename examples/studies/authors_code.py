@@ -24,7 +24,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from examples.outputs import grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.engine.choice import get_engine

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.common import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 
 from d4orm_env.disturbances import (
@@ -137,10 +137,10 @@ def draw(cells: Cells, path: Path) -> None:
     scenarios = list(dict.fromkeys(scenario for scenario, _, _ in cells))
     figure, axes = plt.subplots(len(scenarios), 1, figsize=(9, 1.2 + 1.7 * len(scenarios)), sharex=True, squeeze=False)
     for axis, scenario in zip(axes[:, 0], scenarios, strict=True):
-        policies = list(dict.fromkeys(policy for position, policy, _ in cells if position == scenario))
+        policies = list(dict.fromkeys(policy for where, policy, _ in cells if where == scenario))
         shares = np.full((len(policies), len(COLUMNS)), np.nan)
-        for (position, policy, disturbance), trials in cells.items():
-            if position == scenario:
+        for (where, policy, disturbance), trials in cells.items():
+            if where == scenario:
                 shares[policies.index(policy), COLUMNS.index(disturbance)] = np.mean([one.success for one in trials])
         axis.imshow(shares, vmin=0, vmax=1, cmap="viridis", aspect="auto")
         for (row, column), share in np.ndenumerate(shares):

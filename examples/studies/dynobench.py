@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import grouped, save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, load_dynobench
 from d4orm_planners import Plan, make_planner

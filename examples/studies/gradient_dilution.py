@@ -22,7 +22,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import COLOURS, grouped, plt, save_figure, save_table, study_parser, study_rows
+from examples.common import COLOURS, grouped, plt, save_figure, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import grouped, mean_text, require, save_table, study_parser, study_rows, success_of_seeds
+from examples.common import grouped, mean_text, require, save_table, study_parser, study_rows, success_of_seeds
 
 require("rl", "stable_baselines3", "tensorboard")
 

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import grouped, save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
 from scipy.stats import mannwhitneyu
 
 from d4orm_env import Problem, make_problem, rollout

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from examples.outputs import count, save_gif, save_table, study_parser, study_rows
+from examples.common import count, save_gif, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 from numpy.typing import NDArray
 

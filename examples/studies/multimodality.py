@@ -29,7 +29,7 @@ from math import comb
 from typing import Any
 
 import numpy as np
-from examples.outputs import count, mean_text, plt, require, save_figure, save_table, study_parser, study_rows
+from examples.common import count, mean_text, plt, require, save_figure, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 require("ipopt", "casadi")

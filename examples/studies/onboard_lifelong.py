@@ -22,7 +22,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from examples.outputs import argument_parser, count, require, save_figure, save_gif, save_table
+from examples.common import argument_parser, count, require, save_figure, save_gif, save_table
 from examples.studies.onboard.mission import TICK, Mission
 from examples.studies.onboard.results import Row, draw, film, robot_rows, run_row, timeline
 from examples.studies.onboard.robot import Robot

@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import require
+from examples.common import require
 from numpy.typing import NDArray
 
 require("viz", "viser")

@@ -16,7 +16,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from examples.outputs import mean_text, require, save_table, study_parser, study_rows
+from examples.common import mean_text, require, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 require("rl", "stable_baselines3")

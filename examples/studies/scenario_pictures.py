@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count
+from examples.common import argument_parser, count
 
 from d4orm_env import make_problem, rollout
 from d4orm_env.render import save_picture

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import grouped, save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, verify

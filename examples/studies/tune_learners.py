@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from examples.outputs import count, grouped, save_table, study_parser, study_rows
+from examples.common import count, grouped, save_table, study_parser, study_rows
 from examples.studies.training_seeds import LEARNERS, QUICK
 from examples.studies.tune_rivals import FIRST_SEED, KEPT, Between, OneOf, Settings, candidates
 

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, navigation_v0

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from examples.outputs import grouped, require, save_table, study_parser, study_rows
+from examples.common import grouped, require, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.core.robot_types import find_robot

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from examples.outputs import steps_to_solution
+from examples.common import steps_to_solution
 from examples.studies.paper.figure import TIMES, Figure, Group
 
 from d4orm_planners.evaluation.store import Trial

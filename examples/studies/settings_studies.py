@@ -2,7 +2,7 @@
 
     python -m examples.studies head_to_head --seeds 20 --out head_to_head
 
-Columns are those of :func:`examples.outputs.first_solutions`: success with its 95% interval (Wilson), the mean number
+Columns are those of :func:`examples.common.first_solutions`: success with its 95% interval (Wilson), the mean number
 of denoising steps to the first solution, a trial without one counting twice the budget (PAR-2), the mean travel time of
 the solutions, and how likely it is that a row and the reference are equally good (McNemar on solutions, Wilcoxon on
 steps, paired by seed).
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import (
+from examples.common import (
     first_solutions,
     is_solved,
     mean_text,
