@@ -57,12 +57,7 @@ def argument_parser(description: str | None) -> argparse.ArgumentParser:
 
 
 def study_parser(description: str | None, seeds: int | None = None) -> argparse.ArgumentParser:
-    """A parser for a study: what every script has, and where rows or trials come from.
-
-    Args:
-        description: Docstring of the script.
-        seeds: Default of ``--seeds``; without it there is no such argument.
-    """
+    """A parser for a study: what every script has, where rows or trials come from, and seeds where it has a default."""
     parser = argument_parser(description)
     parser.add_argument("--trials", type=existing_file, help="run nothing; a Parquet file that the study wrote")
     if seeds is not None:
@@ -160,7 +155,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:
-    """How many trials are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
+    """Number of trials that are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
     solved = sum(map(counts, trials))
     lower, upper = wilson_interval(solved, len(trials))
     return {"solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}"}

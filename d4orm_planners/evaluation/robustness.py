@@ -19,7 +19,6 @@ from d4orm_planners.evaluation.tables import markdown, panels, table, target, wr
 THRESHOLD = 0.9
 """Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
 
-
 _PAIRS = """\
 Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
 succeeded; p is that of McNemar's exact test. Differences have 95% intervals by a paired bootstrap."""
@@ -165,7 +164,7 @@ def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """At which level of a disturbance the success of a policy falls below a share of what it is undisturbed.
+    """Level of a disturbance at which the success of a policy falls below a share of what it is undisturbed.
 
     The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
 

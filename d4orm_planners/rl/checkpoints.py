@@ -24,7 +24,6 @@ from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
 
-backend_agg: Any = LazyModule("matplotlib.backends.backend_agg")
 figures: Any = LazyModule("matplotlib.figure")
 
 
@@ -102,7 +101,6 @@ def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
 @own_style()
 def _draw(path: Path, evaluations: Sequence[Evaluation]) -> None:
     figure = figures.Figure(figsize=(7, 3), layout="constrained")
-    backend_agg.FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     steps = [evaluation.steps / 1e6 for evaluation in evaluations]
     left.plot(steps, [100 * evaluation.success_rate for evaluation in evaluations])

@@ -23,7 +23,7 @@ from d4orm_env.envs.joint_env import ENV_ID, register_environments
 
 
 def succeeds(model: PPO, env: gymnasium.Env[Any, Any], seed: int) -> bool:
-    """Whether all arrive without a contact, in the instance of a seed."""
+    """Check whether all arrive without a contact, in the instance of a seed."""
     observation, info = env.reset(seed=seed)
     over = False
     while not over:

@@ -37,6 +37,8 @@ from d4orm_planners.sampling.settings import TUNED
 Settings = Mapping[str, dict[str, Any]]
 """Settings of policies by their labels."""
 PAPER, AUTHORS = {"preset": "paper"}, {"preset": "authors"}
+BUDGET = 2000
+"""Denoising steps of a trial of tuned rivals."""
 
 
 class Block(NamedTuple):
@@ -65,15 +67,14 @@ class Block(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What is compared, and its table.
+    """A comparison, and its table.
 
     Attributes:
         about: A description for ``--help``.
         column: Head of the column of labels.
-        blocks: ``budget -> blocks``, rows of which follow each other; the budget is one of ``budgets``.
-        budgets: Denoising steps of a trial, where settings depend on it, and in the quick version.
+        blocks: Makes the blocks, whose rows follow each other.
         quick: Settings of the quick version.
-        quick_robots: Its team size; ``None`` is one block as it is.
+        quick_robots: Its team size; ``None`` is that of the first block, which is all there is.
         first_seed: Of every row; no default was chosen by seeds from ``FIRST_SEED`` on.
         team: Format of the name of a team, of a trial's attributes.
         rows: Makes the rows of a block.
@@ -83,8 +84,7 @@ class Comparison(NamedTuple):
 
     about: str
     column: str
-    blocks: Callable[[int], Sequence[Block]]
-    budgets: tuple[int, int] = (0, 0)
+    blocks: Callable[[], Sequence[Block]]
     quick: dict[str, Any] = {"max_iterations": 1, "num_steps": 20}  # noqa: RUF012 - never changed
     quick_robots: int | None = 2
     first_seed: int = FIRST_SEED
@@ -95,21 +95,19 @@ class Comparison(NamedTuple):
 
     def blocks_of(self, quick: bool) -> list[Block]:
         """The blocks, or those of the quick version."""
-        blocks = list(self.blocks(self.budgets[quick]))
+        blocks = list(self.blocks())
         if not quick:
             return blocks
-        if self.quick_robots is None:
-            return [blocks[0]._replace(seeds=1)]
-        changed = {"num_robots": self.quick_robots, "seeds": 1}
         small: list[Block] = []
-        for block in blocks:
+        for block in blocks if self.quick_robots else blocks[:1]:
             settings = {label: own | self.quick for label, own in block.settings.items()}
-            if (less := block._replace(settings=settings, **changed)) not in small:  # teams may have differed in size
+            less = block._replace(settings=settings, num_robots=self.quick_robots or block.num_robots, seeds=1)
+            if less not in small:  # teams may have differed in size
                 small.append(less)
         return small
 
 
-def credits_and_penalties(budget: int) -> list[Block]:
+def credits_and_penalties() -> list[Block]:
     """Four teams of 16, D4orm's defaults but for ``credit`` and ``penalty``, at most 20 iterations."""
     penalties = {"team": (1.0,), "robot": (1.0, 2.0), "alternate": (1.0, 2.0), "group": (1.0, 2.0, 3.0)}
     settings = {
@@ -127,7 +125,7 @@ def d4orm(policy: str = "d4orm", max_iterations: int = 20, **settings: Any) -> d
     return {"policy": policy, "engine": "cpu", "max_iterations": max_iterations, **settings}
 
 
-def differences(budget: int) -> list[Block]:
+def differences() -> list[Block]:
     """The preset with one setting of the defaults in turn, and the defaults with one of the preset's."""
     groups = {"credit": "group", "penalty": 2.0}
     preset = {
@@ -153,7 +151,7 @@ def differences(budget: int) -> list[Block]:
     ]
 
 
-def presets_head_to_head(budget: int) -> list[Block]:
+def presets_head_to_head() -> list[Block]:
     """D4orm and D4orm-D by their presets and defaults; and what one difference, or a higher penalty, does."""
     by_preset = {
         name: {f"{name}, authors": d4orm(name, **AUTHORS), f"{name}, paper": d4orm(name, **PAPER),
@@ -180,7 +178,7 @@ def presets_head_to_head(budget: int) -> list[Block]:
     ]
 
 
-def tuned_rivals(budget: int) -> list[Block]:
+def tuned_rivals() -> list[Block]:
     """Every preset by its label, with as many iterations as the budget has room for."""
     chosen: dict[str, dict[str, Any]] = {"d4orm, defaults": {"policy": "d4orm"}}
     for method, tuned in TUNED.items():
@@ -189,14 +187,14 @@ def tuned_rivals(budget: int) -> list[Block]:
                 chosen[f"{method}, {preset}"] = {"policy": method, "preset": preset}
     for settings in chosen.values():
         name, own = settings["policy"], {key: value for key, value in settings.items() if key != "policy"}
-        num_steps = min(make_planner(name, **own).config.num_steps, budget)
-        iterations = 1 if name == "mbd" else budget // num_steps
+        num_steps = min(make_planner(name, **own).config.num_steps, BUDGET)
+        iterations = 1 if name == "mbd" else BUDGET // num_steps
         settings |= {"engine": "cpu", "num_steps": num_steps, "max_iterations": iterations}
     teams = (*TUNED_ON, ("paper_circle", 16))
     return [Block(scenario, num_robots, chosen, "d4orm, tuned") for scenario, num_robots in teams]
 
 
-def steps_and_samples(budget: int) -> list[Block]:
+def steps_and_samples() -> list[Block]:
     """8 and 16 robots on the circle, at most 8 iterations of so many steps and samples."""
     alike = {"late_samples": 1.0}
     chosen: Settings = {
@@ -247,7 +245,7 @@ def with_iterations(team: str, column: str, groups: dict[str, list[Trial]], refe
     return rows
 
 
-def limited_jerk(budget: int) -> list[Block]:
+def limited_jerk() -> list[Block]:
     """4 and 8 double integrators on the circle, and the same with limits on their jerk (paper, section VIII-C)."""
     settings = {"d4orm": d4orm(**PAPER)}
     models = ("holonomic2d", "holonomic2d_jerk")
@@ -283,7 +281,7 @@ COMPARISONS: Mapping[str, Comparison] = {
         "D4orm and its rivals as the paper has them and tuned with the same effort, on seeds that no tuning has seen. "
         "A trial has 2000 denoising steps, of 1024 samples but for the defaults, which draw 256 and later 128; MBD has "
         "its one run, of as many steps as it was tuned with.",
-        "method", tuned_rivals, budgets=(2000, 20), quick_robots=None, first_seed=0,
+        "method", tuned_rivals, quick_robots=None, first_seed=0,
     ),
     "fewer_samples": Comparison(
         "Samples until D4orm's first solution with fewer steps, fewer samples, or fewer while the noise is small: "

@@ -28,13 +28,7 @@ from d4orm_planners import make_planner
 
 
 class Case(NamedTuple):
-    """Instances of a scenario.
-
-    Attributes:
-        label: In the tables.
-        scenario: Its name.
-        settings: Its arguments.
-    """
+    """Instances of a scenario with these arguments, and what the tables call them."""
 
     label: str
     scenario: str

@@ -61,7 +61,7 @@ SCENARIOS = ("swap of ten", "circle of eight", "figure of ten")
 
 
 def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
-    """Who has touched something in each step of a plan; nothing where it is not solved."""
+    """Robots in contact in each step of a plan; nothing where it is not solved."""
     plan = make_planner().solve(problem, seed=seed, time_limit=60)
     if not plan.solved:
         return
@@ -74,7 +74,7 @@ def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
 
 
 def fly_controller(problem: Problem, seed: int, bodies: Any, mode: Any) -> Iterator[np.ndarray]:
-    """Who has touched something in each step of D4orm-C2F."""
+    """Robots in contact in each step of D4orm-C2F."""
     with Controller("d4orm-c2f", mode=mode, tracker=True, lag=find_robot(ROBOT).lag, refine="sync") as controller:
         last, step, calm = bodies.states, 0, 0
         controller.begin(problem, last, seed=seed)

@@ -138,13 +138,7 @@ HEIGHT = 0.5
 
 
 def draw(rows: Sequence[Row], num_robots: int, seconds: float) -> Any:
-    """The figure.
-
-    Args:
-        rows: The timeline.
-        num_robots: Number of robots.
-        seconds: Part of the run that is shown below.
-    """
+    """Draw a timeline: above the round with the most to see, below the first seconds of the run."""
     figure, (above, below) = plt.subplots(
         2, 1, figsize=(9.5, 2.4 + 0.75 * num_robots), layout="constrained", height_ratios=(1.25, 1)
     )

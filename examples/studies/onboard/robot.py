@@ -29,14 +29,7 @@ LOOK = 0.5
 
 
 class Robot:
-    """A robot from tick to tick.
-
-    Args:
-        mission: The settings.
-        number: Its number, from 0.
-        team: Network for candidates.
-        log: Its log.
-    """
+    """A robot from tick to tick; ``team`` is the network for candidates."""
 
     def __init__(self, mission: Mission, number: int, team: Transport, log: Log) -> None:
         self._mission, self._number, self._team, self._log = mission, number, team, log

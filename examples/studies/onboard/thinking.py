@@ -28,11 +28,7 @@ COLUMNS = (
 
 
 class Log:
-    """A CSV file with a row per event; times are :func:`time.perf_counter`, the same clock for all processes.
-
-    Args:
-        path: The file.
-        robot: Its owner.
+    """A CSV file of a robot's events; times are :func:`time.perf_counter`, the same clock for all processes.
 
     Attributes:
         tick: The present tick.
@@ -115,13 +111,7 @@ class Agenda:
 class Round:
     """Planning from where the team will be when the plan takes over.
 
-    Args:
-        agenda: Task of the round.
-        mission: The settings.
-        robot: Owner of the node.
-        engine: Engine for rollouts and samples.
-        team: Network for candidates.
-        observer: Called with what the node does, and the digest of the plan that it is about.
+    ``observer`` is called with what the node does, and the digest of the plan that it is about.
     """
 
     def __init__(

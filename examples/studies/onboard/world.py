@@ -72,14 +72,9 @@ class Record:
 class World:
     """The environment, in lifelong mode, at the other end of the robots' network.
 
-    A tick begins when all robots have answered the one before, but no sooner than real time allows: who is slow
-    holds the world up, and who does not answer within the mission's timeout is given up and stops.
-
-    Args:
-        mission: The settings.
-        robots: The network.
-        ticks: Most ticks.
-        speed: Simulated seconds per second at most.
+    A tick begins when all robots have answered the one before, but no sooner than real time allows, of which one second
+    is ``speed`` simulated ones: a slow robot holds the world up, and one that does not answer within the mission's
+    timeout is given up and stops.
     """
 
     def __init__(self, mission: Mission, robots: Transport, ticks: int, speed: float) -> None:
@@ -95,13 +90,10 @@ class World:
         self._commands: dict[int, Command] = {}
 
     def await_robots(self, check: Callable[[], None]) -> None:
-        """Wait for the first answer of every robot.
-
-        Args:
-            check: Called again and again; raises if there is no use in waiting.
+        """Wait for the first answer of every robot, and call meanwhile ``check``, which may raise.
 
         Raises:
-            RuntimeError: If somebody does not answer.
+            RuntimeError: If a robot does not answer.
         """
         deadline = time.perf_counter() + START
         while missing := self._ask(0, AGAIN):
@@ -110,11 +102,7 @@ class World:
                 raise RuntimeError(f"robots {sorted(missing)} have not answered within {START:g} s")
 
     def run(self, each_tick: Callable[[int], None]) -> None:
-        """Simulate to the end.
-
-        Args:
-            each_tick: Called with the number of every tick before it begins.
-        """
+        """Simulate to the end; ``each_tick`` is called with the number of every tick before it begins."""
         record, due = self.record, time.perf_counter()
         record.joints.append(split_state(self.problem, self._env.state()))
         while self._env.agents:
@@ -187,12 +175,7 @@ GRACE = 15.0
 
 
 class RobotProcesses:
-    """A process for every robot, which ends with the block at the latest.
-
-    Args:
-        mission: Their settings.
-        folder: Folder of their logs.
-    """
+    """A process for every robot, with its log in ``folder``, which ends with the block at the latest."""
 
     def __init__(self, mission: Mission, folder: Path) -> None:
         self.logs = [folder / f"robot_{robot}.csv" for robot in range(mission.robots)]
