@@ -29,6 +29,8 @@ from websockets.datastructures import Headers
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
+from d4orm_env.core.arrays import short_repr
+
 LARGEST_UPLOAD = 2_000_000
 """Bytes of a file."""
 
@@ -44,7 +46,6 @@ Name = Annotated[str, Meta(max_length=255)]
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?", re.IGNORECASE)
-REFUSAL = b"open the address that d4orm play has printed\n"
 _LARGEST_MESSAGE = LARGEST_UPLOAD + 10_000
 _MESSAGE_PERIOD = 0.002
 """Seconds from one message of a page to its next at least; a hand makes one every 16 ms."""
@@ -171,7 +172,7 @@ class MessageValidator:
             case _:
                 raise ValueError("a page has no such control; load it anew")
         if not offered:
-            raise ValueError(f"{control.label} cannot be {_short(value)}; it takes {said}")
+            raise ValueError(f"{control.label} cannot be {short_repr(value)}; it takes {said}")
 
     def _check_drag(self, client: int, message: _Drag) -> None:
         # One that was taken away meanwhile is dragged to the end, and the session says that it is gone.
@@ -208,11 +209,6 @@ def _is_on_scale(value: object, control: Any) -> bool:
     return value == control.max or abs(steps - round(steps)) <= _ROUNDING
 
 
-def _short(value: object) -> str:
-    text = ascii(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
 class OriginCheck:
     """Answers requests that do not come from a page of the playground, before anything else looks at them.
 
@@ -238,9 +234,9 @@ class OriginCheck:
             parts = ";".join(request.headers.get_all("Cookie")).split(";")
             cookies = dict(part.strip().partition("=")[::2] for part in parts)
             passes = passes and _is_same(cookies.get(self._cookie, ""), self._token)
-        return (
-            None if passes else _response(HTTPStatus.FORBIDDEN, {}, b"open the address that d4orm play has printed\n")
-        )
+        if passes:
+            return None
+        return _response(HTTPStatus.FORBIDDEN, {}, b"open the address that d4orm play has printed\n")
 
     @contextmanager
     def installed(self) -> Iterator[None]:
