@@ -18,7 +18,10 @@ from PIL import Image
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+from d4orm_env import Problem
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.envs.joint_state import JointState
+from d4orm_env.render import FrameRenderer
 from d4orm_planners.base.machine import commit, describe_machine
 from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.evaluate import run_study
@@ -247,6 +250,19 @@ def save_figure(figure: Any, path: Path) -> None:
         figure.savefig(temporary)
     plt.close(figure)
     print(f"wrote {path}")
+
+
+def film(
+    problem: Problem, joints: Sequence[JointState], faded: Sequence[Any], collided: Sequence[Any],
+    captions: Sequence[str], view: Any = None,
+) -> list[Any]:  # fmt: skip
+    """Images of joint states with trails; of each ``(K,)`` robots that are pale and those in contact."""
+    renderer, frames = FrameRenderer(problem, (520, 540), view), []
+    for step, (joint, pale, touching, caption) in enumerate(zip(joints, faded, collided, captions, strict=True)):
+        trail = np.stack([past.states[:, :2] for past in joints[max(step - 30, 0) : step + 1]])
+        frames.append(renderer.draw(joint.states, pale, touching, joint.goals, trail, caption=caption))
+    renderer.close()
+    return frames
 
 
 def save_gif(frames: Sequence[Any], path: Path, interval: float) -> None:

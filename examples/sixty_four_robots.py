@@ -2,7 +2,7 @@
 
     python -m examples.sixty_four_robots --seed 1
 
-D4orm-D begins with everybody driving straight to its goal, and repairs the robots that meet.
+The planner `hybrid` begins with straight drives to the goals, and repairs those of the robots that meet.
 """
 
 from __future__ import annotations

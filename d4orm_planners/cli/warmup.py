@@ -103,10 +103,7 @@ def compile_for_planning(
 
 def _in_another_process(call: str) -> subprocess.Popen[bytes]:
     # What ends it, as Ctrl-C, ends this process too, which says so.
-    names = "average_once, drive_once, find_paths, roll_out_once, sample_once, spread_waves"
-    return subprocess.Popen(
-        [sys.executable, "-c", f"from {__name__} import {names}; {call}"], stderr=subprocess.DEVNULL
-    )
+    return subprocess.Popen([sys.executable, "-c", f"from {__name__} import *; {call}"], stderr=subprocess.DEVNULL)
 
 
 def roll_out_once(models: tuple[str, ...]) -> None:
@@ -232,9 +229,9 @@ def _brake(models: tuple[str, ...]) -> None:
 def _evade() -> None:
     """Keep two robots apart, as D4orm-C2F does in the last resort."""
     problem = _smallest_problem(TEAMS[0])
-    colliding, everybody = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
-    joint = JointState(problem.start, problem.goal, _no_controls(problem)[0], ~everybody, 0)
-    safe_velocities(problem, joint, colliding, everybody, problem.margin)
+    colliding, acting = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
+    joint = JointState(problem.start, problem.goal, _no_controls(problem)[0], ~acting, 0)
+    safe_velocities(problem, joint, colliding, acting, problem.margin)
 
 
 def _step_environments() -> None:

@@ -159,7 +159,7 @@ def _driven(problem: Problem, controller: Controller, seed: int) -> list[tuple[f
 
 
 def boxed_problem(num_boxes: int, where: Where) -> Problem:
-    """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from everybody."""
+    """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from all robots."""
     problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=100)
     random = np.random.default_rng(0)
     if where == "near":

@@ -41,7 +41,7 @@ class Condition:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         disturbances: Further disturbances.
         name: Varied quantity, such as ``"push.speed"``; empty for nothing.
-        level: Its level; of disturbances that differ in more than a number, their place among the levels.
+        level: Its level; of disturbances that differ in more than a number, their index among the levels.
         physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
     """
 

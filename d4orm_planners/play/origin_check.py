@@ -1,4 +1,4 @@
-"""Access to the playground: a browser that shows its own page, and nobody else's; and messages that it may send.
+"""Access to the playground: the check that requests are its own page's, and of the messages that this may send.
 
 Any page in a browser may ask a port of this machine. The browser then tells on whose behalf it does (``Origin``) and by
 which name it came (``Host``): a foreign page has another origin, and one that has had its own name point to this
@@ -126,7 +126,7 @@ class MessageValidator:
         }
         self._sockets = server._websock_server
         self._sockets.on_client_connect(self._attach)
-        self._sockets.disconnect_all_clients()  # whoever was quicker than this
+        self._sockets.disconnect_all_clients()  # clients that were quicker than this
 
     async def _attach(self, client: WebsockClientConnection) -> None:
         connection = self._sockets._live_connections[client.client_id]
@@ -140,7 +140,7 @@ class MessageValidator:
             try:
                 return self.checked(client, data)
             except msgspec.ValidationError:
-                pass  # a message that nobody listens to
+                pass  # a message that nothing listens to
             except (msgspec.DecodeError, RecursionError):
                 await connection.close(CloseCode.POLICY_VIOLATION, "only the page of d4orm play may send messages")
             except ValueError as error:

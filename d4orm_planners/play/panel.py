@@ -117,7 +117,7 @@ class Panel:
         horizon.on_update(lambda _: self._session.set_horizon(int(horizon.value)))
 
     def _choose(self, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
-        if event.client is not None:  # somebody's hand, not this program's
+        if event.client is not None:  # a viewer's, not this program's
             self._session.choose(*(name for name, box in self._drivers.items() if box.value))
 
     def _add_edits(self) -> None:

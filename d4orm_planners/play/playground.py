@@ -213,7 +213,7 @@ class Playground:
             OriginCheck(token, f"d4orm_play_{chosen}").installed(),
         ):
             self._server = _Server(host=where, port=chosen, verbose=False)
-        # Otherwise Python prints every request that cannot be read, which anybody can make.
+        # Otherwise Python prints every request that cannot be read.
         logging.getLogger("websockets").addHandler(logging.NullHandler())
         MessageValidator(self._server, self.session.refuse)
         named = socket.gethostname() if host in ("0.0.0.0", "::") else where

@@ -229,7 +229,7 @@ class Session:
             self._status = replace(self._status, message="")
             try:
                 command()
-            except Exception as error:  # nothing that anybody asks for ends the session
+            except Exception as error:  # no request of a viewer ends the session
                 self._say_refused(1, _told(error))
         if dropped := self.commands.dropped():
             self._say_refused(dropped, f"{dropped} changes are left, as {MOST_WAITING} were waiting; make them slower")

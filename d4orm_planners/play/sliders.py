@@ -66,7 +66,7 @@ class DisturbanceSliders:
             self.sliders[slider.name].value = self._session.levels.get(slider.name, slider.off)
 
     def _turn_by(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-        if event.client is not None:  # somebody's hand, not this program's
+        if event.client is not None:  # a viewer's, not this program's
             self._turn()
 
     def _turn(self) -> None:

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -87,15 +88,12 @@ class Drivers:
 
     def __init__(self) -> None:
         self.horizon: int | None = None
-        self._made: dict[tuple[str, int | None], Policy] = {}
+        self._made = cache(make_policy)
 
     def policy(self, name: str) -> Policy:
         """The policy of a name."""
-        horizon = self.horizon if HORIZON in setting_names(name) else None
-        if (name, horizon) not in self._made:
-            settings = {} if horizon is None else {HORIZON: horizon}
-            self._made[name, horizon] = make_policy(name, **settings)
-        return self._made[name, horizon]
+        settings = {} if self.horizon is None or HORIZON not in setting_names(name) else {HORIZON: self.horizon}
+        return self._made(name, **settings)
 
 
 @dataclass(frozen=True)

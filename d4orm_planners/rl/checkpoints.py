@@ -71,8 +71,7 @@ class Evaluation:
 
 def evaluate_network(network: Network, worlds: RobotVecEnv | MixedVecEnv, seed: int) -> Outcome:
     """Run one episode in each world, without exploring; of a mixture, the mean of its parts."""
-    parts = worlds.parts if isinstance(worlds, MixedVecEnv) else (worlds,)
-    means = [np.mean(run_worlds(network, part, seed), axis=0) for part in parts]
+    means = [np.mean(run_worlds(network, part, seed), axis=0) for part in worlds.parts]
     success, travel_time = (float(np.mean(values)) for values in zip(*means))
     return Outcome(success, travel_time, [float(mean[0]) for mean in means])
 

@@ -28,7 +28,7 @@ WORLDS = 64
 
 
 class Successes(RLlibCallback):
-    """Tells whether all have arrived and nobody touched anything."""
+    """Tells whether all have arrived without contact."""
 
     def on_episode_end(self, *, episode: Any, metrics_logger: Any, **others: Any) -> None:
         """Count."""

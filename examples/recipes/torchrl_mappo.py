@@ -5,7 +5,7 @@
 ``TorchRLNavigation`` steps all worlds in one compiled call. An episode is the team's, and a robot's own ends when it
 arrives: that is what the per-robot ``done`` is made of here, and robots that stand at their goals are left out of the
 loss. With TorchRL's own ``PettingZooWrapper`` give ``use_mask=True, done_on_any=False``: by its default the first robot
-that arrives ends the episode for all, and nobody else ever learns to.
+that arrives ends the episode for all, and no other ever learns to.
 """
 
 from __future__ import annotations

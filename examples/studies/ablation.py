@@ -2,10 +2,10 @@
 
     python -m examples.studies ablation --seeds 30 --out ablation
 
-Eight robots on the circle, on random places and in rooms, each measure under the disturbance that it is there for. The
-table has how many trials succeeded and in how many anybody touched anything, with all measures and without, how likely
-it is that both are equally good (McNemar, paired by seed), and how much longer robots travel without where both succeed
-(mean, and Wilcoxon's test).
+Eight robots on the circle, at random positions and in rooms, each measure under the disturbance that it is there for.
+The table has how many trials succeeded and in how many there was a contact, with all measures and without, how
+likely it is that both are equally good (McNemar, paired by seed), and how much longer robots travel without where both
+succeed (mean, and Wilcoxon's test).
 `--go-on-from FILE` takes trials from a Parquet file, such as those with all measures in
 `examples/studies/data/disturbance_study.parquet`.
 """

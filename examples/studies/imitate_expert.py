@@ -3,8 +3,8 @@
     python -m examples.studies imitate_expert --seeds 3
     python -m examples.studies imitate_expert --trials examples/studies/data/imitate_expert.parquet
 
-The clone sees what the expert's own drives led to, and on its own comes into places where the expert never was. DAgger
-lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
+The clone sees what the expert's own drives led to, and on its own comes into states that the expert never was in.
+DAgger lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
 nothing. Success is that in 100 random instances that nothing learns from. All of it is in policy files of "ppo". Broken
 off, the same command goes on; some ten minutes a seed. With ``--trials`` nothing is trained, and the table is made of a
 file that it wrote before. The same from the command line: ``d4orm train imitation`` and ``d4orm train ppo

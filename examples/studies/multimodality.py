@@ -1,4 +1,4 @@
-"""Kinds of solution that a planner finds: two robots swap places around an obstacle (the paper's appendix A).
+"""Kinds of solution that a planner finds: two robots swap positions around an obstacle (the paper's appendix A).
 
     python -m examples.studies multimodality --seeds 100
     python -m examples.studies multimodality --team 8 --seeds 30
@@ -10,13 +10,13 @@ The other two are cyclic (robot 0 above the obstacle, the obstacle above robot 1
 weave, and pass the other on one side before it passes the obstacle on the other. The signs do not tell how often a
 robot goes round.
 
-With ``--team`` a whole team changes places on a circle, the appendix's harder problem: robots meet pairwise, and pass
+With ``--team`` a whole team swaps positions on a circle, the appendix's harder problem: robots meet pairwise, and pass
 each other on one side or the other. A plan's class is the sign of the angle that each robot sweeps around each other
 one, 28 signs with eight robots. The table has how many seeds were solved, how many classes the solutions are of, and
 ten of them drawn at random, which does not grow with the seeds (rarefaction); how many pairs of solutions are of the
-same class, and how far apart two are (root mean square distance of the robots' places over time, mean over all pairs).
-Slow plans differ more, so the last two rows have plans of equal travel times only. The plot has all solutions along the
-directions in which they differ most.
+same class, and how far apart two are (root mean square distance of the robots' positions over time, mean over all
+pairs). Slow plans differ more, so the last two rows have plans of equal travel times only. The plot has all solutions
+along the directions in which they differ most.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from examples.common import argument_parser, count, require, save_figure, save_gif, save_table
 from examples.studies.onboard.mission import TICK, Mission
-from examples.studies.onboard.results import Row, draw, film, robot_rows, run_row, timeline
+from examples.studies.onboard.results import Row, draw, pictures, robot_rows, run_row, timeline
 from examples.studies.onboard.robot import Robot
 from examples.studies.onboard.thinking import COLUMNS, Log
 from examples.studies.onboard.world import RobotProcesses, World, free_endpoints
@@ -133,4 +133,4 @@ def write(world: World, rows: list[Row], out: Path, seconds: float) -> None:
     print(f"wrote {path}")
     until = record.began[min(round(SHOWN / TICK), record.steps - 1)] - record.began[0]
     save_figure(draw(rows, world.problem.num_robots, until), out / "onboard_lifelong_timeline.png")
-    save_gif(film(world.problem, record, seconds), out / "onboard_lifelong.gif", TICK)
+    save_gif(pictures(world.problem, record, seconds), out / "onboard_lifelong.gif", TICK)

@@ -1,4 +1,4 @@
-"""Planning time of D4orm-D by team size at constant density.
+"""Planning time of `hybrid` by team size at constant density.
 
     python -m examples.studies scaling --seeds 3
     python -m examples.studies scaling --seeds 1 --num-robots 2000

@@ -8,7 +8,7 @@
 Random instances differ by seed; those of the AMSwarm comparison have their starts jittered by 5 mm. Every plan that
 counts as solved has passed ``verify()``. Iterations and seconds are those to the first solution, compilation not
 counted; with ``--improve`` the search goes on from there until so many seconds have passed in all. No plan takes
-less time to travel than "least": that of robots which drive straight home with nobody and nothing in the way.
+less time to travel than "least": that of robots which drive straight to their goals with nothing in the way.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ class Mission:
     def problem(self) -> Problem:
         """The team of ground robots in the square, with its first goals."""
         team = Team(("velocity2d",) * self.robots)
-        # Who follows another one does not touch it when that one stops at once.
+        # A robot that follows another one does not touch it when that one stops at once.
         margin = float(np.max(np.asarray(team.max_speed))) * TICK + ROOM
         size = self.side - 2 * (float(np.max(np.asarray(team.radius))) + margin)
         problem = make_problem(

@@ -10,13 +10,13 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from examples.common import film
 from examples.studies.onboard.thinking import COLUMNS
 from examples.studies.onboard.world import Record
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from d4orm_env import Problem
-from d4orm_env.render import FrameRenderer
 from d4orm_env.render.panels import robot_colors
 
 Row = dict[str, Any]
@@ -112,20 +112,16 @@ def robot_rows(record: Record, rows: Sequence[Row]) -> list[Row]:
     return table
 
 
-def film(problem: Problem, record: Record, seconds: float) -> list[Any]:
+def pictures(problem: Problem, record: Record, seconds: float) -> list[Any]:
     """Images of the first seconds, one for every tick; robots that were given up are pale."""
-    renderer = FrameRenderer(problem, (520, 540))
-    frames = []
-    for step in range(min(record.steps, round(seconds / problem.dt))):
-        joint = record.joints[step + 1]
-        trail = np.stack([past.states[:, :2] for past in record.joints[max(step - 25, 0) : step + 2]])
-        lost = np.isin(np.arange(problem.num_robots), record.lost[step])
-        goals = int(np.sum(record.reached[: step + 1]))
-        note = f"    {lost.sum()} given up" if lost.any() else ""
-        caption = f"{joint.steps * problem.dt:.1f} s    {goals} goals reached{note}"
-        frames.append(renderer.draw(joint.states, lost, record.collided[step], joint.goals, trail, caption=caption))
-    renderer.close()
-    return frames
+    steps = min(record.steps, round(seconds / problem.dt))
+    lost = [np.isin(np.arange(problem.num_robots), record.lost[step]) for step in range(steps)]
+    captions = [
+        f"{joint.steps * problem.dt:.1f} s    {np.sum(record.reached[: step + 1])} goals reached"
+        + (f"    {given_up.sum()} given up" if given_up.any() else "")
+        for step, (joint, given_up) in enumerate(zip(record.joints[1:], lost))
+    ]
+    return film(problem, record.joints[1 : steps + 1], lost, record.collided[:steps], captions)
 
 
 def _median(values: Any) -> str:

@@ -80,7 +80,7 @@ TIMEOUT = 0.25
 """Seconds that a node waits for the others after each of its iterations."""
 
 RESEND = 0.2
-"""Seconds between two looks at whether everybody has the best candidate, once all had it."""
+"""Seconds between two looks at whether all nodes have the best candidate, once all had it."""
 
 LOOK = 0.02
 """Seconds between two looks at what has arrived, before that."""

@@ -124,7 +124,7 @@ class World:
         self._env.close()
 
     def _ask(self, tick: int, seconds: float) -> set[int]:
-        """Tell where everybody is and collect the commands; who has not answered in time."""
+        """Tell all robots the joint state, and collect their commands; the robots that have not answered in time."""
         state = [float(value) for value in self._env.state()]
         former = [self._commands.get(robot) for robot in range(len(self.agents))]
         ballots = ["" if command is None else command.ballot for command in former]
@@ -221,7 +221,7 @@ class RobotProcesses:
 
 
 def free_endpoints(number: int) -> list[str]:
-    """Endpoints on loopback that nobody listens at."""
+    """Endpoints on loopback that are free."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(number)]
     ports = [one.getsockname()[1] for one in sockets]
     for one in sockets:

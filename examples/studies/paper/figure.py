@@ -89,7 +89,7 @@ class Figure:
     Attributes:
         name: Its name on the command line.
         title: Its title.
-        source: Its place in the paper.
+        source: Section of the paper that has it.
         sections: Its panels.
         across: Attribute that varies from left to right.
         metrics: Metrics in the tables, see :data:`~examples.studies.paper.numbers.METRICS`.
