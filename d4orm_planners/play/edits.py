@@ -255,6 +255,11 @@ class CommandQueue:
         """True if it was closed."""
         return self._closed
 
+    @property
+    def empty(self) -> bool:
+        """True if no command waits."""
+        return not self._waiting
+
 
 def queued(
     setting: str | None = None,

@@ -83,7 +83,8 @@ class Panel:
         if text != self._text:
             self._text = self._status.content = text
         refused = frames[0].status.refused
-        if refused != self._refused:  # the controls say what is
+        # The controls then say what is, unless a change waits that they show already.
+        if refused != self._refused and not self._session.busy:
             self._refused = refused
             self._sliders.follow()
             for name, box in self._drivers.items():
@@ -130,7 +131,7 @@ class Panel:
             "Remove obstacle": edits.remove_obstacle,
         }
         for name, change in changes.items():
-            self._gui.add_button(name).on_click(lambda _, change=change: self._session.edit(change))
+            self._gui.add_button(name).on_click(partial(lambda change, _: self._session.edit(change), change))
         self._gui.add_button("Push a robot").on_click(lambda _: self._push_farthest())
 
     def _push_farthest(self) -> None:

@@ -72,6 +72,11 @@ class Session:
         frame = self.frame
         return frame.problem.with_state(frame.states, frame.goals)
 
+    @property
+    def busy(self) -> bool:
+        """True while changes wait or are made."""
+        return not self.commands.empty or self.frame.status.state == "planning"
+
     def replay(self) -> Replay:
         """Return a replay since team, world or policies last changed, side by side."""
         viewports = self._viewports

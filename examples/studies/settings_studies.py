@@ -42,15 +42,9 @@ BUDGET = 2000
 
 
 class Block(NamedTuple):
-    """Settings on one team, and the label of those that they are compared with there.
+    """Settings whose rows are shown of one team, by at most so many seeds, and the label of their reference.
 
-    Attributes:
-        scenario: Name of the scenario.
-        num_robots: Size of the team.
-        settings: Settings whose rows are shown.
-        reference: Label of what they are compared with, theirs or another block's of the scenario.
-        seeds: Most seeds.
-        model: Model of the robots; the scenario's own by default.
+    The reference may be of another block of the scenario. The model is the scenario's own by default.
     """
 
     scenario: str
@@ -238,9 +232,7 @@ def with_iterations(team: str, column: str, groups: dict[str, list[Trial]], refe
     """:func:`first_solutions`, and the mean number of iterations of the successes."""
     rows = []
     for row in first_solutions(team, column, groups, reference):
-        solved = [
-            trial.iterations for trial in groups[row[column]] if is_solved(trial) and trial.iterations is not None
-        ]
+        solved = [trial.iterations for trial in groups[row[column]] if is_solved(trial)]
         rows.append(dict(list(row.items())[:4]) | {"iterations": mean_text(solved, ".1f")} | row)
     return rows
 

@@ -125,6 +125,23 @@ def test_a_control_takes_all_that_it_offers(playground: Playground, connection: 
         until(lambda used=used, value=value: used.value == value)  # type: ignore[misc]
 
 
+def test_a_refusal_takes_no_change_back_that_waits() -> None:
+    playground = Playground(make_problem("circle", num_robots=2), "go-to-goal")  # whose clock does not run
+    try:
+        slider = control(playground, "Drag [1/s]")
+        slider.value = 0.5
+        playground.session.disturb({"drag": 0.5})
+        playground.session._say_refused(1, "another change")
+        playground._panel.update()
+        assert slider.value == 0.5
+        playground.session._obey()
+        playground._panel._status_at = 0.0
+        playground._panel.update()
+        assert slider.value == playground.session.levels["drag"] == 0.5
+    finally:
+        playground.close()
+
+
 @pytest.mark.parametrize("name", ["update_cb", "uuid", "removed", "gui_api", "value_"])
 def test_nothing_but_the_value_of_a_control_is_set(
     playground: Playground, connection: ClientConnection, name: str
