@@ -12,7 +12,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import register_model
 from d4orm_env.engine.choice import rollout
-from d4orm_env.envs.joint_env import register_environments
+from d4orm_env.envs import register_environments
 from d4orm_env.scenarios import list_scenarios, load_map, make_problem, register_scenario
 from d4orm_env.verify import VerificationReport, verify
 

@@ -16,9 +16,9 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from d4orm_env.core.arrays import FloatArray, as_float32, whole_number
+from d4orm_env.core.arrays import MAX_ACTION, FloatArray, as_float32, usable, whole_number
 from d4orm_env.envs.base_env import RENDER_MODES, BaseEnv
-from d4orm_env.envs.inputs import MAX_ACTION, check_options, checked_cycles, usable
+from d4orm_env.envs.inputs import check_options, checked_cycles
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.team_step import AgentInfos, TeamStep, agent_infos
 from d4orm_env.scenarios.problems import ScenarioLike

@@ -188,3 +188,13 @@ def whole_number(value: object, name: str, minimum: int, maximum: int | None = N
     if maximum is not None and value > maximum:
         raise ValueError(f"{name} is {short_repr(int(value))}; it must be at most {maximum}")
     return int(value)
+
+
+MAX_ACTION = 1e15
+"""Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
+action so far outside its space is refused like one that is not finite, and less is clipped to the robot's limits."""
+
+
+def usable(actions: FloatArray) -> BoolArray:
+    """Return where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
+    return np.abs(actions) <= MAX_ACTION

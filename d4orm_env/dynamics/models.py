@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from itertools import chain
+from types import FunctionType
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
 from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D
 from d4orm_env.dynamics.holonomic3d_drag import HOLONOMIC3D_DRAG
 from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
-from d4orm_env.dynamics.source_digest import pieces
+from d4orm_env.dynamics.source_digest import bytecode, pieces, source_text
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.dynamics.unicycle import UNICYCLE
 from d4orm_env.dynamics.unicycle1 import UNICYCLE1
@@ -63,21 +64,21 @@ def names_of_codes(codes: Iterable[int]) -> tuple[str, ...]:
 
 
 @cache
-def model_digest(model: Model) -> str:
+def model_digest(model: Model, content: Callable[[FunctionType], object] = source_text) -> str:
     """SHA-256 over all that a model is, its functions' sources and the constants that they name included."""
     sha = hashlib.sha256(repr([value for name, value in vars(model).items() if name != "functions"]).encode())
     for function in model.functions:
-        sha.update(repr(list(_pieces(function))).encode())
+        sha.update(repr(list(_pieces(function, content))).encode())
     return sha.hexdigest()
 
 
-def _pieces(function: object) -> Iterator[object]:
+def _pieces(function: object, content: Callable[[FunctionType], object]) -> Iterator[object]:
     """:func:`~d4orm_env.dynamics.source_digest.pieces` of a model's function, or of what it was made of."""
     if isinstance(function, RungeKutta):
         return iter(["Runge-Kutta"])
     if isinstance(function, Unwinding):
-        return chain(["unwinding", function.index], _pieces(function.limit_state))
-    return pieces(function)
+        return chain(["unwinding", function.index], _pieces(function.limit_state, content))
+    return pieces(function, content)
 
 
 def register_model(model: Model) -> None:
@@ -166,7 +167,7 @@ def _check_functions(model: Model) -> None:
             raise ValueError(
                 f"model {model.name!r}: {name} returns {result!r}; expected a tuple of {size} finite numbers"
             )
-        floats = [value for value in _pieces(function) if isinstance(value, float)]
+        floats = [value for value in _pieces(function, bytecode) if isinstance(value, float)]
         if floats:
             raise ValueError(
                 f"model {model.name!r}: {name} uses the float {floats[0]:g}, which would change an engine's "

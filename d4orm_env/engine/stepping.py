@@ -28,6 +28,7 @@ from d4orm_env.dynamics.robot_model import (
     Vector,
     runge_kutta,
 )
+from d4orm_env.dynamics.source_digest import bytecode
 from d4orm_env.engine.compiling import ZERO, compiled, inlined
 from d4orm_env.engine.elementary import OPS, cosine, sine
 from d4orm_env.engine.simd import TILE
@@ -161,7 +162,7 @@ def models_of_kernel(models: tuple[str, ...]) -> tuple[str, ...]:
 
 def models_key(names: tuple[str, ...]) -> str:
     """Key in the cache of a kernel for these models: the codes are in the kernel too."""
-    return repr([(name, MODEL_CODES[name], model_digest(MODELS[name])) for name in names])
+    return repr([(name, MODEL_CODES[name], model_digest(MODELS[name], bytecode)) for name in names])
 
 
 def _in_scalar_style(function: ModelFunction) -> ModelFunction:

@@ -8,14 +8,20 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, frozen_array, whole_number
+from d4orm_env.core.arrays import (
+    LARGEST,
+    MAX_ACTION,
+    BoolArray,
+    FloatArray,
+    as_float32,
+    frozen_array,
+    usable,
+    whole_number,
+)
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_states, unwound_states
 from d4orm_env.disturbances.disturbance import check_components, per_component
 
-MAX_ACTION = 1e15
-"""Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
-action so far outside its space is refused like one that is not finite, and less is clipped to the robot's limits."""
 MAX_CYCLES = 10**9
 
 
@@ -50,11 +56,6 @@ def checked_states(
             if team[robot, list(problem.team.robot_models[robot].speed_indices)].any():
                 raise ValueError(f"state of robot_{robot} is moving, but the robot has docked; set its speed to zero")
     return array
-
-
-def usable(actions: FloatArray) -> BoolArray:
-    """Return where actions are finite, and at most :data:`MAX_ACTION` in magnitude."""
-    return np.abs(actions) <= MAX_ACTION
 
 
 def check_options(options: object, known: tuple[str, ...] = (), ignored: tuple[str, ...] = ()) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
+from d4orm_env.envs import ENV_ID, register_environments
 from d4orm_env.envs.base_env import RENDER_MODES, BaseEnv
 from d4orm_env.envs.inputs import check_options, joint_controls
 from d4orm_env.envs.options import EnvOptions
@@ -14,9 +15,7 @@ from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.team_step import Info, TeamStep, agent_infos
 from d4orm_env.scenarios.problems import ScenarioLike
 
-__all__ = ["JointNavigationEnv", "register_environments"]
-
-ENV_ID = "d4orm/Navigation-v0"
+__all__ = ["ENV_ID", "JointNavigationEnv", "register_environments"]
 
 
 class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
@@ -113,13 +112,3 @@ def joint_spaces(setup: EnvSetup) -> tuple[gymnasium.Space[FloatArray], gymnasiu
     low, high = np.where(high > 0, low, low.min(axis=0)), np.where(high > 0, high, high.max(axis=0))
     observations = gymnasium.spaces.Box(np.tile(lowest, count), np.tile(highest, count))
     return observations, gymnasium.spaces.Box(low.ravel(), high.ravel())
-
-
-def register_environments() -> None:
-    """Make the environments known to Gymnasium; a second call changes nothing."""
-    if ENV_ID not in gymnasium.registry:
-        gymnasium.register(
-            id=ENV_ID,
-            entry_point="d4orm_env.envs.joint_env:JointNavigationEnv",
-            vector_entry_point="d4orm_env.envs.vector_env:NavigationVectorEnv",
-        )

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, as_float32, short_repr
+from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, usable
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
-from d4orm_env.envs.inputs import usable
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.driving import ATTRIBUTE, driven_alone
 from d4orm_planners.base.fingerprint import attributes

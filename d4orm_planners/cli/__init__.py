@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 import threading
@@ -12,6 +13,7 @@ from typing import Any
 
 def main() -> None:
     """Run the command line and exit, without a traceback if Ctrl-C comes while it is loaded."""
+    gc.disable()  # until the command's modules are loaded: nothing of them is garbage
     try:
         from d4orm_planners.cli.app import main as run
     except KeyboardInterrupt:

@@ -6,6 +6,7 @@ A command's module is imported when it is run, so that ``--help`` is quick.
 
 from __future__ import annotations
 
+import gc
 import importlib.metadata
 import io
 import signal
@@ -73,7 +74,11 @@ class LazyCommands(Mapping[str, Any]):
         module, _, function = COMMANDS[name][0].partition(":")
         alone = typer.Typer(add_completion=False, rich_markup_mode=None)
         alone.command(name, cls=OnceEach)(getattr(import_module(f"d4orm_planners.cli.{module}"), function))
-        return typer.main.get_command(alone)
+        command = typer.main.get_command(alone)
+        if not gc.isenabled():  # see d4orm_planners.cli.main
+            gc.freeze()
+            gc.enable()
+        return command
 
     def __iter__(self) -> Iterator[str]:
         return iter(COMMANDS)

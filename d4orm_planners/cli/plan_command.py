@@ -15,8 +15,8 @@ from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
 from d4orm_planners.cli.arguments import check_target, output_folder, parse_settings, refuse_options
 from d4orm_planners.cli.common_options import Engine, PictureOptions, ProblemOptions, Settings, TimeLimit, takes
 from d4orm_planners.cli.outputs import print_plan, print_table, require_solved, solve_progress
-from d4orm_planners.cli.warmup import compile_for_planning
 from d4orm_planners.engine.sampling_types import get_sampling_engine
+from d4orm_planners.hybrid.compile_ahead import compile_for_planning
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem

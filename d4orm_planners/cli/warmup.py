@@ -1,14 +1,8 @@
-"""``d4orm warmup``: compile ahead whatever planning, rolling out and the environments need, into the cache on disk.
-
-What samples and rolls out takes as long as what searches for drives. numba compiles one kernel at a time in a process,
-so that two processes do it in half the time.
-"""
+"""``d4orm warmup``: compile ahead whatever planning, rolling out and the environments need, into the cache on disk."""
 
 from __future__ import annotations
 
 import pkgutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -21,32 +15,31 @@ from gymnasium import make_vec
 from numba.core.dispatcher import Dispatcher
 
 from d4orm_env import engine, navigation_v0, paths
-from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.problem import Problem
-from d4orm_env.core.team import Team
 from d4orm_env.disturbances import Dropout, Intruder, StateNoise
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.caching import Kernel, check_can_be_kept, has_to_be_compiled
 from d4orm_env.engine.cpu import world_kernels
-from d4orm_env.engine.threads import Threads
 from d4orm_env.envs.joint_state import JointState
-from d4orm_env.scenarios import make_problem
 from d4orm_planners import d4orm_c2f, mapf, tracking
 from d4orm_planners import engine as sampling_engine
 from d4orm_planners.base.names import PLANNERS
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.cli.common_options import Quiet
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
-from d4orm_planners.engine.cpu_sampling import Sampling
-from d4orm_planners.engine.path_index import PathIndex, check_alone
-from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 from d4orm_planners.engine.score import score_kernel
+from d4orm_planners.hybrid.compile_ahead import (
+    drive_once,
+    find_paths,
+    in_another_process,
+    no_controls,
+    roll_out_once,
+    sample_once,
+    smallest_problem,
+    spread_waves,
+)
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
-from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.tracking.reference_drives import follow_reference, reference_kernel
-from d4orm_planners.tracking.steering import prepare_drives, standing
 from d4orm_planners.tracking.tracker import straight_kernel
 
 
@@ -72,96 +65,6 @@ class WarmupReport:
 TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
 """The smallest teams of common models that have kernels of their own."""
 
-_RULES = SamplingRules(weights=SoftmaxWeights(1.0))
-
-
-def compile_for_planning(
-    models: tuple[str, ...], announce: Callable[[], None] = lambda: None, *, driver: str = "", walls: bool = False
-) -> None:
-    """Compile what planning on the CPU needs, in this process and another, unless it is on disk already.
-
-    Args:
-        models: The team's.
-        announce: Called before it begins, if there is anything to do.
-        driver: The planner's name, if it looks for drives before it samples.
-        walls: Whether it then finds paths among obstacles too.
-    """
-    if not (has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out)):
-        return
-    announce()
-    # Either takes about half of the time. Should the other fail, its kernels are compiled when they are needed.
-    drive, paths = f"drive_once({models!r}, {driver!r})", "; find_paths()" if walls else ""
-    other = _in_another_process(drive + paths if driver else f"average_once({models!r}); roll_out_once({models!r})")
-    if driver:
-        # First what the other process needs too, later.
-        roll_out_once(models)
-    if driver and walls:
-        spread_waves()
-    sample_once((models,))
-    other.wait()
-
-
-def _in_another_process(call: str) -> subprocess.Popen[bytes]:
-    # What ends it, as Ctrl-C, ends this process too, which says so.
-    return subprocess.Popen([sys.executable, "-c", f"from {__name__} import *; {call}"], stderr=subprocess.DEVNULL)
-
-
-def roll_out_once(models: tuple[str, ...]) -> None:
-    """Roll out a plan of the smallest problem of a team of these models on the CPU."""
-    problem = _smallest_problem(models)
-    get_sampling_engine("cpu").rollout(problem, _no_controls(problem))
-
-
-def average_once(models: tuple[str, ...]) -> None:
-    """Weigh and average samples, which a process that scores them needs last."""
-    problem = _smallest_problem(models)
-    rewards = np.zeros((1, 2), np.float32)
-    run = Sampling(SamplingTask(problem, _no_controls(problem)), _RULES, rewards.size, 0, Threads(1))
-    run.moments(_RULES.weights(rewards, np), with_second=False)
-
-
-def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
-    """Look for drives as a planner begins with, in the smallest problem of a team of these models."""
-    planner, problem = make_planner(driver, engine="cpu"), _smallest_problem(models)
-    prepare_drives(problem)
-    _index_paths(problem)
-    # Last, because this rolls out, which another process compiles meanwhile.
-    planner.init(SolveRun(planner, problem, seed=0))
-
-
-def _index_paths(problem: Problem) -> None:
-    """Look for meetings and faults of robots that stay where they are."""
-    states, robots = standing(problem)[0], np.arange(problem.num_robots)
-    index = PathIndex(states[..., : problem.dimension], problem.team.radius, problem.margin)
-    index.pairs()
-    index.move(robots, index.positions)
-    paths = states.swapaxes(0, 1)[:, None]
-    index.count_meetings(robots, paths)
-    check_alone(problem.arrays, robots, paths)
-
-
-def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
-    """Sample once for teams of these models on the CPU."""
-    for models in teams:
-        problem = _smallest_problem(models)
-        task = SamplingTask(problem, _no_controls(problem))
-        get_sampling_engine("cpu").prepare(task, _RULES, np.ones(1, np.float32), 2)
-
-
-def _doorway() -> Problem:
-    return make_problem("doorway", num_robots=4)
-
-
-def spread_waves() -> None:
-    """Find shortest paths among walls."""
-    problem = _doorway()
-    problem.shortest_paths.distance(problem.goal)
-
-
-def find_paths() -> None:
-    """Find paths for a team among walls, and drive along them."""
-    make_planner("mapf", engine="cpu").solve(_doorway(), seed=0)
-
 
 def warm_up() -> WarmupReport:
     """Run everything once on the smallest problems.
@@ -172,7 +75,7 @@ def warm_up() -> WarmupReport:
     # Before anything runs: what the other process compiles is in the cache when it is needed here.
     missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
-    other = _in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()")
+    other = in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()")
     sample_once((TEAMS[0], TEAMS[-1]))
     for models in TEAMS:
         roll_out_once(models)
@@ -201,19 +104,8 @@ def _names(kernels: Iterable[Dispatcher[Callable[..., object]]]) -> tuple[str, .
     return tuple(kernel.py_func.__name__ for kernel in kernels)
 
 
-def _smallest_problem(models: tuple[str, ...]) -> Problem:
-    team = Team(models)
-    start = np.zeros((team.num_robots, team.state_size))
-    start[:, 1] = np.arange(team.num_robots)  # beside each other: trailers are behind
-    return Problem(team, start=start, goal=start[:, : team.dimension] + 1, horizon=5)
-
-
-def _no_controls(problem: Problem) -> FloatArray:
-    return np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
-
-
 def _plan() -> None:
-    problem = _smallest_problem(TEAMS[0])
+    problem = smallest_problem(TEAMS[0])
     # A planner that does not sample has nothing to compile that the others have not.
     for name in (name for name in PLANNERS.own() if issubclass(PLANNERS[name], SamplingPlanner)):
         make_planner(name, engine="cpu", num_samples=32, num_steps=1).solve(problem, max_iterations=1)
@@ -221,23 +113,23 @@ def _plan() -> None:
 
 def _brake(models: tuple[str, ...]) -> None:
     """Bring robots to rest, as D4orm-C2F does after its plans."""
-    problem = _smallest_problem(models)
+    problem = smallest_problem(models)
     at_rest = np.zeros((1, *problem.goal.shape), np.float32)
     follow_reference(problem, problem.start, at_rest, at_rest, 0.0)
 
 
 def _evade() -> None:
     """Keep two robots apart, as D4orm-C2F does in the last resort."""
-    problem = _smallest_problem(TEAMS[0])
+    problem = smallest_problem(TEAMS[0])
     colliding, acting = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
-    joint = JointState(problem.start, problem.goal, _no_controls(problem)[0], ~acting, 0)
+    joint = JointState(problem.start, problem.goal, no_controls(problem)[0], ~acting, 0)
     safe_velocities(problem, joint, colliding, acting, problem.margin)
 
 
 def _step_environments() -> None:
     disturbances = [Dropout(0.5), StateNoise(0.1), Intruder()]
     for arguments in ({}, {"lifelong": True}, {"disturbances": disturbances, "observed_rays": 4}):
-        env = navigation_v0.parallel_env(problem=_smallest_problem(TEAMS[0]), **arguments)
+        env = navigation_v0.parallel_env(problem=smallest_problem(TEAMS[0]), **arguments)
         env.reset(seed=0)
         zero = np.zeros(env.action_space(env.possible_agents[0]).shape, np.float32)
         env.step(dict.fromkeys(env.agents, zero))

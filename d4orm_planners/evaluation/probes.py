@@ -30,7 +30,7 @@ import json, sys, time
 begin = time.perf_counter()
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.cli.warmup import compile_for_planning
+from d4orm_planners.hybrid.compile_ahead import compile_for_planning
 imported = time.perf_counter()
 problem = make_problem("circle", num_robots=int(sys.argv[1]))
 planner = make_planner(engine="cpu")

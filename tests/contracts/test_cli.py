@@ -18,7 +18,8 @@ from d4orm_env import make_problem
 from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
-from d4orm_planners.cli import outputs, warmup
+from d4orm_planners.cli import outputs
+from d4orm_planners.hybrid import compile_ahead
 
 QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
 
@@ -75,7 +76,7 @@ def test_run_takes_settings_of_policies(d4orm, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_what_is_compiled_ahead_fits_robots_of_every_model(model: str) -> None:
-    assert warmup._smallest_problem((model,) * 3).num_robots == 3
+    assert compile_ahead.smallest_problem((model,) * 3).num_robots == 3
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,10 @@ from d4orm_env.engine import cpu
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.paths import lattice, looking, wavefront
 from d4orm_planners.baselines.amswarm.alternation import alternate
-from d4orm_planners.cli.warmup import sample_once
 from d4orm_planners.engine import path_index, weighting
 from d4orm_planners.engine import score as sampling
 from d4orm_planners.engine.weighting import softmax_weights
+from d4orm_planners.hybrid.compile_ahead import sample_once
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.tracking.tracker import straight_kernel
 

@@ -8,12 +8,11 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import LARGEST, SMALLEST
+from d4orm_env.core.arrays import LARGEST, MAX_ACTION, SMALLEST
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MAX_TIME_STEP, MIN_TIME_STEP
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.envs.inputs import MAX_ACTION
 from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import split_state
 from d4orm_env.envs.vector_env import NavigationVectorEnv
