@@ -29,10 +29,16 @@ def denoised() -> Replay:
 
 def compared(title: str, policies: dict[str, str], **options: object) -> Replay:
     """Policies side by side, on the same seed."""
+    return episodes(title, {label: {"policy": policy} for label, policy in policies.items()}, **options)
+
+
+def episodes(title: str, cases: dict[str, dict[str, object]], **options: object) -> Replay:
+    """Episodes side by side, on the same seed, each with a policy or further arguments of the environment."""
     motions = []
-    for label, policy in policies.items():
-        env = navigation_v0.parallel_env(**options)
-        motions.append(run_episode(env, make_policy(policy), seed=0).motion(label))
+    for label, case in cases.items():
+        arguments = {"policy": "d4orm-c2f", **options, **case}
+        policy = make_policy(arguments.pop("policy"))
+        motions.append(run_episode(navigation_v0.parallel_env(**arguments), policy, seed=0).motion(label))
     return Replay(title, tuple(motions))
 
 
@@ -40,15 +46,6 @@ def planned_by(title: str, planners: Sequence[str], scenario: str, **arguments: 
     """The same problem by several planners, each with what it takes."""
     problem = make_problem(scenario, **arguments)
     return Replay(title, tuple(make_planner(name).solve(problem, seed=0).motion(name) for name in planners))
-
-
-def drawn(title: str, labels: dict[str, dict[str, object]], **options: object) -> Replay:
-    """An environment with other arguments each, driven alike."""
-    motions = []
-    for label, others in labels.items():
-        env = navigation_v0.parallel_env(**options, **others)
-        motions.append(run_episode(env, make_policy("d4orm-c2f"), seed=0).motion(label))
-    return Replay(title, tuple(motions))
 
 
 REPLAYS: dict[str, Callable[[], Replay]] = {
@@ -87,14 +84,14 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
     "nodes": lambda: planned_by("Nodes that exchange candidates", ("d-d4orm",), "circle", num_robots=16),
     "amswarm": lambda: planned_by("AMSwarm", ("amswarm", "hybrid"), "amswarm_3"),
     "ipopt": lambda: planned_by("Direct collocation", ("ipopt",), "circle", num_robots=4),
-    "instances": lambda: drawn(
+    "instances": lambda: episodes(
         "Other instances of one scenario",
         {"seed 1": {"seed": 1}, "seed 2": {"seed": 2}, "seed 3": {"seed": 3}},
         scenario="random",
         num_robots=8,
         randomize_instance=False,
     ),
-    "models": lambda: drawn(
+    "models": lambda: episodes(
         "Other robots in one scenario",
         {name: {"model": name} for name in ("holonomic2d", "differential_drive")},
         scenario="circle",

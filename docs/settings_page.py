@@ -27,7 +27,7 @@ NODES = {"planner": 'What every node refines its candidate with: `"d4orm"`, `"d4
 
 
 def described(config: type) -> dict[str, str]:
-    """What each setting means, from the ``Attributes:`` of a configuration class and those it is made of."""
+    """Meanings of settings, from the ``Attributes:`` of a configuration class and those it is made of."""
     meanings: dict[str, str] = {}
     for kind in reversed(config.__mro__):
         _, _, listed = (inspect.getdoc(kind) or "").partition("Attributes:\n")

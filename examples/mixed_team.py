@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from examples.outputs import argument_parser
+from examples.common import argument_parser
 
 from d4orm_env import load_problem, verify
 from d4orm_env.render import save_animation, save_picture

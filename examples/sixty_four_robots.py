@@ -2,14 +2,14 @@
 
     python -m examples.sixty_four_robots --seed 1
 
-D4orm-D begins with everybody driving straight to its goal, and repairs the robots that meet.
+The planner `hybrid` begins with straight drives to the goals, and repairs those of the robots that meet.
 """
 
 from __future__ import annotations
 
 import sys
 
-from examples.outputs import argument_parser, count, save_table
+from examples.common import argument_parser, count, save_table
 
 from d4orm_env import make_problem, verify
 from d4orm_env.render import save_animation, save_picture

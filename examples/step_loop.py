@@ -7,7 +7,7 @@ Copy ``run`` to start an experiment of your own; ``d4orm_planners.run_episode`` 
 
 from __future__ import annotations
 
-from examples.outputs import argument_parser, save_table
+from examples.common import argument_parser, save_table
 
 from d4orm_env import navigation_v0
 from d4orm_planners import make_policy

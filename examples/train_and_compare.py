@@ -8,7 +8,7 @@ was: the training from its last checkpoint, the comparison after its last trial.
 
 from __future__ import annotations
 
-from examples.outputs import argument_parser, count, require, save_table
+from examples.common import argument_parser, count, require, save_table
 
 require("orca", "pyrvo")
 require("rl", "stable_baselines3", "tensorboard")

@@ -84,7 +84,7 @@ def control(playground: Playground, label: str) -> Any:
 def drag(phase: str, index: int | None, end: tuple[float, ...] = (0.3, 0.4, 0), **others: object) -> dict[str, object]:
     """The message of a robot that is dragged."""
     return {
-        "type": "SceneNodeDragMessage", "phase": phase, "name": "/lane_0/robots", "instance_index": index,
+        "type": "SceneNodeDragMessage", "phase": phase, "name": "/viewport_0/robots", "instance_index": index,
         "start_position": [0, 0, 0], "start_screen_pos": [0.5, 0.5], "end_position": end,
         "end_screen_pos": [0.5, 0.5], "button": "left", "modifier": None, "owner": "", **others,
     }  # fmt: skip

@@ -96,7 +96,7 @@ class LazyCommands(Mapping[str, Any]):
 
 
 class Commands(TyperGroup):
-    """The commands. A file that ends too early is not taken for the end of what somebody types, which Typer does."""
+    """The commands. A file that ends too early is an error, which Typer takes for the end of the user's input."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
@@ -145,7 +145,7 @@ def options(
 
 
 class _Pipe(io.FileIO):
-    """A stream that nobody may read to its end, as ``head`` does: what is left is dropped, and the command goes on."""
+    """A stream whose reader may leave, as ``head`` does: what is left is dropped, and the command goes on."""
 
     _ended = False
 

@@ -14,14 +14,7 @@ from d4orm_planners.cli.outputs import print_table
 
 def scenarios() -> None:
     """List the scenarios."""
-
-    def described(name: str) -> str:
-        try:
-            return describe_scenario(name)
-        except ValueError as error:  # an installed package offers it and cannot be imported
-            return str(error)
-
-    print_table("Scenarios", [(name, described(name)) for name in list_scenarios()])
+    print_table("Scenarios", [(name, _or_error(describe_scenario, name)) for name in list_scenarios()])
 
 
 def planners(

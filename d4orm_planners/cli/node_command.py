@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -165,15 +166,10 @@ def _tell(record: IterationRecord) -> None:
     typer.echo(f"iteration {record.iteration} at {record.wall_time:.2f} s: reward {record.reward:.3f}, {outcome}{note}")
 
 
-class _Lines(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        typer.echo(record.getMessage())
-
-
 @contextmanager
 def _events_as_lines() -> Iterator[None]:
     """Print what the nodes log."""
-    logger, handler = logging.getLogger("d4orm_planners.d_d4orm"), _Lines()
+    logger, handler = logging.getLogger("d4orm_planners.d_d4orm"), logging.StreamHandler(sys.stdout)
     level = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

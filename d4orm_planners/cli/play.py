@@ -73,7 +73,7 @@ def _playground(options: PlayOptions) -> Playground:
 
 
 def quieten_viser() -> None:
-    """Keep viser from printing, by rich, a line whenever anybody knocks with another version."""
+    """Keep viser from printing, by rich, a line for every client of another version."""
     rich.get_console().quiet = True
 
 

@@ -23,7 +23,6 @@ from d4orm_planners.cli.outputs import resumable, tell_results
 if TYPE_CHECKING:
     from d4orm_planners.rl.training import TrainingResult
 
-
 IMITATION = "imitation"
 
 

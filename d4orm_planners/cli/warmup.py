@@ -121,9 +121,9 @@ def _brake(models: tuple[str, ...]) -> None:
 def _evade() -> None:
     """Keep two robots apart, as D4orm-C2F does in the last resort."""
     problem = smallest_problem(TEAMS[0])
-    colliding, everybody = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
-    joint = JointState(problem.start, problem.goal, no_controls(problem)[0], ~everybody, 0)
-    safe_velocities(problem, joint, colliding, everybody, problem.margin)
+    colliding, acting = 10 * (problem.start[::-1] - problem.start)[:, :2], np.ones(problem.num_robots, np.bool_)
+    joint = JointState(problem.start, problem.goal, no_controls(problem)[0], ~acting, 0)
+    safe_velocities(problem, joint, colliding, acting, problem.margin)
 
 
 def _step_environments() -> None:

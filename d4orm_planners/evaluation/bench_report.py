@@ -167,7 +167,7 @@ _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
     }),
     "plans": _tabulated("First feasible verified plan, circle of 5 m", {
         "robots": itemgetter("num_robots"),
-        "engine": lambda row: row.get("engine", "cpu"),
+        "engine": itemgetter("engine"),
         "preset": itemgetter("rules"),
         "solved": lambda row: f"{row['solved']} of {row['seeds']}",
         "planning, s": lambda row: seconds(row["seconds"]),

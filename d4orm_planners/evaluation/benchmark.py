@@ -230,9 +230,8 @@ def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int)
     problem = circle(num_robots, "holonomic2d", settings.horizon)
     noise_scale = _d4orm(num_steps=settings.num_steps).noise_scale()
     several, single = (_engine_run(problem, settings, "cpu", None, count) for count in (threads, 1))
-    with_several, with_one = in_turn(
-        lambda: several(noise_scale, True), lambda: single(noise_scale, True), settings.repetitions, settings.time_limit
-    )
+    works = [partial(run, noise_scale, True) for run in (several, single)]
+    with_several, with_one = in_turn(works, settings.repetitions, settings.time_limit)
     return {
         "num_robots": num_robots,
         "threads": threads,

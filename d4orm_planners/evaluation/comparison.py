@@ -155,7 +155,8 @@ def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
         return None
     won = np.array([(one.success, other.success) for one, other in common], float)
     only_first, only_second = int((won[:, 0] > won[:, 1]).sum()), int((won[:, 0] < won[:, 1]).sum())
-    slower = [_time(one) - _time(other) for one, other in common if one.success and other.success]
+    both = [pair for pair in common if all(trial.success for trial in pair)]
+    slower = [(one.travel_time or 0.0) - (other.travel_time or 0.0) for one, other in both]
     trial, lower, upper = first.trials[0], *_bootstrap(won[:, 0] - won[:, 1])
     slower_lower, slower_upper = _bootstrap(slower) if len(slower) > 1 else (None, None)
     return PairedPolicies(
@@ -178,10 +179,6 @@ def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
         slower_lower=slower_lower,
         slower_upper=slower_upper,
     )
-
-
-def _time(trial: Trial) -> float:
-    return trial.travel_time or 0.0
 
 
 def _bootstrap(differences: Sequence[float] | np.ndarray) -> tuple[float, float]:

@@ -42,7 +42,7 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E
 
 
 class Quantity(NamedTuple):
-    """What is varied of a disturbance, in plain words, and its unit."""
+    """Quantity of a disturbance that is varied, in plain words, and its unit."""
 
     name: str
     unit: str

@@ -127,7 +127,7 @@ def measure_functional(settings: BenchmarkSettings) -> Measurement:
         (state, total), keys = carry, jax.random.split(key, 1 + size)
         controls = jax.random.uniform(keys[0], (size, *limits.shape), jnp.float32, minval=-limits, maxval=limits)
         state, transition = jax.vmap(env.step)(keys[1:], state, controls)
-        # What nobody reads would not be computed.
+        # The compiler leaves out results that are not used.
         return (state, total + transition.rewards.sum() + transition.observations.sum()), None
 
     @jax.jit

@@ -171,20 +171,11 @@ def run_shard(
     Shards share nothing, so that they run at the same time on any file system; once all have ended :func:`run_study`
     of the same study and folder puts them together. A shard that was stopped goes on where it was.
 
-    Args:
-        study: The study.
-        out: Folder to write to; made if it does not exist.
-        shard: Number of the part, from 1 on, and how many there are.
-        trial_timeout: As for :func:`evaluate`, like all others.
-        workers: Processes.
-        progress: Called as the trials are done.
+    Args and errors are those of :func:`run_study`, but for ``shard``: the number of the part, from 1 on, and how many
+    there are. An unknown part is a ``ValueError``.
 
     Returns:
         The file.
-
-    Raises:
-        ValueError: If there is no such part, or as :func:`evaluate`.
-        OSError: If the folder or the file cannot be written to, or workers do not start.
     """
     count = whole_number(shard[1], "number of shards", 1)
     index = whole_number(shard[0], "shard", 1, count)

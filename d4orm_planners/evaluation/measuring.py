@@ -26,24 +26,12 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """The spread of some values.
-
-        Raises:
-            ValueError: If there are none.
-        """
-        if not len(values):
-            raise ValueError("there are no measurements to summarise; measure at least once")
+        """The spread of some values, at least one."""
         smallest, lower, median, upper, largest = (float(v) for v in np.percentile(values, [0, 25, 50, 75, 100]))
         return cls(median, lower, upper, smallest, largest, len(values))
 
     def times(self, factor: float) -> Spread:
-        """The same measurements in another unit.
-
-        Raises:
-            ValueError: If the factor is not positive, which would turn the order around.
-        """
-        if not factor > 0:
-            raise ValueError(f"factor is {factor:g}; it must be positive")
+        """The same measurements in another unit; the factor is positive."""
         return replace(self, **{name: value * factor for name, value in vars(self).items() if name != "count"})
 
 
@@ -55,18 +43,11 @@ def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> 
         repetitions: Calls at most, at least one.
         time_limit: No further call begins once the counted ones have taken this long [s].
     """
-    return Spread.of(_repeated((work,), repetitions, time_limit)[0])
+    return Spread.of(in_turn((work,), repetitions, time_limit)[0])
 
 
-def in_turn(
-    first: Callable[[], object], second: Callable[[], object], repetitions: int, time_limit: float
-) -> tuple[list[float], list[float]]:
-    """Seconds that each of two things takes, done in turn after once that does not count; see :func:`measure`."""
-    one, other = _repeated((first, second), repetitions, time_limit)
-    return one, other
-
-
-def _repeated(works: Sequence[Callable[[], object]], repetitions: int, time_limit: float) -> list[list[float]]:
+def in_turn(works: Sequence[Callable[[], object]], repetitions: int, time_limit: float) -> list[list[float]]:
+    """Seconds that each of several functions takes, called in turn; see :func:`measure`."""
     for work in works:
         work()
     seconds: list[list[float]] = [[] for _ in works]

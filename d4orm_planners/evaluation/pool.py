@@ -157,11 +157,7 @@ def _block_interrupts() -> None:
 
 
 class ProcessWorker:
-    """A process of this machine, begun with its first job. It ends when this one dies.
-
-    Args:
-        threads: That its kernels run on.
-    """
+    """A process of this machine, begun with its first job, whose kernels run on ``threads``; it ends with this one."""
 
     def __init__(self, threads: int = 1) -> None:
         self._threads = threads

@@ -152,14 +152,14 @@ def _driven(problem: Problem, controller: Controller, seed: int) -> list[tuple[f
         steps.append((time.perf_counter() - begin, setpoint.held))
         states = np.hstack([setpoint.position, setpoint.velocity]).astype(np.float32)
         if len(steps) % round(1 / problem.dt) == 0:
-            reach = 1.5 * problem.team.largest_radius
-            states[:, : problem.dimension] += random.uniform(-reach, reach, problem.goal.shape)
+            shift = 1.5 * problem.team.largest_radius
+            states[:, : problem.dimension] += random.uniform(-shift, shift, problem.goal.shape)
         time.sleep(max(start + now + problem.dt - time.perf_counter(), 0.0))
     return steps
 
 
 def boxed_problem(num_boxes: int, where: Where) -> Problem:
-    """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from everybody."""
+    """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from all robots."""
     problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=100)
     random = np.random.default_rng(0)
     if where == "near":
@@ -178,15 +178,14 @@ def measure_obstacles(
     open_world = problem.replace(world=World())
     controls = np.zeros((problem.horizon, NUM_ROBOTS, problem.control_size), np.float32)
     controls[:40] = 0.5 * (problem.goal - problem.start[:, :2]) / np.linalg.norm(problem.goal, axis=1)[:, None]
-    among, alone = in_turn(lambda: iterate(problem), lambda: iterate(open_world), repetitions, time_limit)
-    judging, _ = in_turn(lambda: verify(problem, controls), lambda: None, repetitions, time_limit)
+    among, alone = in_turn([partial(iterate, one) for one in (problem, open_world)], repetitions, time_limit)
     return {
         "obstacles": num_boxes,
         "where": where,
         "num_robots": NUM_ROBOTS,
         "iteration": Spread.of(among),
         "ratio": Spread.of(np.divide(among, alone).tolist()),
-        "verify": Spread.of(judging),
+        "verify": measure(lambda: verify(problem, controls), repetitions, time_limit),
     }
 
 

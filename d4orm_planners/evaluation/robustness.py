@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence, Sized
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -18,7 +18,6 @@ from d4orm_planners.evaluation.tables import markdown, panels, table, target, wr
 
 THRESHOLD = 0.9
 """Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
-
 
 _PAIRS = """\
 Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
@@ -79,13 +78,15 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     """
     _check_given(groups, TrialGroup, "run_study() of a study with disturbances")
     rates = success_rates(groups)
-    places = _panels([rate for rate in rates if rate.disturbance])
-    if not places:
+    groups_by_title = _panels([rate for rate in rates if rate.disturbance])
+    if not groups_by_title:
         raise ValueError("no group of trials has a disturbance; run a study with disturbances")
-    pairs = compare_pairs(groups)
+    pairs, count = compare_pairs(groups), len(groups_by_title)
+    # One for each scenario, team and level of noise.
+    suffixes = [f"-{number}" for number in range(1, count + 1)] if count > 1 else [""]
     captions = [
         f"- `disturbances{suffix}`, `disturbance_map{suffix}`: {markdown_text(title)}"
-        for suffix, title in zip(_suffixes(places), places)
+        for suffix, title in zip(suffixes, groups_by_title)
     ]
     blocks = [tolerance_tables(rates), "## Figures", _FIGURES, "\n".join(captions), *_pair_tables(rates, pairs)]
     paths = [Path(folder, name) for name in ("disturbances.md", "tolerance.csv")]
@@ -95,29 +96,24 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
     if pairs:
         paths.append(Path(folder, "pairs.csv"))
         write_csv(paths[-1], [vars(pair) for pair in pairs])
-    for suffix, (_, group) in zip(_suffixes(places), places.items()):
+    for suffix, group in zip(suffixes, groups_by_title.values()):
         paths += write_figure(Path(folder), f"disturbances{suffix}", draw_lines(group))
         paths += write_figure(Path(folder), f"disturbance_map{suffix}", draw_map(group))
     return paths
-
-
-def _suffixes(places: Sized) -> list[str]:
-    """Ends of the names of figures, one for each scenario, team and level of noise."""
-    return [f"-{number}" for number in range(1, len(places) + 1)] if len(places) > 1 else [""]
 
 
 def tolerance_tables(rates: Sequence[SuccessRate]) -> str:
     """A table per scenario, team and level of noise: for every policy its undisturbed success and what it tolerates."""
     blocks = [f"## Level at which success falls below {THRESHOLD:.0%} of the undisturbed"]
     for title, group in _panels([rate for rate in rates if rate.disturbance]).items():
-        stood = tolerances(group)
-        names = list(dict.fromkeys(one.disturbance for one in stood))
-        cells = {(one.label, one.disturbance): one.text for one in stood}
-        undisturbed = {one.label: one.undisturbed for one in stood}
+        tolerated = tolerances(group)
+        names = list(dict.fromkeys(one.disturbance for one in tolerated))
+        cells = {(one.label, one.disturbance): one.text for one in tolerated}
+        undisturbed = {one.label: one.undisturbed for one in tolerated}
         if None in undisturbed.values():
             blocks.append(_NOT_RUN)
         # Policies are few and disturbances many.
-        labels, noise = list(undisturbed), stood[0].control_noise_std
+        labels, noise = list(undisturbed), tolerated[0].control_noise_std
         first = f"success with noise {noise:g} alone" if noise else "undisturbed success"
         rows = [(first, *("not run" if rate is None else f"{rate:.0%}" for rate in undisturbed.values()))]
         rows += [(quantity_of(name).text, *(cells.get((label, name), "-") for label in labels)) for name in names]
@@ -132,8 +128,8 @@ def _pair_tables(rates: Sequence[SuccessRate], pairs: Sequence[PairedPolicies]) 
     titles = {
         (one.scenario, one.num_robots, one.model): title for title, group in panels(rates).items() for one in group
     }
-    for place, title in titles.items():
-        rows = [_pair_cells(pair) for pair in pairs if (pair.scenario, pair.num_robots, pair.model) == place]
+    for team, title in titles.items():
+        rows = [_pair_cells(pair) for pair in pairs if (pair.scenario, pair.num_robots, pair.model) == team]
         if rows:
             blocks.append(table(title, header, rows))
     return blocks
@@ -168,7 +164,7 @@ def _panels(rates: Sequence[SuccessRate]) -> dict[str, list[SuccessRate]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """At which level of a disturbance the success of a policy falls below a share of what it is undisturbed.
+    """Level of a disturbance at which the success of a policy falls below a share of what it is undisturbed.
 
     The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
 
@@ -199,6 +195,10 @@ class Tolerance:
         return "-" if self.passes is None else f"over {self.passes:g}"
 
 
+_LINE = ("label", "scenario", "num_robots", "model", "control_noise_std", "disturbance")
+"""Attributes that the rates of a line have in common."""
+
+
 def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
     """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
 
@@ -210,7 +210,7 @@ def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[T
     lines: dict[tuple[object, ...], list[SuccessRate]] = {}
     undisturbed: dict[tuple[object, ...], float] = {}
     for rate in rates:
-        where = (rate.label, rate.scenario, rate.num_robots, rate.model, rate.control_noise_std)
+        where = tuple(getattr(rate, name) for name in _LINE[:-1])
         if rate.undisturbed:
             undisturbed[where] = rate.rate
         if rate.disturbance:
@@ -229,19 +229,14 @@ def _from_harmless(line: Sequence[SuccessRate]) -> Sequence[SuccessRate]:
 
 
 def _tolerance(line: Sequence[SuccessRate], undisturbed: float | None, share: float) -> Tolerance:
-    first, threshold = line[0], None if undisturbed is None else share * undisturbed
+    threshold = None if undisturbed is None else share * undisturbed
     passes = fails = None
     if threshold:
         levels = [rate.level for rate in line]
-        failing = next((place for place, rate in enumerate(line) if rate.rate < threshold), len(line))
+        failing = next((index for index, rate in enumerate(line) if rate.rate < threshold), len(line))
         passes, fails = ([None, *levels][failing], [*levels, None][failing])
     return Tolerance(
-        label=first.label,
-        scenario=first.scenario,
-        num_robots=first.num_robots,
-        model=first.model,
-        control_noise_std=first.control_noise_std,
-        disturbance=first.disturbance,
+        **{name: getattr(line[0], name) for name in _LINE},
         passes=passes,
         fails=fails,
         undisturbed=undisturbed,

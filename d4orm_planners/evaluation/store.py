@@ -81,7 +81,7 @@ class Trial:
         travel_time: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive.
         makespan: Latest arrival time [s], likewise.
         stretch: Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; ``None`` if
-            nobody arrived, and in rows that older versions wrote.
+            no robot arrived, and in rows that older versions wrote.
         reward: Mean over steps and robots.
         mean_squared_jerk: See :func:`d4orm_env.core.trajectory.mean_squared_jerk` [m^2/s^6].
         steps: Steps of the episode.
@@ -152,6 +152,13 @@ class Trial:
         return [BestSoFar(*point) for point in json.loads(self.history)]
 
     @property
+    def decision_time(self) -> float | None:
+        """Mean seconds of choosing the actions of one step, after the preparation; ``None`` where it is not known."""
+        if self.wall_time is None or self.preparation is None or not self.steps:
+            return None
+        return (self.wall_time - self.preparation) / self.steps
+
+    @property
     def denoising_steps(self) -> int | None:
         """Denoising steps until the last better plan; ``None`` where they are not known."""
         return self.progress[-1].steps if self.progress else None
@@ -196,7 +203,7 @@ class TrialStore(SqliteFile):
     Args:
         path: The file.
         read_only: Leave it as it is, which must be there then; its folder need not be writable.
-        alone: Nobody else opens it, so that no locks are taken, which some network file systems do not have.
+        alone: No other process opens it, so that no locks are taken, which some network file systems do not have.
 
     Raises:
         ValueError: If the file is something else, or of another version.

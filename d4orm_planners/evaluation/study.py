@@ -263,10 +263,9 @@ def _varied(name: str, levels: Levels) -> list[Varied]:
     if all(isinstance(one, Disturbance | Sequence) and not isinstance(one, str) and _holds(one) for one in listed):
         chosen = [checked_disturbances(one) for one in listed]
         return [(name, one, level) for one, level in zip(chosen, _levels_of(chosen))]
-    made = [(level, disturbance_at(name, level)) for level in listed]
     return [
-        (name, (one,), float(level if isinstance(level, int | float) else place))
-        for place, (level, one) in enumerate(made)
+        (name, (disturbance_at(name, level),), float(level if isinstance(level, int | float) else index))
+        for index, level in enumerate(listed)
     ]
 
 
@@ -276,10 +275,10 @@ def _holds(given: object) -> bool:
 
 
 def _levels_of(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
-    """The levels of disturbances that were given themselves: the number in which they differ, or their places."""
+    """The levels of disturbances that were given themselves: the number in which they differ, or their indices."""
     if all(len(one) == 1 and type(one[0]) is type(chosen[0][0]) for one in chosen):
         values = [attributes_of(one[0]) for one in chosen]
         differing = [name for name in values[0] if len({repr(each[name]) for each in values}) > 1]
         if len(differing) == 1 and all(isinstance(each[differing[0]], int | float) for each in values):
             return [float(each[differing[0]]) for each in values]  # type: ignore[arg-type] # a number, as was asked
-    return [float(place) for place in range(len(chosen))]
+    return [float(index) for index in range(len(chosen))]

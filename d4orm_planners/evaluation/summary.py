@@ -203,11 +203,7 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
     shares = [trial.denoising_share for trial in trials if trial.denoising_share is not None]
     timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
     compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
-    choosing = [
-        (trial.wall_time - trial.preparation) / trial.steps
-        for trial in trials
-        if trial.wall_time is not None and trial.preparation is not None and trial.steps
-    ]
+    choosing = [trial.decision_time for trial in trials if trial.decision_time is not None]
     return SuccessRate(
         **vars(Compared.of(trials, len(successes), trials[0].label if label is None else label)),
         verified=sum(trial.verified is True for trial in trials),

@@ -15,7 +15,7 @@ import numpy as np
 
 from d4orm_env import verify
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.errors import UnknownKeywordError, describe
+from d4orm_env.core.errors import describe
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import source_digest
 from d4orm_env.disturbances.disturbance import AnyDisturbance
@@ -41,7 +41,7 @@ class Condition:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         disturbances: Further disturbances.
         name: Varied quantity, such as ``"push.speed"``; empty for nothing.
-        level: Its level; of disturbances that differ in more than a number, their place among the levels.
+        level: Its level; of disturbances that differ in more than a number, their index among the levels.
         physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
     """
 
@@ -59,13 +59,7 @@ class Condition:
             ValueError: If an attribute of a user's has no form in JSON, or its source cannot be read.
         """
         listed = [[name_of(one), _attributes(one)] for one in self.disturbances if not one.negligible]
-        try:
-            return json.dumps(listed, sort_keys=True)
-        except TypeError as error:
-            raise ValueError(
-                f"disturbance {self.name!r} has an attribute that cannot be stored ({error}); give numbers, text, "
-                "truth values, lists and mappings of them"
-            ) from None
+        return _stored(listed, f"disturbance {self.name!r} has an attribute")
 
     @property
     def replayable(self) -> bool:
@@ -103,16 +97,9 @@ class Configuration:
         Raises:
             ValueError: If a setting has no form in JSON, or a source cannot be read.
         """
-        try:
-            observed = {"observation": dict(self.observation)} if self.observation else {}
-            return json.dumps(policy_settings(self.source, **self.settings) | observed, sort_keys=True)
-        except TypeError as error:
-            if isinstance(error, UnknownKeywordError):
-                raise
-            raise ValueError(
-                f"policy {self.label!r} has a setting that cannot be stored ({error}); give numbers, text, truth "
-                "values, lists and mappings of them"
-            ) from None
+        observed = {"observation": dict(self.observation)} if self.observation else {}
+        settings = policy_settings(self.source, **self.settings)
+        return _stored(settings | observed, f"policy {self.label!r} has a setting")
 
     @cached_property
     def planned(self) -> bool:
@@ -212,7 +199,7 @@ def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, 
 
 def _verdict(problem: Problem, episode: Episode) -> dict[str, object]:
     """Verify the executed controls."""
-    # It looks at the whole horizon; an episode ends earlier when everyone has docked.
+    # It looks at the whole horizon; an episode ends earlier when all have arrived.
     executed = episode.trajectory.controls
     rest = np.zeros((problem.horizon - len(executed), *executed.shape[1:]), executed.dtype)
     report = verify(problem, np.concatenate([executed, rest]))
@@ -269,6 +256,16 @@ def _origin() -> tuple[str, str]:
     """Versions of the libraries with the commit of this package, and the machine, as JSON."""
     source = {"commit": found} if (found := commit()) else {}
     return json.dumps({**versions(LIBRARIES), **source}, sort_keys=True), json.dumps(describe_machine(), sort_keys=True)
+
+
+def _stored(content: object, owner: str) -> str:
+    """JSON with sorted keys; the error of what has no such form begins with its owner."""
+    try:
+        return json.dumps(content, sort_keys=True)
+    except TypeError as error:
+        raise ValueError(
+            f"{owner} that cannot be stored ({error}); give numbers, text, truth values, lists and mappings of them"
+        ) from None
 
 
 def _attributes(one: AnyDisturbance) -> dict[str, object]:

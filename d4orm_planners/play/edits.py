@@ -90,11 +90,11 @@ def remove_robot(problem: Problem) -> Problem:
 
 def add_obstacle(problem: Problem, kind: str, random: np.random.Generator) -> Problem:
     """One more obstacle, a ``"disc"`` or a ``"box"`` of 0.4 m, where there is room."""
-    world, reach = problem.world, 0.3
+    world, clearance = problem.world, 0.3
     if world.num_obstacles >= MOST_OBSTACLES:
         raise ValueError(f"there are {world.num_obstacles} obstacles, which is the most here; remove one first")
     taken = np.vstack([problem.start[:, : problem.dimension], problem.goal])
-    position = _free_position(problem, taken, random, reach + float(np.max(problem.team.radius)))
+    position = _free_position(problem, taken, random, clearance + float(np.max(problem.team.radius)))
     if kind == "box":
         return _with_world(problem, boxes=[*world.boxes, [*(position - 0.2), *(position + 0.2)]])
     name = "circles" if problem.dimension == 2 else "spheres"
@@ -130,11 +130,11 @@ def followed(before: Problem, after: Problem, other: Problem, who: str) -> Probl
     """Another team's scene changed as this one was: what was moved, added or removed is, all else stays."""
     kept = min(before.num_robots, after.num_robots)
     positions, moved = [], []
-    for here, there, elsewhere in zip(_positions(before), _positions(after), _positions(other)):
-        same = (there[:kept] == here[:kept]).all(axis=1)
-        there[:kept][same] = elsewhere[:kept][same]
-        positions.append(there)
-        moved.append([*np.flatnonzero(~same), *range(kept, len(there))])
+    for former, new, others in zip(_positions(before), _positions(after), _positions(other)):
+        same = (new[:kept] == former[:kept]).all(axis=1)
+        new[:kept][same] = others[:kept][same]
+        positions.append(new)
+        moved.append([*np.flatnonzero(~same), *range(kept, len(new))])
     changed = after.with_state(*positions)
     try:
         for what, rows, robots in zip(("the robot", "the goal"), positions, moved):
@@ -168,10 +168,10 @@ def _check_world(problem: Problem) -> None:
 
 
 def _check_position(problem: Problem, what: str, robot: int, positions: FloatArray) -> None:
-    """Refuse the place of a robot among ``positions`` ``(K, d)`` if it is none, or touches something."""
+    """Refuse the position of a robot, a row of ``positions`` ``(K, d)``, if it is not finite or touches something."""
     radius = np.asarray(problem.team.radius, np.float64)
     if not np.isfinite(positions[robot]).all():
-        raise ValueError(f"{what} of robot_{robot} is not at a place; drag it again")
+        raise ValueError(f"{what} of robot_{robot} is at no position; drag it again")
     check_resolution(problem.team, positions, problem.dt, problem.goal_radius)
     if problem.world.clearance(positions[robot]) <= radius[robot]:
         raise ValueError(f"{what} of robot_{robot} would touch an obstacle or the bounds; it stays where it was")
@@ -184,17 +184,19 @@ def _check_position(problem: Problem, what: str, robot: int, positions: FloatArr
 
 
 def _free_position(
-    problem: Problem, taken: ArrayLike, random: np.random.Generator, reach: float | None = None
+    problem: Problem, taken: ArrayLike, random: np.random.Generator, clearance: float | None = None
 ) -> FloatArray:
     """``(d,)`` a random position with room for a robot of the first one's size among ``taken`` ``(N, d or more)``."""
     others = np.asarray(taken, np.float32)[:, : problem.dimension]
-    reach = float(problem.team.radius[0]) + problem.margin if reach is None else reach
-    room = reach + float(np.max(problem.team.radius))
+    clearance = float(problem.team.radius[0]) + problem.margin if clearance is None else clearance
+    distance = clearance + float(np.max(problem.team.radius))
     low, high = goal_region(problem)
     for _ in range(_ATTEMPTS):
         position = random.uniform(low, high).astype(np.float32)
-        clear = problem.world.clearance(position) > reach
-        if clear and (np.linalg.norm(others - position, axis=1) > room).all():
+        if (
+            problem.world.clearance(position) > clearance
+            and (np.linalg.norm(others - position, axis=1) > distance).all()
+        ):
             return position
     raise ValueError("there is no room for one more; remove something first")
 
@@ -252,6 +254,11 @@ class CommandQueue:
     def closed(self) -> bool:
         """True if it was closed."""
         return self._closed
+
+    @property
+    def empty(self) -> bool:
+        """True if no command waits."""
+        return not self._waiting
 
 
 def queued(

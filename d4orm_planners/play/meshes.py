@@ -171,7 +171,7 @@ def body_groups(problem: Problem) -> list[BodyGroup]:
     planar = problem.team.shapes and problem.dimension == 2
     for number, body in enumerate(problem.team.bodies):
         kinds.setdefault(body.footprint if planar else None, []).append(number)
-    return [_group(problem, f"robots_{position}", *kind) for position, kind in enumerate(kinds.items())]
+    return [_group(problem, f"robots_{index}", *kind) for index, kind in enumerate(kinds.items())]
 
 
 def _group(problem: Problem, name: str, footprint: Footprint | None, numbers: list[int]) -> BodyGroup:

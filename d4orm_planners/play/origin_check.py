@@ -1,28 +1,35 @@
-"""Access to the playground: a browser that shows its own page, and nobody else's; and requests it may make.
+"""Access to the playground: the check that requests are its own page's, and of the messages that this may send.
 
-Any page in a browser may open a web socket to a port of this machine. The browser then tells on whose behalf it does
-(``Origin``) and by which name it came (``Host``): a foreign page has another origin, and one that has had its own name
-point to this machine (DNS rebinding) has a foreign host.
+Any page in a browser may ask a port of this machine. The browser then tells on whose behalf it does (``Origin``) and by
+which name it came (``Host``): a foreign page has another origin, and one that has had its own name point to this
+machine (DNS rebinding) has a foreign host. A page for other machines has a token in its address instead, which the
+first request brings and gets back as a cookie, and all others show.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-from collections.abc import Callable
+import re
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
+from http import HTTPStatus
 from typing import Annotated, Any, Literal
-from urllib.parse import urlsplit
+from unittest.mock import patch
+from urllib.parse import parse_qs
 
 import msgspec
 import viser
+import websockets.asyncio.server
 from msgspec import Meta
 from viser.infra import ClientId, WebsockClientConnection
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+from websockets.http11 import Request, Response
 
-from d4orm_planners.play.proxy import GATE_HEADER
+from d4orm_env.core.arrays import short_repr
 
 LARGEST_UPLOAD = 2_000_000
 """Bytes of a file."""
@@ -38,7 +45,7 @@ Name = Annotated[str, Meta(max_length=255)]
 
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_POLICY_VIOLATION = 1008
+_LOCAL_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?", re.IGNORECASE)
 _LARGEST_MESSAGE = LARGEST_UPLOAD + 10_000
 _MESSAGE_PERIOD = 0.002
 """Seconds from one message of a page to its next at least; a hand makes one every 16 ms."""
@@ -102,16 +109,42 @@ _DECODER = msgspec.msgpack.Decoder(_Camera | _Drag | _Control | _Upload | _Part)
 
 
 class MessageValidator:
-    """Tells messages that a page may send from all others."""
+    """Lets those messages of a page come through that ask for what it offers.
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._gui, self._scene = server.gui, server.scene
+    Args:
+        server: The page.
+        refuse: Called with the reason when a page asks for anything else.
+    """
+
+    def __init__(self, server: viser.ViserServer, refuse: Callable[[str], None]) -> None:
+        self._gui, self._scene, self._refuse = server.gui, server.scene, refuse
         self._checks: dict[type, Callable[[int, Any], None]] = {
             _Drag: self._check_drag,
             _Control: self._check_control,
             _Upload: self._check_upload,
             _Part: self._check_part,
         }
+        self._sockets = server._websock_server
+        self._sockets.on_client_connect(self._attach)
+        self._sockets.disconnect_all_clients()  # clients that were quicker than this
+
+    async def _attach(self, client: WebsockClientConnection) -> None:
+        connection = self._sockets._live_connections[client.client_id]
+        connection.recv = partial(self._receive, connection, client.client_id)  # type: ignore[method-assign, assignment]
+
+    async def _receive(self, connection: ServerConnection, client: int) -> bytes:
+        """The next message that may come through; a connection with anything else is closed."""
+        while True:
+            await asyncio.sleep(_MESSAGE_PERIOD)
+            data = await ServerConnection.recv(connection)
+            try:
+                return self.checked(client, data)
+            except msgspec.ValidationError:
+                pass  # a message that nothing listens to
+            except (msgspec.DecodeError, RecursionError):
+                await connection.close(CloseCode.POLICY_VIOLATION, "only the page of d4orm play may send messages")
+            except ValueError as error:
+                self._refuse(str(error))
 
     def checked(self, client: int, data: str | bytes) -> bytes:
         """Return a client's message, encoded anew.
@@ -139,7 +172,7 @@ class MessageValidator:
             case _:
                 raise ValueError("a page has no such control; load it anew")
         if not offered:
-            raise ValueError(f"{control.label} cannot be {_short(value)}; it takes {said}")
+            raise ValueError(f"{control.label} cannot be {short_repr(value)}; it takes {said}")
 
     def _check_drag(self, client: int, message: _Drag) -> None:
         # One that was taken away meanwhile is dragged to the end, and the session says that it is gone.
@@ -176,75 +209,61 @@ def _is_on_scale(value: object, control: Any) -> bool:
     return value == control.max or abs(steps - round(steps)) <= _ROUNDING
 
 
-def _short(value: object) -> str:
-    text = ascii(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
 class OriginCheck:
-    """Turns away web sockets of a page before anything that they have sent is looked at.
-
-    Of what the others send, only what the page offers comes through.
+    """Answers requests that do not come from a page of the playground, before anything else looks at them.
 
     Args:
-        server: The page.
-        token: That of the gate before it; ``None`` for a page without a gate, which is for browsers on this machine.
-        refuse: Called with the reason when a page asks for what it does not offer.
+        token: Secret in the page's address; ``None`` for a page that is for browsers on this machine.
+        cookie: Name of the cookie that keeps it.
     """
 
-    def __init__(self, server: viser.ViserServer, token: str | None, refuse: Callable[[str], None]) -> None:
-        self._token, self._refuse = token, refuse
-        self._validator = MessageValidator(server)
-        self._sockets = server._websock_server
-        self._sockets.on_client_connect(self._admit_or_close)
-        self._sockets.disconnect_all_clients()  # whoever was quicker than this
+    def __init__(self, token: str | None, cookie: str) -> None:
+        self._token, self._cookie = token, cookie
 
-    async def _admit_or_close(self, client: WebsockClientConnection) -> None:
-        connection = self._sockets._live_connections[client.client_id]
-        assert connection.request is not None
-        if not self._admits(connection.request.headers):
-            await turn_away(connection)
-            return
-        connection.protocol.max_message_size = connection.protocol.max_fragment_size = _LARGEST_MESSAGE
-        connection.recv = partial(self._receive, connection, client.client_id)  # type: ignore[method-assign, assignment]
+    def answer(self, request: Request) -> Response | None:
+        """Return the answer to a request; ``None`` if it may pass."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        passes = len(hosts) == 1 and origins in ([], [f"http://{hosts[0]}"])
+        if self._token is None:
+            passes = passes and _LOCAL_HOST.fullmatch(hosts[0]) is not None
+        elif _is_same(parse_qs(request.path.partition("?")[2]).get("token", [""])[0], self._token):
+            cookie = f"{self._cookie}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+            return _response(HTTPStatus.SEE_OTHER, {"Location": "/", "Set-Cookie": cookie})
+        else:
+            # Other pages of this host may have cookies of any form.
+            parts = ";".join(request.headers.get_all("Cookie")).split(";")
+            cookies = dict(part.strip().partition("=")[::2] for part in parts)
+            passes = passes and _is_same(cookies.get(self._cookie, ""), self._token)
+        if passes:
+            return None
+        return _response(HTTPStatus.FORBIDDEN, {}, b"open the address that d4orm play has printed\n")
 
-    async def _receive(self, connection: ServerConnection, client: int) -> bytes:
-        """The next message that may come through; a connection with anything else is closed."""
-        while True:
-            await asyncio.sleep(_MESSAGE_PERIOD)
-            data = await ServerConnection.recv(connection)
-            try:
-                return self._validator.checked(client, data)
-            except msgspec.ValidationError:
-                pass  # a message that nobody listens to
-            except (msgspec.DecodeError, RecursionError):
-                await turn_away(connection)
-            except ValueError as error:
-                self._refuse(str(error))
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Have a server of web sockets that is started meanwhile ask first; viser starts one and has no option for it.
 
-    def _admits(self, headers: Headers) -> bool:
-        return comes_from_here(headers) if self._token is None else headers.get_all(GATE_HEADER) == [self._token]
+        Raises:
+            RuntimeError: If none was started, so that nothing would be checked.
+        """
+        serve, started = websockets.asyncio.server.serve, False
 
+        def checked_serve(*given: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+            nonlocal started
+            started = True
+            options["max_size"] = _LARGEST_MESSAGE
+            first = lambda connection, request: self.answer(request) or process_request(connection, request)  # noqa: E731
+            return serve(*given, process_request=first, **options)
 
-def comes_from_here(headers: Headers) -> bool:
-    """Check whether a request was made by a page of this machine's own, or by no page at all."""
-    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-    if len(hosts) != 1 or _hostname(hosts[0]) not in LOOPBACK:
-        return False
-    return origins in ([], [f"http://{hosts[0]}"])
-
-
-async def turn_away(connection: ServerConnection) -> None:
-    """Close a connection, and leave nothing to read of what it has sent."""
-    await connection.close(_POLICY_VIOLATION, "only the page that d4orm play shows may ask for anything")
-    with contextlib.suppress(ConnectionClosed):
-        while True:
-            await ServerConnection.recv(connection)
+        with patch.object(websockets.asyncio.server, "serve", checked_serve):
+            yield
+        if not started:
+            raise RuntimeError(f"viser {viser.__version__} starts no server that can be guarded; install viser 1.1")
 
 
-def _hostname(host: str) -> str | None:
-    """The name in ``name:port``."""
-    try:
-        return urlsplit(f"//{host}").hostname
-    except ValueError:
-        return None
+def _is_same(given: str, secret: str) -> bool:
+    return secrets.compare_digest(given.encode(errors="replace"), secret.encode())
+
+
+def _response(status: HTTPStatus, headers: dict[str, str], body: bytes = b"") -> Response:
+    common = {"Content-Type": "text/plain", "Content-Length": str(len(body)), "Connection": "close"}
+    return Response(status, status.phrase, Headers(common | headers), body)

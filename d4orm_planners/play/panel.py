@@ -23,7 +23,7 @@ from d4orm_planners.play import edits
 from d4orm_planners.play.origin_check import LARGEST_UPLOAD
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.sliders import Dials
+from d4orm_planners.play.sliders import DisturbanceSliders
 
 if TYPE_CHECKING:
     from d4orm_planners.play.playground import View
@@ -61,13 +61,14 @@ class Panel:
         with self._gui.add_folder("Who drives", expand_by_default=False):
             self._add_policies()
         with self._gui.add_folder("What goes wrong", expand_by_default=False):
-            self._dials = Dials(server.gui, session)
+            self._sliders = DisturbanceSliders(server.gui, session)
         with self._gui.add_folder("Change the scene"):
             self._add_edits()
         with self._gui.add_folder("Another scene", expand_by_default=False):
             self._add_scenes()
         with self._gui.add_folder("Show", expand_by_default=False):
-            self._add_views()
+            for name in view.shown:
+                self._add_choice(name)
         with self._gui.add_folder("Files", expand_by_default=False):
             self._add_files()
 
@@ -82,10 +83,12 @@ class Panel:
         if text != self._text:
             self._text = self._status.content = text
         refused = frames[0].status.refused
-        if refused != self._refused:  # the controls say what is
+        # The controls then say what is, unless a change waits that they show already.
+        if refused != self._refused and not self._session.busy:
             self._refused = refused
-            self._dials.follow()
-            self._follow_policies()
+            self._sliders.follow()
+            for name, box in self._drivers.items():
+                box.value = name in self._session.policies
 
     def _add_clock(self) -> None:
         self.paused: Any = self._gui.add_checkbox("Paused", False)
@@ -115,12 +118,8 @@ class Panel:
         horizon.on_update(lambda _: self._session.set_horizon(int(horizon.value)))
 
     def _choose(self, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
-        if event.client is not None:  # somebody's hand, not this program's
+        if event.client is not None:  # a viewer's, not this program's
             self._session.choose(*(name for name, box in self._drivers.items() if box.value))
-
-    def _follow_policies(self) -> None:
-        for name, box in self._drivers.items():
-            box.value = name in self._session.policies
 
     def _add_edits(self) -> None:
         self._gui.add_markdown("Drag robots, goals and obstacles; drag a robot with Shift to push it.")
@@ -132,13 +131,10 @@ class Panel:
             "Remove obstacle": edits.remove_obstacle,
         }
         for name, change in changes.items():
-            self._add_edit(name, change)
-        self._gui.add_button("Push a robot").on_click(lambda _: self._push_somebody())
+            self._gui.add_button(name).on_click(partial(lambda change, _: self._session.edit(change), change))
+        self._gui.add_button("Push a robot").on_click(lambda _: self._push_farthest())
 
-    def _add_edit(self, name: str, change: edits.Edit) -> None:
-        self._gui.add_button(name).on_click(lambda _: self._session.edit(change))
-
-    def _push_somebody(self) -> None:
+    def _push_farthest(self) -> None:
         """Push the robot that is farthest from its goal, any way."""
         direction = self._random.normal(size=self._session.frame.problem.dimension)
         self._session.push(None, PUSH * direction / np.linalg.norm(direction))
@@ -161,10 +157,6 @@ class Panel:
             self._session.load(lambda: SCENARIOS.look_up(name).problem(number, first, model=chosen), first)
 
         self._gui.add_button("Begin").on_click(load)
-
-    def _add_views(self) -> None:
-        for name in self._view.shown:
-            self._add_choice(name)
 
     def _add_choice(self, name: str) -> None:
         box = self._gui.add_checkbox(name.capitalize(), self._view.shown[name])
@@ -191,7 +183,9 @@ class Panel:
                 self._session.refuse(f"a file is being written; ask for {name} when that is done")
                 return
             try:
-                _send(event.client, name, text())
+                content = text().encode()
+                if event.client is not None:  # it is still there
+                    event.client.send_file_download(name, content, save_immediately=True)
             except Exception as error:
                 self._session.refuse(f"{name} cannot be written: {describe(error)}")
             finally:
@@ -201,12 +195,6 @@ class Panel:
 
 
 THEME: dict[str, Any] = {"show_logo": False, "show_share_button": False, "control_width": "medium"}
-
-
-def _send(client: viser.ClientHandle | None, name: str, text: str) -> None:
-    """Let a browser save a file, if it is still there."""
-    if client is not None:
-        client.send_file_download(name, text.encode(), save_immediately=True)
 
 
 def status_text(frames: Sequence[Frame]) -> str:

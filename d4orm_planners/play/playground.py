@@ -6,6 +6,7 @@ import contextlib
 import io
 import logging
 import math
+import secrets
 import socket
 import threading
 import time
@@ -20,12 +21,11 @@ from numpy.typing import NDArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import view_limits
 from d4orm_planners.play.meshes import Points, in_space
-from d4orm_planners.play.origin_check import LOOPBACK, OriginCheck
+from d4orm_planners.play.origin_check import LOOPBACK, MessageValidator, OriginCheck
 from d4orm_planners.play.panel import THEME, Panel
-from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.viewport_view import LaneView
+from d4orm_planners.play.viewport_view import ViewportView
 
 GAP = 0.12
 """Between two scenes, in sizes of one."""
@@ -56,7 +56,7 @@ class View:
             "dark": False,
         }
         self._camera = Viewpoint(server)
-        self._lanes: list[LaneView] = []
+        self._viewports: list[ViewportView] = []
         self._built: object = None
         self._looked_at: object = None
 
@@ -69,24 +69,24 @@ class View:
             self._rebuild(frames)
         now = time.perf_counter()
         with self._server.atomic():
-            for lane, frame in zip(self._lanes, frames):
-                lane.update(frame, now)
+            for viewport, frame in zip(self._viewports, frames):
+                viewport.update(frame, now)
 
     def _rebuild(self, frames: tuple[Frame, ...]) -> None:
         """Make all shapes anew."""
         limits = in_space(view_limits(frames[0].problem))
         positions = _positions(len(frames), limits)
         with self._server.atomic():
-            for lane in self._lanes:
-                lane.remove()
-            self._lanes = [
-                LaneView(self._server, self._session, index, frame, position, self.shown)
+            for viewport in self._viewports:
+                viewport.remove()
+            self._viewports = [
+                ViewportView(self._server, self._session, index, frame, position, self.shown)
                 for index, (frame, position) in enumerate(zip(frames, positions, strict=True))
             ]
             if len(frames) > 1:
                 top = np.array([limits[:, 0].mean(), limits[1, 1], limits[:, 2].mean()], np.float32)
-                for lane, frame in zip(self._lanes, frames):
-                    lane.name(frame.policy, top)
+                for viewport, frame in zip(self._viewports, frames):
+                    viewport.name(frame.policy, top)
         problem = frames[0].problem
         scene = (problem.name, problem.num_robots, problem.dimension, len(frames))
         if scene != self._looked_at:
@@ -120,18 +120,18 @@ class Viewpoint:
         camera.position, camera.look_at = view_from(limits, dimension, WIDE)
         camera.up, camera.fov = up, FIELD_OF_VIEW
         for client in self._server.get_clients().values():
-            with _looking_nowhere():
+            with _bad_camera_left_alone():
                 client.camera.up_direction = up
             self._look(client)
 
     def _look(self, client: viser.ClientHandle) -> None:
         camera = client.camera
-        with _looking_nowhere():
+        with _bad_camera_left_alone():
             camera.position, camera.look_at = view_from(self._limits, self._dimension, camera.aspect)
 
 
 @contextmanager
-def _looking_nowhere() -> Iterator[None]:
+def _bad_camera_left_alone() -> Iterator[None]:
     """A context that leaves a camera alone whose browser says that it looks nowhere, or that has nothing to see yet."""
     with suppress(ValueError, FloatingPointError), np.errstate(divide="raise", invalid="raise"):
         yield
@@ -205,21 +205,19 @@ class Playground:
         **observation: Any,
     ) -> None:
         local = host in LOOPBACK
-        chosen = _free_port(host, port)
+        where, chosen = LOOPBACK[0] if local else host, _free_port(host, port)
+        token = None if local else secrets.token_urlsafe(24)
         self.session = Session(problem, *policies, seed=seed, **observation)
-        with contextlib.redirect_stdout(io.StringIO()):  # its own words on where it is
-            self._server = _Server(
-                host="127.0.0.1", port=chosen if local else _free_port("127.0.0.1", 0), verbose=False
-            )
-        self._gate = None if local else AuthenticatingProxy(host, chosen, self._server.get_port())
-        # Otherwise Python prints every request that cannot be read, which anybody can make.
+        with (
+            contextlib.redirect_stdout(io.StringIO()),  # its own words on where it is
+            OriginCheck(token, f"d4orm_play_{chosen}").installed(),
+        ):
+            self._server = _Server(host=where, port=chosen, verbose=False)
+        # Otherwise Python prints every request that cannot be read.
         logging.getLogger("websockets").addHandler(logging.NullHandler())
-        OriginCheck(self._server, None if self._gate is None else self._gate.token, self.session.refuse)
-        if self._gate is None:
-            self.address = f"http://127.0.0.1:{self._server.get_port()}/"
-        else:
-            named = socket.gethostname() if host in ("0.0.0.0", "::") else host
-            self.address = f"http://{named}:{self._gate.port}/?token={self._gate.token}"
+        MessageValidator(self._server, self.session.refuse)
+        named = socket.gethostname() if host in ("0.0.0.0", "::") else where
+        self.address = f"http://{named}:{self._server.get_port()}/" + ("" if local else f"?token={token}")
         self._server.scene.configure_default_lights(enabled=False)
         self._server.scene.add_light_ambient("/light", intensity=1.1)
         self._server.scene.add_light_directional("/sun", intensity=0.5, position=(-1.0, -0.5, 2.0))
@@ -261,8 +259,7 @@ class Playground:
 
     def close(self) -> None:
         """Leave no thread and no port, but for what does not end in :data:`LAST_WAIT`, which the process's end ends."""
-        ends = [self.session.close, self._server.stop, *([] if self._gate is None else [self._gate.close])]
-        ending = [threading.Thread(target=end, daemon=True) for end in ends]
+        ending = [threading.Thread(target=end, daemon=True) for end in (self.session.close, self._server.stop)]
         deadline = time.perf_counter() + LAST_WAIT
         for thread in ending:
             thread.start()

@@ -29,7 +29,7 @@ _IDLE = 0.1
 _MOST_EDITING = 0.25
 """Seconds from one step to the next after which no other change is begun; the clock goes on first."""
 
-MOST_LANES = 6
+MOST_VIEWPORTS = 6
 
 
 class Session:
@@ -50,13 +50,13 @@ class Session:
         self, problem: Problem, *policies: str, seed: int = 0, lifelong: bool = False, **observation: Any
     ) -> None:
         self._loaded, self.policies = problem, policies or ("d4orm-c2f",)
-        self._terms, self.levels = EpisodeOptions(seed, lifelong, observation), dict[str, float]()
+        self._options, self.levels = EpisodeOptions(seed, lifelong, observation), dict[str, float]()
         self._drivers = Drivers()
         self.commands = CommandQueue()
         self._paused, self._steps_wanted, self._speed = False, 0, 1.0
         self._status = Status(0, 0, 0.0, 0.0, problem.dt, "planning", "", 0)
         self.frames: tuple[Frame, ...] = ()
-        self._lanes: tuple[Viewport, ...] = ()
+        self._viewports: tuple[Viewport, ...] = ()
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="d4orm-play", daemon=True)
         self._begin([problem] * len(self.policies), afresh=True)
@@ -72,11 +72,16 @@ class Session:
         frame = self.frame
         return frame.problem.with_state(frame.states, frame.goals)
 
+    @property
+    def busy(self) -> bool:
+        """True while changes wait or are made."""
+        return not self.commands.empty or self.frame.status.state == "planning"
+
     def replay(self) -> Replay:
         """Return a replay since team, world or policies last changed, side by side."""
-        lanes = self._lanes
-        scene = lanes[0].scene
-        motions = [lane.recording.motion(lane.name) for lane in lanes]
+        viewports = self._viewports
+        scene = viewports[0].scene
+        motions = [viewport.recording.motion(viewport.name) for viewport in viewports]
         return Replay(f"{scene.name}, {count(scene.num_robots, 'robot')} by {', '.join(self.policies)}", tuple(motions))
 
     def start(self) -> None:
@@ -95,13 +100,13 @@ class Session:
         raise ValueError(reason)
 
     @queued()
-    def edit(self, edit: Edit, lane: int = 0) -> None:
-        """Change the scene between two steps, as the team of this lane has it; all others follow.
+    def edit(self, edit: Edit, viewport: int = 0) -> None:
+        """Change the scene between two steps, as the team of this viewport has it; all others follow.
 
         What cannot be is left, and the next frame's message says why.
         """
-        before = [one.scene for one in self._lanes]
-        leader = min(lane, len(before) - 1)
+        before = [one.scene for one in self._viewports]
+        leader = min(viewport, len(before) - 1)
         after = edit(before[leader])
         scenes = [
             after if index == leader else followed(before[leader], after, other, self.policies[index])
@@ -110,21 +115,21 @@ class Session:
         self._begin(scenes, afresh=after.team is not before[0].team or after.world is not before[0].world)
 
     @queued()
-    def push(self, robot: int | None, velocity: ArrayLike, lane: int = 0) -> None:
+    def push(self, robot: int | None, velocity: ArrayLike, viewport: int = 0) -> None:
         """Give a robot a velocity on top of its own at the next step's beginning, in all that drive side by side.
 
         The policies are not told, and have to find out.
 
         Args:
-            robot: Its number; ``None`` is the one of this lane that is farthest from its goal.
+            robot: Its number; ``None`` is the one of this viewport that is farthest from its goal.
             velocity: ``(d,)`` [m/s].
-            lane: Whose robot has to be under way.
+            viewport: Whose robot has to be under way.
         """
         given = np.asarray(velocity, np.float32)
-        leader = self._lanes[min(lane, len(self._lanes) - 1)]
+        leader = self._viewports[min(viewport, len(self._viewports) - 1)]
         chosen = leader.farthest if robot is None else robot
         leader.push(chosen, given)
-        for other in self._lanes:
+        for other in self._viewports:
             if other is not leader and not other.arrived[chosen]:
                 other.push(chosen, given)
         self._show(self._state)
@@ -133,7 +138,7 @@ class Session:
     def load(self, make_scene: Callable[[], Problem], seed: int = 0) -> None:
         """Begin anew with another scene."""
         scene = make_scene()
-        self._begin([scene] * len(self.policies), terms=replace(self._terms, seed=seed), afresh=True)
+        self._begin([scene] * len(self.policies), options=replace(self._options, seed=seed), afresh=True)
         self._loaded = scene
 
     @queued()
@@ -146,10 +151,10 @@ class Session:
         """Let other policies drive on from here, side by side; one that comes in begins where the first is."""
         if policies == self.policies:
             return
-        if not 1 <= len(set(policies)) == len(policies) <= MOST_LANES:
-            raise ValueError(f"{len(policies)} policies are chosen; choose 1 to {MOST_LANES}, each once")
-        scenes = {lane.name: lane.scene for lane in self._lanes}
-        self._begin([scenes.get(name, self._lanes[0].scene) for name in policies], names=policies, afresh=True)
+        if not 1 <= len(set(policies)) == len(policies) <= MOST_VIEWPORTS:
+            raise ValueError(f"{len(policies)} policies are chosen; choose 1 to {MOST_VIEWPORTS}, each once")
+        scenes = {viewport.name: viewport.scene for viewport in self._viewports}
+        self._begin([scenes.get(name, self._viewports[0].scene) for name in policies], names=policies, afresh=True)
 
     @queued("horizon")
     def set_horizon(self, steps: int) -> None:
@@ -164,13 +169,13 @@ class Session:
     @queued("lifelong")
     def set_lifelong(self, lifelong: bool) -> None:
         """Set whether robots that arrive go on to new goals."""
-        self._begin(terms=replace(self._terms, lifelong=lifelong))
+        self._begin(options=replace(self._options, lifelong=lifelong))
 
     @queued("disturbances")
     def disturb(self, levels: Mapping[str, float]) -> None:
         """Set the disturbances by name and level, from the next step on."""
         if levels != self.levels:
-            self._begin(terms=replace(self._terms, disturbances=disturbances_at(levels)))
+            self._begin(options=replace(self._options, disturbances=disturbances_at(levels)))
             self.levels = dict(levels)
 
     @queued("paused")
@@ -212,10 +217,10 @@ class Session:
     def _advance_or_pause(self) -> None:
         """One step; where there is none, such as without room for a lifelong goal, a pause that says why."""
         try:
-            if any(not lane.finished for lane in self._lanes):
-                for lane in self._lanes:
-                    lane.advance()
-                self._status = replace(self._status, time=self._status.time + self._lanes[0].scene.dt)
+            if any(not viewport.finished for viewport in self._viewports):
+                for viewport in self._viewports:
+                    viewport.advance()
+                self._status = replace(self._status, time=self._status.time + self._viewports[0].scene.dt)
                 self._show(self._state, moved=True)
         except Exception as error:  # of policies, whatever they are
             self._paused = True
@@ -229,7 +234,7 @@ class Session:
             self._status = replace(self._status, message="")
             try:
                 command()
-            except Exception as error:  # nothing that anybody asks for ends the session
+            except Exception as error:  # no request of a viewer ends the session
                 self._say_refused(1, _told(error))
         if dropped := self.commands.dropped():
             self._say_refused(dropped, f"{dropped} changes are left, as {MOST_WAITING} were waiting; make them slower")
@@ -243,41 +248,41 @@ class Session:
     def _state(self) -> str:
         if self._paused:
             return "paused"
-        return "arrived" if all(lane.finished for lane in self._lanes) else "running"
+        return "arrived" if all(viewport.finished for viewport in self._viewports) else "running"
 
     def _begin(
         self,
         scenes: Sequence[Problem] | None = None,
         names: tuple[str, ...] | None = None,
-        terms: EpisodeOptions | None = None,
+        options: EpisodeOptions | None = None,
         afresh: bool = False,
     ) -> None:
         """Go on from scenes, one for each policy, or from here: episodes of their own, which the policies plan for.
 
         What fails leaves everything as it was.
         """
-        names, terms = names or self.policies, terms or self._terms
-        scenes = [lane.scene for lane in self._lanes] if scenes is None else scenes
-        recordings = [None] * len(names) if afresh else [lane.recording for lane in self._lanes]
+        names, options = names or self.policies, options or self._options
+        scenes = [viewport.scene for viewport in self._viewports] if scenes is None else scenes
+        recordings = [None] * len(names) if afresh else [viewport.recording for viewport in self._viewports]
         if self.frames:
             self._show("planning")
         try:
-            lanes = tuple(
-                Viewport(name, self._drivers.policy(name), scene, terms, recording)
+            viewports = tuple(
+                Viewport(name, self._drivers.policy(name), scene, options, recording)
                 for name, scene, recording in zip(names, scenes, recordings, strict=True)
             )
         except Exception:
-            for lane in self._lanes:  # what drove until now may have forgotten where it was
-                lane.regain()
+            for viewport in self._viewports:  # what drove until now may have forgotten where it was
+                viewport.regain()
             raise
-        self._lanes, self.policies, self._terms = lanes, names, terms
+        self._viewports, self.policies, self._options = viewports, names, options
         if afresh:
             self._status = replace(self._status, generation=self._status.generation + 1, time=0.0)
         self._show(self._state, moved=True)
 
     def _show(self, state: str, message: str | None = None, moved: bool = False) -> None:
         """Make frames of the present; without another message the last one stays."""
-        dt = self._lanes[0].scene.dt
+        dt = self._viewports[0].scene.dt
         self._status = replace(
             self._status,
             number=self._status.number + 1,
@@ -286,7 +291,7 @@ class Session:
             state=state,
             message=self._status.message if message is None else message,
         )
-        self.frames = tuple(lane.frame(self._status) for lane in self._lanes)
+        self.frames = tuple(viewport.frame(self._status) for viewport in self._viewports)
 
 
 def _told(error: Exception) -> str:

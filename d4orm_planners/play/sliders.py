@@ -9,8 +9,8 @@ import viser
 from d4orm_planners.play.session import Session
 
 
-class Dial(NamedTuple):
-    """A slider of one disturbance.
+class SliderRange(NamedTuple):
+    """Levels of one disturbance that a slider offers.
 
     Attributes:
         name: The disturbance and its attribute, as :func:`~d4orm_env.disturbances.disturbance_registry.find_level`
@@ -30,51 +30,51 @@ class Dial(NamedTuple):
     off: float
 
 
-DIALS = (
-    Dial("control_noise", "Noise on controls", 0.0, 1.0, 0.02, 0.0),
-    Dial("correlated_noise", "Slow noise on controls", 0.0, 1.0, 0.02, 0.0),
-    Dial("bias", "Bias of controls", 0.0, 0.5, 0.01, 0.0),
-    Dial("gain", "Gain of controls off by", 0.0, 0.8, 0.02, 0.0),
-    Dial("quantisation", "Controls rounded to", 0.0, 1.0, 0.05, 0.0),
-    Dial("delay", "Controls late [steps]", 0, 10, 1, 0),
-    Dial("dropout", "Controls lost", 0.0, 0.95, 0.05, 0.0),
-    Dial("state_noise", "Noise on positions seen [m]", 0.0, 0.2, 0.005, 0.0),
-    Dial("state_delay", "States seen late [steps]", 0, 10, 1, 0),
-    Dial("occlusion", "Sight [m]", 0.2, 10.0, 0.2, 10.0),
-    Dial("push", "Pushes per robot [1/s]", 0.0, 2.0, 0.05, 0.0),
-    Dial("stall", "Robots that stall", 0.0, 1.0, 0.05, 0.0),
-    Dial("intruder", "Intruders", 0, 8, 1, 0),
-    Dial("drag", "Drag [1/s]", 0.0, 2.0, 0.05, 0.0),
-    Dial("limit_mismatch", "Limits are truly times", 0.3, 1.5, 0.05, 1.0),
+SLIDERS = (
+    SliderRange("control_noise", "Noise on controls", 0.0, 1.0, 0.02, 0.0),
+    SliderRange("correlated_noise", "Slow noise on controls", 0.0, 1.0, 0.02, 0.0),
+    SliderRange("bias", "Bias of controls", 0.0, 0.5, 0.01, 0.0),
+    SliderRange("gain", "Gain of controls off by", 0.0, 0.8, 0.02, 0.0),
+    SliderRange("quantisation", "Controls rounded to", 0.0, 1.0, 0.05, 0.0),
+    SliderRange("delay", "Controls late [steps]", 0, 10, 1, 0),
+    SliderRange("dropout", "Controls lost", 0.0, 0.95, 0.05, 0.0),
+    SliderRange("state_noise", "Noise on positions seen [m]", 0.0, 0.2, 0.005, 0.0),
+    SliderRange("state_delay", "States seen late [steps]", 0, 10, 1, 0),
+    SliderRange("occlusion", "Sight [m]", 0.2, 10.0, 0.2, 10.0),
+    SliderRange("push", "Pushes per robot [1/s]", 0.0, 2.0, 0.05, 0.0),
+    SliderRange("stall", "Robots that stall", 0.0, 1.0, 0.05, 0.0),
+    SliderRange("intruder", "Intruders", 0, 8, 1, 0),
+    SliderRange("drag", "Drag [1/s]", 0.0, 2.0, 0.05, 0.0),
+    SliderRange("limit_mismatch", "Limits are truly times", 0.3, 1.5, 0.05, 1.0),
 )
 
 
-class Dials:
+class DisturbanceSliders:
     """Sliders that disturb a session from its next step on."""
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
         self._session = session
         gui.add_markdown("From the next step on, the same for all that drive.")
-        self.sliders: dict[str, Any] = {dial.name: gui.add_slider(dial.label, *dial[2:5], dial.off) for dial in DIALS}
+        self.sliders: dict[str, Any] = {one.name: gui.add_slider(one.label, *one[2:5], one.off) for one in SLIDERS}
         for slider in self.sliders.values():
             slider.on_update(self._turn_by)
         gui.add_button("Nothing").on_click(lambda _: self._clear())
 
     def follow(self) -> None:
         """Show what the session is disturbed by."""
-        for dial in DIALS:
-            self.sliders[dial.name].value = self._session.levels.get(dial.name, dial.off)
+        for slider in SLIDERS:
+            self.sliders[slider.name].value = self._session.levels.get(slider.name, slider.off)
 
     def _turn_by(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-        if event.client is not None:  # somebody's hand, not this program's
+        if event.client is not None:  # a viewer's, not this program's
             self._turn()
 
     def _turn(self) -> None:
         self._session.disturb(
-            {dial.name: value for dial in DIALS if (value := self.sliders[dial.name].value) != dial.off}
+            {slider.name: value for slider in SLIDERS if (value := self.sliders[slider.name].value) != slider.off}
         )
 
     def _clear(self) -> None:
-        for dial in DIALS:
-            self.sliders[dial.name].value = dial.off
+        for slider in SLIDERS:
+            self.sliders[slider.name].value = slider.off
         self._turn()

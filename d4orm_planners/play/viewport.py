@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -87,15 +88,12 @@ class Drivers:
 
     def __init__(self) -> None:
         self.horizon: int | None = None
-        self._made: dict[tuple[str, int | None], Policy] = {}
+        self._made = cache(make_policy)
 
     def policy(self, name: str) -> Policy:
         """The policy of a name."""
-        horizon = self.horizon if HORIZON in setting_names(name) else None
-        if (name, horizon) not in self._made:
-            settings = {} if horizon is None else {HORIZON: horizon}
-            self._made[name, horizon] = make_policy(name, **settings)
-        return self._made[name, horizon]
+        settings = {} if self.horizon is None or HORIZON not in setting_names(name) else {HORIZON: self.horizon}
+        return self._made(name, **settings)
 
 
 @dataclass(frozen=True)
@@ -117,15 +115,15 @@ class Viewport:
     """
 
     def __init__(
-        self, name: str, policy: Policy, scene: Problem, terms: EpisodeOptions, recording: EpisodeBuffer | None = None
+        self, name: str, policy: Policy, scene: Problem, options: EpisodeOptions, recording: EpisodeBuffer | None = None
     ) -> None:
-        self.name, self._policy, self._scene, self._seed = name, policy, scene, terms.seed
+        self.name, self._policy, self._scene, self._seed = name, policy, scene, options.seed
         # A robot stalls within the scene's usual duration, after which this episode goes on all the same.
-        options: dict[str, Any] = {
-            "lifelong": terms.lifelong, "disturbances": terms.disturbances, **terms.observation
-        }  # fmt: skip
-        self._env = open_env(scene, policy=policy, max_cycles=scene.horizon, **options)
-        self._observations, _ = self._env.reset(seed=terms.seed)
+        self._env = open_env(
+            scene, policy=policy, max_cycles=scene.horizon, lifelong=options.lifelong,
+            disturbances=options.disturbances, **options.observation,
+        )  # fmt: skip
+        self._observations, _ = self._env.reset(seed=options.seed)
         self._env.max_cycles = MOST_CYCLES
         begin = time.perf_counter()
         self.regain()

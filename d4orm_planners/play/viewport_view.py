@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -35,7 +36,10 @@ from d4orm_planners.play.meshes import (
 from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
 
-Whose: TypeAlias = NDArray[np.intp] | None
+Numbers: TypeAlias = NDArray[np.intp] | None
+"""Numbers ``(N,)`` of what shapes stand for, where they are others than the shapes' own."""
+Move: TypeAlias = Callable[[Problem, int, FloatArray, FloatArray], Problem]
+"""``(scene, number, position (d,), shift (d,))`` to the scene in which something was dragged there."""
 Moved: TypeAlias = Callable[[int, Points, Points, bool], None]
 
 CONTACT, OBSTACLE, BOUND, MARGIN = (208, 2, 27), (150, 156, 166), (90, 98, 110), (200, 60, 60)
@@ -56,7 +60,7 @@ LINES_EVERY = 0.1
 """Seconds between new trails and plans."""
 
 
-class LaneView:
+class ViewportView:
     """View of one that drives."""
 
     def __init__(
@@ -69,7 +73,7 @@ class LaneView:
         shown: Mapping[str, bool],
     ) -> None:
         self._scene, self._session, self._index, self._shown = server.scene, session, index, shown
-        self._root = f"/lane_{index}"
+        self._root = f"/viewport_{index}"
         self._seen, self._lines_at = (-1, False), 0.0
         self._held: dict[tuple[str, int], Points] = {}
         self._trail: list[FloatArray] = []
@@ -151,15 +155,14 @@ class LaneView:
             at, colors = shown[group.bodies], self._colors[group.robots]
             self._add_many(group.name, group.mesh, at, group.scales, colors, 1.0)
             self._add_many(f"margins_{group.name}", group.margin[0], at, group.margin[1], np.array(MARGIN), 0.25)
-            move = lambda index, position, _: lambda problem: edits.move_robot(problem, index, position)  # noqa: E731
-            self._drag(group.name, "robot", move, group.robots)
+            self._drag(
+                group.name, "robot", lambda scene, index, at, _: edits.move_robot(scene, index, at), group.robots
+            )
             self._drag_pushes(group)
         diamond = puck(4, 0.2) if flat else ball(0)
         self._add_many("goals", diamond, goals, np.stack([mark] * 3, axis=1), self._colors, 0.6 if flat else 0.35)
         self._add_many("subgoals", ball(0), positions, np.stack([dot] * 3, axis=1), self._colors, 0.9)
-        self._drag(
-            "goals", "goal", lambda index, position, _: lambda problem: edits.move_goal(problem, index, position)
-        )
+        self._drag("goals", "goal", lambda scene, index, at, _: edits.move_goal(scene, index, at))
 
     def _add_bodies(self, frame: Frame) -> None:
         """Add the dynamic obstacles."""
@@ -170,17 +173,11 @@ class LaneView:
             self._add_many("bodies", mesh, positions, np.stack([radius, radius, high], axis=1), np.array(BODY), 1.0)
 
     def _add_many(
-        self,
-        name: str,
-        mesh: trimesh.Trimesh,
-        positions: Points,
-        scales: FloatArray,
-        colors: FloatArray,
-        opacity: float,
+        self, name: str, mesh: trimesh.Trimesh, at: Points, scales: FloatArray, colors: FloatArray, opacity: float
     ) -> None:
         self._nodes[name] = self._scene.add_batched_meshes_simple(
             f"{self._root}/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32),
-            np.tile(np.array([1, 0, 0, 0], np.float32), (len(positions), 1)), positions, batched_scales=scales,
+            np.tile(np.array([1, 0, 0, 0], np.float32), (len(at), 1)), at, batched_scales=scales,
             batched_colors=linear(colors), opacity=opacity, material="toon5", lod="off", cast_shadow=False,
             receive_shadow=False,
         )  # fmt: skip
@@ -197,16 +194,14 @@ class LaneView:
                     color=OBSTACLE, opacity=None if problem.dimension == 2 else 0.6, flat_shading=True,
                     position=centre, cast_shadow=False, receive_shadow=False, side="double",
                 )  # fmt: skip
-                self._drag(name, name, _mover(kind, index))
+                self._drag(name, name, partial(_move_obstacle, kind, index))
         if problem.world.lower is not None:
             self._nodes["bounds"] = self._scene.add_line_segments(
                 f"{self._root}/bounds", edges(in_space(problem.world.bounds)), BOUND,
                 thickness=2.0, thickness_units="screen",
             )  # fmt: skip
 
-    def _drag(
-        self, name: str, kind: str, edit: Callable[[int, FloatArray, FloatArray], edits.Edit], whose: Whose = None
-    ) -> None:
+    def _drag(self, name: str, kind: str, move: Move, numbers: Numbers = None) -> None:
         """Let a shape be dragged: it follows the pointer, and where it is let go the scene is changed."""
         node = self._nodes[name]
 
@@ -218,9 +213,9 @@ class LaneView:
                 return
             self._held.pop((kind, index), None)
             d = self._frame.problem.dimension
-            self._session.edit(edit(index, (at + shift)[:d], shift[:d]), self._index)
+            self._session.edit(lambda scene: move(scene, index, (at + shift)[:d], shift[:d]), self._index)
 
-        self._follow_hand(node, kind, moved, whose=whose)
+        self._follow_hand(node, kind, moved, numbers=numbers)
 
     def _drag_pushes(self, group: BodyGroup) -> None:
         """Let robots be pushed: the page draws an arrow, and where it is let go the robot gets its velocity."""
@@ -232,20 +227,21 @@ class LaneView:
         self._follow_hand(self._nodes[group.name], "robot", moved, "shift", group.robots)
 
     def _follow_hand(
-        self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, whose: Whose = None
+        self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, numbers: Numbers = None
     ) -> None:
         """Call ``moved(number, position, shift so far, ended)`` while one of a node's shapes is dragged.
 
-        The number is that of the shape, or what ``whose`` ``(N,)`` has for it.
+        The number is that of the shape, or what ``numbers`` has for it.
         """
         grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 
         @node.on_drag("left", modifier=modifier)
         async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:  # one after the other
             instance = event.instance_index or 0
-            index, hand = instance if whose is None else int(whose[instance]), (event.client_id, instance)
+            index, hand = instance if numbers is None else int(numbers[instance]), (event.client_id, instance)
             if event.phase == "start":
-                at = self._position_of(kind, index)
+                # Where the page shows it; the session may be further on.
+                at = np.array(self._positions[kind][index] if kind in self._positions else self._nodes[kind].position)
                 grips[hand] = (at, self._pointed(event, at))
             if hand in grips:
                 (at, grip), ended = grips[hand], event.phase == "end"
@@ -257,10 +253,6 @@ class LaneView:
     def _frame(self) -> Frame:
         frames = self._session.frames
         return frames[min(self._index, len(frames) - 1)]
-
-    def _position_of(self, kind: str, index: int) -> Points:
-        """``(3,)`` where the page shows it; the session may be further on."""
-        return np.array(self._positions[kind][index] if kind in self._positions else self._nodes[kind].position)
 
     def _pointed(self, event: viser.SceneNodeDragEvent[viser.SceneNodeHandle], at: Points) -> Points:
         """Return the pointer's position: on the plane that planar robots drive on, or as far off as the shape."""
@@ -303,5 +295,5 @@ class LaneView:
             self._nodes[name].points, self._nodes[name].colors = points, colors
 
 
-def _mover(kind: str, index: int) -> Callable[[int, FloatArray, FloatArray], edits.Edit]:
-    return lambda _, position, shift: lambda problem: edits.move_obstacle(problem, kind, index, shift)
+def _move_obstacle(kind: str, index: int, scene: Problem, _: int, at: FloatArray, shift: FloatArray) -> Problem:
+    return edits.move_obstacle(scene, kind, index, shift)

@@ -6,7 +6,6 @@ Their buffers hand out the steps in which a robot acted, and no others.
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -93,7 +92,6 @@ class MaskedReplayBuffer(_MaskedBuffer, ReplayBuffer):
         return rows, slots
 
 
-@dataclass(frozen=True)
 class Algorithm:
     """One of Stable-Baselines3's algorithms.
 

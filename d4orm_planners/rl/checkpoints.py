@@ -24,7 +24,6 @@ from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
 
-backend_agg: Any = LazyModule("matplotlib.backends.backend_agg")
 figures: Any = LazyModule("matplotlib.figure")
 
 
@@ -72,8 +71,7 @@ class Evaluation:
 
 def evaluate_network(network: Network, worlds: RobotVecEnv | MixedVecEnv, seed: int) -> Outcome:
     """Run one episode in each world, without exploring; of a mixture, the mean of its parts."""
-    parts = worlds.parts if isinstance(worlds, MixedVecEnv) else (worlds,)
-    means = [np.mean(run_worlds(network, part, seed), axis=0) for part in parts]
+    means = [np.mean(run_worlds(network, part, seed), axis=0) for part in worlds.parts]
     success, travel_time = (float(np.mean(values)) for values in zip(*means))
     return Outcome(success, travel_time, [float(mean[0]) for mean in means])
 
@@ -102,7 +100,6 @@ def write_curve(folder: Path, evaluations: Sequence[Evaluation]) -> None:
 @own_style()
 def _draw(path: Path, evaluations: Sequence[Evaluation]) -> None:
     figure = figures.Figure(figsize=(7, 3), layout="constrained")
-    backend_agg.FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     steps = [evaluation.steps / 1e6 for evaluation in evaluations]
     left.plot(steps, [100 * evaluation.success_rate for evaluation in evaluations])
@@ -221,17 +218,15 @@ class Checkpoint:
         room = _room(model, env)
         numbers = {}
         with (self.folder / "state.npz").open("rb") as stream, ArrayArchive(stream, room) as archive:
-            for name, position in room.items():
+            for name, largest in room.items():
                 if not (fresh or name.startswith(tuple(f"{running}_" for running in _running(env)))):
                     continue
-                numbers[name] = array = archive.array(name, position.nbytes)
-                same = (
-                    array.shape[1:] == position.shape[1:]
-                    and array.ndim == position.ndim
-                    and array.dtype == position.dtype
-                )
-                if not same or (not name.startswith("replay_") and array.shape != position.shape):
-                    raise ValueError(f"{name} is {array.dtype} {array.shape}, not {position.dtype} {position.shape}")
+                numbers[name] = array = archive.array(name, largest.nbytes)
+                # A replay buffer may be filled in part.
+                skipped = 1 if name.startswith("replay_") else 0
+                same = (array.ndim, array.shape[skipped:]) == (largest.ndim, largest.shape[skipped:])
+                if not same or array.dtype != largest.dtype:
+                    raise ValueError(f"{name} is {array.dtype} {array.shape}, not {largest.dtype} {largest.shape}")
         return numbers
 
     def _set_parameters(self, model: BaseAlgorithm) -> None:

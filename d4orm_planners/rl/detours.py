@@ -1,4 +1,4 @@
-"""Paths round robots that have docked, for policies that have learned to head straight for their goals."""
+"""Paths round robots that have arrived, for policies that have learned to head straight for their goals."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from d4orm_planners.tracking.steering import goals_along_paths
 
 
 class Detours:
-    """Shortest paths round docked robots, in one episode.
+    """Shortest paths round arrived robots, in one episode.
 
-    Who has no memory and heads straight for its goal stands still behind others that have docked. A path is found when
-    a robot first needs it, and again when another one has docked.
+    A robot without memory that heads straight for its goal stops behind others that have arrived. A path is found when
+    a robot first needs it, and again when another one has arrived.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._docked = np.zeros(problem.num_robots, np.bool_)
+        self._arrived = np.zeros(problem.num_robots, np.bool_)
         self._alone: dict[int, Problem] = {}
 
     def goals(self, joint: JointState, positions: FloatArray) -> FloatArray:
-        """Return where robots should head: their goals, or along their paths where a docked robot is in the way.
+        """Return where robots should head: their goals, or along their paths where an arrived robot is in the way.
 
         Args:
             joint: The team.
@@ -32,11 +32,11 @@ class Detours:
         Returns:
             ``(K, d)`` [m].
         """
-        if (joint.arrived != self._docked).any():
-            self._docked, self._alone, world = joint.arrived, {}, self._problem.world
-            round_ones = np.column_stack([joint.states[self._docked, : world.dimension], self._radius[self._docked]])
+        if (joint.arrived != self._arrived).any():
+            self._arrived, self._alone, world = joint.arrived, {}, self._problem.world
+            balls = np.column_stack([joint.states[self._arrived, : world.dimension], self._radius[self._arrived]])
             kind = "circles" if world.dimension == 2 else "spheres"
-            self._world = world.replace(**{kind: np.concatenate([world.balls, round_ones])})
+            self._world = world.replace(**{kind: np.concatenate([world.balls, balls])})
         heads = joint.goals.copy()
         for robot in self._blocked(joint, positions).tolist():
             if robot not in self._alone:
@@ -51,13 +51,13 @@ class Detours:
         return self._problem.team.radius
 
     def _blocked(self, joint: JointState, positions: FloatArray) -> IntArray:
-        """Numbers of the robots that a docked one is in the way of."""
-        arrived, ahead = self._docked, joint.goals - positions
-        beside = joint.states[arrived, : self._problem.dimension] - positions[:, None]
+        """Numbers of the robots that an arrived one is in the way of."""
+        arrived, ahead = self._arrived, joint.goals - positions
+        offsets = joint.states[arrived, : self._problem.dimension] - positions[:, None]
         along = (
-            np.einsum("kd,knd->kn", ahead, beside)
+            np.einsum("kd,knd->kn", ahead, offsets)
             / np.maximum((ahead * ahead).sum(axis=1), np.finfo(np.float32).tiny)[:, None]
         )
-        gaps = np.linalg.norm(beside - np.clip(along, 0, 1)[..., None] * ahead[:, None], axis=2)
-        reach = self._radius[:, None] + self._radius[arrived] + self._problem.margin
-        return np.flatnonzero((gaps < reach).any(axis=1) & ~arrived)
+        distances = np.linalg.norm(offsets - np.clip(along, 0, 1)[..., None] * ahead[:, None], axis=2)
+        safety_distance = self._radius[:, None] + self._radius[arrived] + self._problem.margin
+        return np.flatnonzero((distances < safety_distance).any(axis=1) & ~arrived)

@@ -139,7 +139,8 @@ class _ImitationRun:
         """One round, its evaluation and its checkpoint."""
         begin, settings = time.perf_counter(), self.settings
         each, drivers = settings.episodes + settings.epochs, ("cloning", "DAgger")
-        what = f"{drivers[min(index, 1)]}, round {index + 1} of {settings.rounds}{self._so_far}"
+        success = f"; success {self.evaluations[-1].success_rate:.0%}" if self.evaluations else ""
+        what = f"{drivers[min(index, 1)]}, round {index + 1} of {settings.rounds}{success}"
 
         def report(done: int) -> None:
             self._progress(what, index * each + done, settings.rounds * each)
@@ -170,10 +171,6 @@ class _ImitationRun:
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.conclude(index, self._model, self._env, network, self.evaluations)
-
-    @property
-    def _so_far(self) -> str:
-        return f"; success {self.evaluations[-1].success_rate:.0%}" if self.evaluations else ""
 
     def _network(self, index: int, seconds: float = 0.0) -> Network:
         """Return the network as it is now, the last ``seconds`` in this round."""
@@ -237,14 +234,8 @@ def clone(
 ) -> None:
     """Have the mean of a PPO model's actions follow an expert's, by Adam on the mean squared difference.
 
-    Args:
-        model: The model.
-        env: Normalises its observations.
-        inputs: ``(N, F)`` features.
-        targets: ``(N, m)`` the expert's actions in ``[-1, 1]``.
-        epochs: Number of times that each sample is looked at.
-        random: In which order.
-        report: Called with the number of epochs done.
+    ``inputs`` ``(N, F)`` are features, ``targets`` ``(N, m)`` the expert's actions in ``[-1, 1]``; ``report`` is called
+    with the number of epochs done.
     """
     policy = model.policy
     seen, wanted = torch.as_tensor(env.normalize_obs(inputs)), torch.as_tensor(targets)

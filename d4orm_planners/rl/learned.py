@@ -41,7 +41,7 @@ class LearnedConfig(CheckedSettings):
             run anything when it is loaded: give only one that you made yourself or trust. By default the policy that
             comes with the package for the robots' model, and for open ground or a world with walls or many obstacles.
         detours: Whether a robot that has learned to head straight for its goal heads along the shortest path round
-            robots that have docked where these are in the way. That is a law beside the network, which goes by the
+            robots that have arrived where these are in the way. That is a law beside the network, which goes by the
             joint state; not with a communication range or a line of sight, which hide robots.
         egocentric: Whether a ``.zip`` was trained in ``egocentric`` environments.
 
@@ -139,13 +139,13 @@ class LearnedPolicy(Policy):
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
         robots, joint = robot_indices(observations), split_state(self.problem, state)
         self._look_along_paths(self._actor.network, robots, seen, joint)
-        controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
+        controls = self._actor.network.controls(seen, self.problem.team.control_limits[robots])
         if not self._actor.network.header.brakes:
             controls = brake_to_dock(self.problem, robots, controls, joint)
         return within_limits(self.problem, dict(zip(observations, controls)))
 
     def _look_along_paths(self, network: Network, robots: list[int], seen: FloatArray, joint: JointState) -> None:
-        """Change the goals in ``seen`` ``(N, D)``: as in training, by the map that all have, or round docked robots.
+        """Change the goals in ``seen`` ``(N, D)``: as in training, by the map that all have, or round arrived robots.
 
         Where a robot is follows from its goal and where it sees that.
         """
@@ -214,9 +214,6 @@ class _NetworkActor:
                 f"the policy in {self.path.name} was trained with {trained}, and this environment has {given}; make it "
                 "as in training"
             )
-
-    def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
-        return self.network.controls(observations, limits)
 
 
 def _load_zip(algorithm: str, path: Path) -> Any:

@@ -98,9 +98,9 @@ class Header(BaseModel):
         return self.model_dump_json(exclude=unsaid)
 
 
-def range_sensors(number: int, reach: float) -> str:
+def range_sensors(number: int, ray_range: float) -> str:
     """The arguments of an environment whose robots have so many rays of this range [m]."""
-    return f"observed_rays={number}, ray_range={reach:g}" if number else "observed_rays=0"
+    return f"observed_rays={number}, ray_range={ray_range:g}" if number else "observed_rays=0"
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +285,7 @@ def encode(features: Features, arrays: Mapping[str, FloatArray], seen: FloatArra
         hidden = rows @ arrays[f"{kind}_weight_0"].T + (own @ arrays[f"{kind}_own"].T)[:, None]
         hidden = np.maximum(hidden + arrays[f"{kind}_bias_0"], 0)
         hidden = np.maximum(hidden @ arrays[f"{kind}_weight_1"].T + arrays[f"{kind}_bias_1"], 0) * rows[..., :1]
-        # None is below zero, which stands for nobody.
+        # No value is below zero, which stands for an empty set.
         parts += [hidden.max(axis=1, initial=0), SUM_SCALE * hidden.sum(axis=1)]
     joined: FloatArray = np.concatenate(parts, axis=1)
     return joined

@@ -27,7 +27,7 @@ def perturbed(
         seed: Of what is drawn.
         num_robots: Size of the team.
         base: The scenario.
-        shift: Places are moved within so much on either axis [m]; less where robots would be too close to each other.
+        shift: Positions move by so much at most on either axis [m]; less where robots would be too close to each other.
         shrink: Up to so large a share is taken off distances from the origin.
         **settings: Of the scenario.
     """

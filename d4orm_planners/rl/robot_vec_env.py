@@ -23,12 +23,45 @@ from d4orm_env.scenarios.problems import ScenarioLike
 
 
 class SharedVecEnv(VecEnv):
-    """Base of environments whose robots share their worlds, so that none can be had by itself."""
+    """Base of environments whose robots share their worlds, so that none can be had by itself.
+
+    Attributes:
+        parts: Environments that it consists of, which are itself where it is one.
+        seconds: Time spent so far on stepping and on what episodes begin with, such as drawing instances.
+    """
 
     render_mode = None
+    parts: Sequence[RobotVecEnv]
+    seconds = 0.0
+
+    def reset(self) -> FloatArray:
+        """Begin an episode in every world; the seed counts once."""
+        begin = time.perf_counter()
+        encoded = self._encoded([part.begin() for part in self.parts])
+        features = np.concatenate([part.show(*own)[0] for part, own in zip(self.parts, encoded, strict=True)])
+        self.seconds += time.perf_counter() - begin
+        return features
 
     def step_async(self, actions: FloatArray) -> None:
         self._actions = as_float32(actions)
+
+    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
+        begin = time.perf_counter()
+        frames, limits = (np.concatenate([getattr(part, name) for part in self.parts]) for name in ("frames", "limits"))
+        controls = self.parts[0].features.decode(self._actions, frames, limits)
+        split = np.split(controls, np.cumsum([part.num_envs for part in self.parts])[:-1])
+        encoded = self._encoded([part.drive(own) for part, own in zip(self.parts, split, strict=True)])
+        outcomes = (part.conclude(*own) for part, own in zip(self.parts, encoded, strict=True))
+        features, rewards, dones, infos = zip(*outcomes, strict=True)
+        self.seconds += time.perf_counter() - begin
+        flat = [info for listed in infos for info in listed]
+        return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), flat
+
+    def _encoded(self, seen: list[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
+        """Features and frames of what the robots of each part see: all at once, for each call takes its time."""
+        features, frames = self.parts[0].encoded(np.concatenate(seen))
+        ends = np.cumsum([len(own) for own in seen])[:-1]
+        return list(zip(np.split(features, ends), np.split(frames, ends), strict=True))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[object]:
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
@@ -75,7 +108,6 @@ class RobotVecEnv(SharedVecEnv):
         finished: ``(world, success, travel_time)`` of the worlds that ended in the last step.
         limits: ``(B * K, m)`` largest controls.
         frames: ``(B * K, 2)`` in which the robots act now, see :meth:`Features.encode`.
-        seconds: Time spent so far on stepping and on what episodes begin with, such as drawing instances.
 
     Raises:
         ValueError: For a bad argument, or a team of mixed models.
@@ -114,24 +146,10 @@ class RobotVecEnv(SharedVecEnv):
         self._seed: int | None = seed
         self.acted = np.ones(count, np.bool_)
         self.finished: list[tuple[int, bool, float]] = []
-        self.seconds = 0.0
+        self.parts = (self,)
         bound = np.full(self.features.size, 10, np.float32)
         m = problem.control_size
         super().__init__(count, Box(-bound, bound), Box(-np.ones(m, np.float32), np.ones(m, np.float32)))
-
-    def reset(self) -> FloatArray:
-        """Begin an episode in every world; the seed counts once."""
-        begin = time.perf_counter()
-        features, _ = self.show(*self.encoded(self.begin()))
-        self.seconds += time.perf_counter() - begin
-        return features
-
-    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
-        begin = time.perf_counter()
-        seen = self.drive(self.features.decode(self._actions, self.frames, self.limits))
-        outcome = self.conclude(*self.encoded(seen))
-        self.seconds += time.perf_counter() - begin
-        return outcome
 
     def begin(self) -> FloatArray:
         """Begin an episode in every world; what the robots see ``(B * K, .)``, for :meth:`encoded`."""

@@ -18,8 +18,6 @@ from d4orm_planners.rl.network import EPSILON, FORMAT, KINDS, SUM_SCALE, Header,
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.running_mean_std import RunningMeanStd
-    from stable_baselines3.common.vec_env import VecNormalize
 
 START_COUNT = 1e6
 """Observations that a trained network's normalisation counts for: what it knows is not forgotten."""

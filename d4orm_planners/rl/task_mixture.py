@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -11,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray
+from d4orm_env.core.arrays import BoolArray
 from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import goal_speeds
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
-from d4orm_env.envs.team_step import Info
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import find_scenario, unknown_argument
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv, SharedVecEnv
@@ -154,7 +152,7 @@ class TrainTask:
     def problem(self, seed: int, model: str | None = None) -> Problem:
         """An instance with robots of that model; ``None`` is the scenario's own. Robots dock at any speed by default.
 
-        Who explores hardly ever comes to rest at a goal, and a policy that has not learned to brake is braked.
+        A robot that explores hardly ever comes to rest at a goal, and a policy that has not learned to brake is braked.
         """
         problem = make_problem(self.scenario, self.num_robots, seed, model=model, **self.settings)
         usual = goal_speeds(problem.team, problem.dt, None)
@@ -251,9 +249,6 @@ class MixedVecEnv(SharedVecEnv):
             raise ValueError(f"the mixture has robots of {', '.join(models)}; one policy is learned for one model")
         self.features, self.problem, self.shortest_paths = first.features, first.problem, first.shortest_paths
         self.num_worlds = sum(part.num_worlds for part in parts)
-        self._splits = np.cumsum([part.num_envs for part in parts])[:-1]
-        self._limits = np.concatenate([part.limits for part in parts])
-        self.seconds = 0.0
         super().__init__(sum(part.num_envs for part in parts), first.observation_space, first.action_space)
 
     @property
@@ -264,30 +259,6 @@ class MixedVecEnv(SharedVecEnv):
     def finished(self) -> list[tuple[int, bool, float]]:
         offsets = np.cumsum([0, *(part.num_worlds for part in self.parts)]).tolist()
         return [(offset + world, *how) for offset, part in zip(offsets, self.parts) for world, *how in part.finished]
-
-    def reset(self) -> FloatArray:
-        begin = time.perf_counter()
-        encoded = self._encoded([part.begin() for part in self.parts])
-        features = np.concatenate([part.show(*own)[0] for part, own in zip(self.parts, encoded, strict=True)])
-        self.seconds += time.perf_counter() - begin
-        return features
-
-    def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
-        begin = time.perf_counter()
-        frames = np.concatenate([part.frames for part in self.parts])
-        controls = np.split(self.features.decode(self._actions, frames, self._limits), self._splits)
-        encoded = self._encoded([part.drive(own) for part, own in zip(self.parts, controls, strict=True)])
-        outcomes = (part.conclude(*own) for part, own in zip(self.parts, encoded, strict=True))
-        features, rewards, dones, infos = zip(*outcomes)
-        flat = [info for listed in infos for info in listed]
-        self.seconds += time.perf_counter() - begin
-        return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), flat
-
-    def _encoded(self, seen: list[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
-        """Features and frames of what the robots of each part see: all at once, for each call takes its time."""
-        features, frames = self.parts[0].encoded(np.concatenate(seen))
-        ends = np.cumsum([len(own) for own in seen])[:-1]
-        return list(zip(np.split(features, ends), np.split(frames, ends), strict=True))
 
     def close(self) -> None:
         for part in self.parts:

@@ -31,7 +31,7 @@ TUNED: Mapping[str, Mapping[str, object]] = MappingProxyType({
 From ``python -m examples.studies tune_rivals --candidates 27 --seeds 4``: 27 settings each, the preset ``"paper"``
 among them, on four teams of 8 and 16 robots with seeds from 100 on. A third of the settings went on to twice the
 seeds, and a third of these to four times as many. The trials are in
-``examples/studies/data/tuning.parquet``, the table in ``docs/tables/tuning.md``. A method
+``examples/studies/data/tune_rivals.parquet``, the table in ``docs/tables/tuning.md``. A method
 whose preset was best keeps it.
 """
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, require, save_table
-from examples.recipes.task import WORLD
+from examples.common import require, save_table
+from examples.recipes.task import WORLD, recipe_arguments
 
 require("rl", "torchrl")
 try:
@@ -57,10 +57,7 @@ class Successes(Callback):
 
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
-    parser.add_argument("--iterations", type=count, default=200, help="of 8192 steps of teams each")
-    arguments = parser.parse_args()
+    arguments = recipe_arguments(__doc__, "--iterations", 200, "of 8192 steps of teams each")
     iterations, parts = (60, 3) if arguments.quick else (arguments.iterations, 10)
     torch.set_num_threads(1)  # the layers are too small to be shared
     own = {"num_robots": arguments.num_robots, "num_instances": 512, **WORLD}

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from examples.outputs import argument_parser, count, require, save_table
-from examples.recipes.task import WORLD, solved
+from examples.common import require, save_table
+from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "torch")
 import torch
@@ -145,10 +145,7 @@ def update(agent: Agent, optimizer: Any, batch: Batch, advantage: Any) -> None:
 
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
-    parser.add_argument("--updates", type=count, default=150, help="of 8192 steps of teams each")
-    arguments = parser.parse_args()
+    arguments = recipe_arguments(__doc__, "--updates", 150, "of 8192 steps of teams each")
     updates, parts = (60, 3) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the layers are too small to be shared

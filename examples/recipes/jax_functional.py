@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from examples.outputs import argument_parser, save_table
+from examples.common import argument_parser, save_table
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.jax import functional
@@ -40,8 +40,8 @@ def episode(gains: Any, problem: Problem, start: Any) -> tuple[Any, Any]:
 def replace_start(problem: Problem, start: Any) -> Problem:
     """The problem from other start states. A problem is a pytree: its arrays may be exchanged for traced ones."""
     leaves, structure = jax.tree.flatten(problem)
-    position = next(i for i, leaf in enumerate(leaves) if leaf is problem.start)
-    return jax.tree.unflatten(structure, [*leaves[:position], start, *leaves[position + 1 :]])
+    index = next(i for i, leaf in enumerate(leaves) if leaf is problem.start)
+    return jax.tree.unflatten(structure, [*leaves[:index], start, *leaves[index + 1 :]])
 
 
 def main() -> None:

@@ -15,12 +15,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from examples.outputs import argument_parser, count, require, save_table
-from examples.recipes.task import WORLD, solved
+from examples.common import require, save_table
+from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("jaxrl", "optax")
-
-
 import optax
 
 from d4orm_env.jax.functional_env import FunctionalEnv
@@ -87,15 +85,8 @@ def collect(env: FunctionalEnv, network: Any, carry: Any, key: Any) -> tuple[Any
     value = apply(network["critic"], observation)[..., 0]
     state, transition = jax.vmap(env.step)(jax.random.split(move, len(observation)), state, action)
     done = transition.finished | transition.done[:, None]
-    sample = Sample(
-        observation,
-        action,
-        log_density(network, observation, action),
-        value,
-        transition.rewards,
-        done,
-        transition.acted,
-    )
+    density = log_density(network, observation, action)
+    sample = Sample(observation, action, density, value, transition.rewards, done, transition.acted)
     return (state, transition.observations), (sample, (transition.done, transition.success))
 
 
@@ -158,10 +149,7 @@ def train(env: FunctionalEnv, num_updates: int, key: Any) -> tuple[Any, Any]:
 
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
-    parser.add_argument("--updates", type=count, default=150, help="of 8192 steps of teams each")
-    arguments = parser.parse_args()
+    arguments = recipe_arguments(__doc__, "--updates", 150, "of 8192 steps of teams each")
     num_updates, rows = (80, 4) if arguments.quick else (arguments.updates, 10)
     env = FunctionalEnv("random", num_robots=arguments.num_robots, num_instances=512, **WORLD)
     network, counts = jax.jit(partial(train, env, num_updates))(jax.random.key(0))

@@ -10,8 +10,8 @@ import sys
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, save_table
-from examples.recipes.task import WORLD, solved
+from examples.common import save_table
+from examples.recipes.task import WORLD, recipe_arguments, solved
 
 try:
     from ray.rllib.algorithms.ppo import PPOConfig
@@ -28,7 +28,7 @@ WORLDS = 64
 
 
 class Successes(RLlibCallback):
-    """Tells whether all have arrived and nobody touched anything."""
+    """Tells whether all have arrived without contact."""
 
     def on_episode_end(self, *, episode: Any, metrics_logger: Any, **others: Any) -> None:
         """Count."""
@@ -49,10 +49,7 @@ def settings(env_config: dict[str, Any]) -> PPOConfig:
 
 def main() -> None:
     """Train, print how many episodes succeeded on the way, and drive with what was learned."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
-    parser.add_argument("--iterations", type=count, default=200, help="of 2048 steps of teams each")
-    arguments = parser.parse_args()
+    arguments = recipe_arguments(__doc__, "--iterations", 200, "of 2048 steps of teams each")
     iterations, parts = (45, 3) if arguments.quick else (arguments.iterations, 10)
     algorithm = settings({"scenario": "random", "num_robots": arguments.num_robots, **WORLD}).build_algo()
     results = [algorithm.train()["env_runners"] for _ in range(iterations)]

@@ -10,8 +10,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from examples.outputs import argument_parser, count, require
-from examples.recipes.task import SEEDS, WORLD
+from examples.common import require
+from examples.recipes.task import SEEDS, WORLD, recipe_arguments
 
 require("rl", "stable_baselines3")
 import gymnasium
@@ -23,7 +23,7 @@ from d4orm_env.envs.joint_env import ENV_ID, register_environments
 
 
 def succeeds(model: PPO, env: gymnasium.Env[Any, Any], seed: int) -> bool:
-    """Whether all arrive without a contact, in the instance of a seed."""
+    """Check whether all arrive without a contact, in the instance of a seed."""
     observation, info = env.reset(seed=seed)
     over = False
     while not over:
@@ -34,10 +34,7 @@ def succeeds(model: PPO, env: gymnasium.Env[Any, Any], seed: int) -> bool:
 
 def main() -> None:
     """Train, and drive with what was learned."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
-    parser.add_argument("--steps", type=count, default=500_000, help="steps of teams to train")
-    arguments = parser.parse_args()
+    arguments = recipe_arguments(__doc__, "--steps", 500_000, "steps of teams to train")
     torch.set_num_threads(1)  # the layers are too small to be shared
     register_environments()
     world = {"scenario": "random", "num_robots": arguments.num_robots, **WORLD}

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from examples.outputs import argument_parser, count, require
-from examples.recipes.task import WORLD, solved
+from examples.common import require
+from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "supersuit", "stable_baselines3")
 import supersuit
@@ -44,10 +44,7 @@ def train(num_robots: int, worlds: int, steps: int, path: Path) -> PPO:
 
 def main() -> None:
     """Train, and drive with what was learned."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
-    parser.add_argument("--steps", type=count, default=2_000_000, help="robot-steps to train")
-    arguments = parser.parse_args()
+    arguments = recipe_arguments(__doc__, "--steps", 2_000_000, "robot-steps to train")
     torch.set_num_threads(1)  # the layers are too small to be shared
     path = arguments.out / "supersuit_ppo.zip"
     model = train(arguments.num_robots, 2 if arguments.quick else 16, 512 if arguments.quick else arguments.steps, path)

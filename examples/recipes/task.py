@@ -8,6 +8,8 @@ import time
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from examples.common import argument_parser, count
+
 from d4orm_env import navigation_v0
 from d4orm_env.envs.rewards import TrainingReward
 from d4orm_planners import Policy, run_episode
@@ -19,6 +21,14 @@ WORLD: Mapping[str, object] = MappingProxyType(
 
 SEEDS = range(50_000, 50_100)
 """Seeds of the unseen instances; those of the trainings are small."""
+
+
+def recipe_arguments(description: str | None, budget: str, default: int, help: str) -> argparse.Namespace:
+    """The arguments of a recipe: those of every program, the team's size, and how long to train."""
+    parser = argument_parser(description)
+    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
+    parser.add_argument(budget, type=count, default=default, help=help)
+    return parser.parse_args()
 
 
 def solved(policy: Policy, arguments: argparse.Namespace) -> str:

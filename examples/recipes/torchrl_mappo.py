@@ -5,7 +5,7 @@
 ``TorchRLNavigation`` steps all worlds in one compiled call. An episode is the team's, and a robot's own ends when it
 arrives: that is what the per-robot ``done`` is made of here, and robots that stand at their goals are left out of the
 loss. With TorchRL's own ``PettingZooWrapper`` give ``use_mask=True, done_on_any=False``: by its default the first robot
-that arrives ends the episode for all, and nobody else ever learns to.
+that arrives ends the episode for all, and no other ever learns to.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import time
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count, require, save_table
-from examples.recipes.task import WORLD, solved
+from examples.common import require, save_table
+from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "torchrl")
 import torch
@@ -82,10 +82,7 @@ def with_advantages(data: Any, advantages: GAE) -> Any:
 
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--num-robots", "--robots", type=count, default=4, help="size of the team")
-    parser.add_argument("--updates", type=count, default=200, help="of 8192 steps of teams each")
-    arguments = parser.parse_args()
+    arguments = recipe_arguments(__doc__, "--updates", 200, "of 8192 steps of teams each")
     updates, parts = (60, 3) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the layers are too small to be shared

@@ -15,25 +15,18 @@ from pathlib import Path
 from unittest.mock import patch
 
 import matplotlib.pyplot as plt
-from examples.outputs import argument_parser
-from examples.studies.comparisons import COMPARISONS
-from examples.studies.comparisons import main as compare
+from examples.common import argument_parser
+from examples.studies.settings_studies import COMPARISONS
+from examples.studies.settings_studies import main as compare
 
 from d4orm_env.core.errors import unknown
 from d4orm_planners.cli.app import main as d4orm
 
 FOLDER = Path(__file__).parent
 DATA = FOLDER / "data"
-SHARED = ("comparisons",)
+SHARED = ("settings_studies",)
 """Modules that are no studies."""
 NAMES = tuple(sorted({*COMPARISONS, "paper", *(path.stem for path in FOLDER.glob("[a-z]*.py"))} - {*SHARED}))
-WITH_TRIALS = (
-    "ablation", "against_mmd", "amswarm_gaps", "arrivals", "authors_code", "contact_penalty", "credit_by_update",
-    "disturbance_study", "dynobench", "fewer_samples", "gradient_dilution", "head_to_head", "imitate_expert",
-    "independent_noise", "jerk_limits", "lifelong", "multimodality", "paper_differences", "policy_rates", "scaling",
-    "solve_rates", "tune_learners", "tuned_rivals", "warm_start", "zero_shot",
-)  # fmt: skip
-"""Studies whose trials are in a file of their name."""
 TIMED = ("big-teams", "coarseness", "ipopt")
 """Figures of the paper that were measured on a machine that did nothing else."""
 FIGURES = ("amswarm", "nodes", "noise-schedule", "robustness", "selections", "team-size", *TIMED)
@@ -56,10 +49,9 @@ def make_all() -> None:
     out = argument_parser(__doc__).parse_args().out
     run("one_dimension", "--out", out)
     run("multimodality", "--team", 8, "--trials", DATA / "multimodality_team.parquet", "--out", out)
-    run("tune_rivals", "--trials", DATA / "tuning.parquet", "--out", out)
-    for study in WITH_TRIALS:
-        run(study, "--trials", DATA / f"{study}.parquet", "--out", out)
-    run("training_seeds", "--curves", DATA / "training_curves.csv", "--out", out)
+    for study in NAMES:
+        if (trials := DATA / f"{study}.parquet").is_file():
+            run(study, "--trials", trials, "--out", out)
     for figure in FIGURES:
         times = () if figure in TIMED else ("--no-times",)
         run("paper", figure, "--trials", DATA / f"{figure}.parquet", *times, "--out", out)

@@ -2,10 +2,10 @@
 
     python -m examples.studies ablation --seeds 30 --out ablation
 
-Eight robots on the circle, on random places and in rooms, each measure under the disturbance that it is there for. The
-table has how many trials succeeded and in how many anybody touched anything, with all measures and without, how likely
-it is that both are equally good (McNemar, paired by seed), and how much longer robots travel without where both succeed
-(mean, and Wilcoxon's test).
+Eight robots on the circle, at random positions and in rooms, each measure under the disturbance that it is there for.
+The table has how many trials succeeded and in how many there was a contact, with all measures and without, how
+likely it is that both are equally good (McNemar, paired by seed), and how much longer robots travel without where both
+succeed (mean, and Wilcoxon's test).
 `--go-on-from FILE` takes trials from a Parquet file, such as those with all measures in
 `examples/studies/data/disturbance_study.parquet`.
 """
@@ -13,10 +13,10 @@ it is that both are equally good (McNemar, paired by seed), and how much longer 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
-import numpy as np
-from examples.outputs import save_table, study_trials, trials_parser
+from examples.common import mean_text, save_table, study_trials, trials_parser
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 from examples.studies.disturbance_study import (
     DISTURBANCES,
@@ -88,12 +88,6 @@ def by_cell(trials: Sequence[Trial]) -> Cells:
     return {key: cell for key, cell in cells.items() if cell}
 
 
-def travel_time(trial: Trial) -> float:
-    """Return the robots' travel time, on average [s]."""
-    assert trial.travel_time is not None
-    return trial.travel_time
-
-
 def rows_of(cells: Cells) -> list[dict[str, Any]]:
     """A row for every scenario, disturbance and what is left out."""
     rows = []
@@ -102,13 +96,13 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
             pairs = in_common(cell[label], cell[ALL])
             both = [(one, other) for one, other in pairs if one.success and other.success]
             test = paired(cell[label], cell[ALL], lambda trial: float(not trial.success))
-            longer = [travel_time(one) - travel_time(other) for one, other in both]
-            cost = paired([one for one, _ in both], [other for _, other in both], travel_time) if both else None
+            longer = [one.travel_time - other.travel_time for one, other in both]
+            cost = paired(*zip(*both, strict=True), cost=attrgetter("travel_time")) if both else None
             rows.append(
                 {"disturbance": disturbance, "scenario": scenario, "left out": label, "trials": len(pairs),
                  "with": successes([other for _, other in pairs]), "without": successes([one for one, _ in pairs]),
                  "p (succeeded)": f"{test.success_p:.2g}",
-                 "travel time without [s]": f"{np.mean(longer):+.2f}" if longer else "-",
+                 "travel time without [s]": mean_text(longer, "+.2f"),
                  "p (travel time)": f"{cost.cost_p:.2g}" if cost else "-"}
             )  # fmt: skip
     return rows

@@ -15,7 +15,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.core.trajectory import accelerations
@@ -67,20 +67,17 @@ def measure(teams: Sequence[tuple[str, int]], seeds: int) -> list[Row]:
 
 def summary(rows: Sequence[Row]) -> list[Row]:
     """A row per team and planner; all but the seconds are of solutions."""
-
-    def mean(name: str, of: Sequence[Row]) -> str:
-        return f"{np.mean([row[name] for row in of]):.3g}" if of else "-"
-
     table = []
-    for team in dict.fromkeys((row["scenario"], row["robots"], row["planner"]) for row in rows):
-        own = [row for row in rows if (row["scenario"], row["robots"], row["planner"]) == team]
+    for (scenario, robots, planner), own in grouped(rows, "scenario", "robots", "planner").items():
         solved = [row for row in own if row["solved"]]
+        travel, jerk, moving = (
+            mean_text([row[name] for row in solved], ".3g") for name in ("travel_time", "jerk", "acceleration")
+        )
         seconds = [row["processor_seconds"] if row["solved"] else np.inf for row in own]
         table.append(
-            {"team": f"{team[0]}, {team[1]}", "planner": team[2], "solved": f"{len(solved)} of {len(own)}",
+            {"team": f"{scenario}, {robots}", "planner": planner, "solved": f"{len(solved)} of {len(own)}",
              "processor [s], median": f"{np.median(seconds):.2f}".replace("inf", "never"),
-             "travel time [s]": mean("travel_time", solved), "jerk [m²/s⁶]": mean("jerk", solved),
-             "acceleration [m²/s⁴]": mean("acceleration", solved)}
+             "travel time [s]": travel, "jerk [m²/s⁶]": jerk, "acceleration [m²/s⁴]": moving}
         )  # fmt: skip
     return table
 

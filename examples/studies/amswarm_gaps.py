@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from examples.outputs import is_solved, save_table, solved_columns, study_trials, trials_parser
+from examples.common import is_solved, mean_text, save_table, solved_columns, study_trials, trials_parser
 
 from d4orm_env import Problem, make_problem
 from d4orm_planners.evaluation.study import Study
@@ -56,11 +56,11 @@ def main() -> None:
     """Run every variant, and write the table."""
     arguments = trials_parser(__doc__, seeds=10).parse_args()
     settings, seeds = (TINY, 1) if arguments.quick else (PAPER, arguments.seeds)
-    there = problems()
-    study = Study(policies={"d4orm-d": settings}, scenarios=tuple(there.values()), seeds=range(seeds))
+    variants = problems()
+    study = Study(policies={"d4orm-d": settings}, scenarios=tuple(variants.values()), seeds=range(seeds))
     trials = study_trials(arguments, "amswarm_gaps", [study])
     rows: list[dict[str, Any]] = []
-    for name, problem in there.items():
+    for name, problem in variants.items():
         mine = [trial for trial in trials if trial.scenario == name]
         free, needed = gap(problem)
         makespans = [trial.makespan for trial in mine if is_solved(trial) and trial.makespan is not None]
@@ -68,6 +68,6 @@ def main() -> None:
             {"cylinders": name, "gap [m]": f"{free:.2f}", "a robot needs [m]": f"{needed:.2f}",
              **solved_columns(mine),
              "iterations": f"{np.median([trial.iterations for trial in mine if trial.iterations is not None]):g}",
-             "makespan [s]": f"{np.mean(makespans):.2f}" if makespans else "-"}
+             "makespan [s]": mean_text(makespans)}
         )  # fmt: skip
     save_table(rows, arguments.out / "amswarm_gaps.csv")

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -58,20 +58,19 @@ def median(values: list[int], count: int) -> str:
 def summary(rows: Rows) -> Rows:
     """A row per team."""
     table = []
-    for team in dict.fromkeys((row["scenario"], row["robots"]) for row in rows):
-        of = [row for row in rows if (row["scenario"], row["robots"]) == team]
+    for (scenario, robots), of in grouped(rows, "scenario", "robots").items():
         left = [row for row in of if not row["solved"]]
         colliding = [row["in_violation"] for row in left if not row["not_arrived"]]
         arrived = [row["arrived_after"] for row in of if row["arrived_after"]]
         table.append(
             {
-                "scenario": team[0],
-                "robots": team[1],
+                "scenario": scenario,
+                "robots": robots,
                 "iterations until all arrive": median(arrived, len(of)),
                 "until solved": median([row["iterations"] for row in of if row["solved"]], len(of)),
                 "solved": f"{len(of) - len(left)} of {len(of)}",
                 "all arrive and some collide": f"{len(colliding)} of {len(of)}",
-                "robots in violation": f"{np.mean(colliding):.3g}" if colliding else "-",
+                "robots in violation": mean_text(colliding, ".3g"),
             }
         )
     return table

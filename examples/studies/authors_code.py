@@ -24,7 +24,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.engine.choice import get_engine
@@ -89,8 +89,8 @@ def check_instance(code: Any, problem: Problem) -> None:
     """Make sure that their robots start and end where ours do."""
     env = code.d4orm.envs.get_env("multi2dholo", problem.num_robots)
     for theirs, ours in ((env.x0, problem.start), (env.xg, problem.goal)):
-        there = np.array(theirs).reshape(problem.num_robots, -1)[:, : problem.dimension]
-        if not np.allclose(there, ours[:, : problem.dimension], atol=1e-5):
+        positions = np.array(theirs).reshape(problem.num_robots, -1)[:, : problem.dimension]
+        if not np.allclose(positions, ours[:, : problem.dimension], atol=1e-5):
             raise ValueError(f"its circle of {problem.num_robots} robots is not 'paper_circle'; is it proroklab/d4orm?")
 
 
@@ -132,20 +132,15 @@ def measure(solvers: dict[str, Solver], teams: tuple[int, ...], seeds: int, max_
 
 def summary(rows: list[Row]) -> list[Row]:
     """A row per team and planner."""
-
-    def mean(values: list[float], digits: int) -> str:
-        return f"{np.mean(values):.{digits}f}" if values else "-"
-
     table = []
-    for size, label in dict.fromkeys((row["robots"], row["planner"]) for row in rows):
-        own = [row for row in rows if (row["robots"], row["planner"]) == (size, label)]
+    for (size, label), own in grouped(rows, "robots", "planner").items():
         solved = [row for row in own if row["solved"]]
         table.append(
             {"robots": size, "planner": label, "solved": f"{len(solved)} of {len(own)}",
              "verified": f"{sum(row['verified'] for row in own)} of {len(own)}",
-             "iterations": mean([row["iterations"] for row in solved], 1),
+             "iterations": mean_text([row["iterations"] for row in solved], ".1f"),
              "least, most": f"{min(row['iterations'] for row in own)}, {max(row['iterations'] for row in own)}",
-             "travel time [s]": mean([row["travel_time"] for row in solved if row["verified"]], 2)}
+             "travel time [s]": mean_text([row["travel_time"] for row in solved if row["verified"]])}
         )  # fmt: skip
     return table
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import (
+from examples.common import (
     is_solved,
     penalised_steps,
     plt,

@@ -2,11 +2,11 @@
 
     python -m examples.studies disturbance_study --seeds 50 --out disturbance_study
 
-D4orm-C2F beside a plan of D4orm-D executed open loop, ORCA and PPO, each with the same seeds, on the circle, on random
-places and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all; and on the circle and
-on random places the same robots are rigid bodies in MuJoCo, as pucks and on two wheels, where that is installed.
+D4orm-C2F beside a plan of `hybrid` executed open loop, ORCA and PPO, each with the same seeds, on the circle, at random
+positions and in rooms. Every disturbance is on by itself at one level, beside no disturbance at all; and on the circle
+and at random positions the same robots are rigid bodies in MuJoCo, as pucks and on two wheels, where that is installed.
 Written is for every policy, scenario and disturbance how many trials succeeded, with Wilson's 95% interval, in how many
-somebody touched anything, and how many ended too late; an overview of these, and a heat map. Trials are stored in the
+there was a contact, and how many ended too late; an overview of these, and a heat map. Trials are stored in the
 folder one by one, and a call that was broken off, or one with more seeds or scenarios, goes on from there.
 `--trials FILE` makes table and heat map of trials that are in a Parquet file, such as those in `examples/studies/data`.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.common import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 
 from d4orm_env.disturbances import (
@@ -118,7 +118,7 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
 
 
 def successes(trials: Sequence[Trial]) -> str:
-    """Return the number of successes, and of trials in which anybody touched anything."""
+    """Return the number of successes, and of trials with a contact."""
     return f"{sum(trial.success for trial in trials)}, {sum(trial.collided > 0 for trial in trials)}"
 
 
@@ -137,10 +137,10 @@ def draw(cells: Cells, path: Path) -> None:
     scenarios = list(dict.fromkeys(scenario for scenario, _, _ in cells))
     figure, axes = plt.subplots(len(scenarios), 1, figsize=(9, 1.2 + 1.7 * len(scenarios)), sharex=True, squeeze=False)
     for axis, scenario in zip(axes[:, 0], scenarios, strict=True):
-        policies = list(dict.fromkeys(policy for position, policy, _ in cells if position == scenario))
+        policies = list(dict.fromkeys(policy for where, policy, _ in cells if where == scenario))
         shares = np.full((len(policies), len(COLUMNS)), np.nan)
-        for (position, policy, disturbance), trials in cells.items():
-            if position == scenario:
+        for (where, policy, disturbance), trials in cells.items():
+            if where == scenario:
                 shares[policies.index(policy), COLUMNS.index(disturbance)] = np.mean([one.success for one in trials])
         axis.imshow(shares, vmin=0, vmax=1, cmap="viridis", aspect="auto")
         for (row, column), share in np.ndenumerate(shares):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, load_dynobench
 from d4orm_planners import Plan, make_planner
@@ -37,15 +37,8 @@ def loaded(path: Path) -> Problem | str:
 def row_of(path: Path, seed: int) -> dict[str, Any]:
     """The row of a file and a seed."""
     problem = loaded(path)
-    row: dict[str, Any] = {
-        "instance": path.stem,
-        "seed": seed,
-        "robots": 0,
-        "models": "",
-        "refused": "",
-        "solved": False,
-    }
-    row |= {"seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
+    row: dict[str, Any] = {"instance": path.stem, "seed": seed, "robots": 0, "models": "", "refused": ""}
+    row |= {"solved": False, "seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
     if isinstance(problem, str):
         return row | {"refused": problem}
     row |= {"robots": problem.num_robots, "models": ", ".join(sorted(set(problem.team.models)))}
@@ -67,10 +60,7 @@ def main() -> None:
     rows = study_rows(
         arguments, "dynobench", lambda: [row_of(path, seed) for path in paths for seed in range(arguments.seeds)]
     )
-    instances: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        if not row["refused"]:
-            instances.setdefault(row["instance"], []).append(row)
+    instances = grouped((row for row in rows if not row["refused"]), "instance")
     save_table([described(own) for own in instances.values()], arguments.out / "dynobench.csv")
 
 
@@ -86,7 +76,3 @@ def described(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "solved": f"{len(solved)} of {len(rows)}", "planning [s]": median("seconds"),
         "makespan [s]": median("makespan"), "sum of costs [s]": median("sum_of_costs"),
     }  # fmt: skip
-
-
-if __name__ == "__main__":
-    main()

@@ -22,7 +22,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import COLOURS, plt, save_figure, save_table, study_parser, study_rows
+from examples.common import COLOURS, grouped, plt, save_figure, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem
@@ -128,7 +128,7 @@ def means(rows: Rows, size: int, credit: str, name: str) -> list[float]:
 def summary(rows: Rows) -> Rows:
     """A row per team size and credit; theory has normally distributed rewards."""
     table = []
-    for size, credit in dict.fromkeys((row["robots"], row["credit"]) for row in rows):
+    for size, credit in grouped(rows, "robots", "credit"):
         of = partial(means, rows, size, credit)
         limit = normal_limit(of("samples")[0])
         reward, lower, upper = mean_interval(of("reward"))

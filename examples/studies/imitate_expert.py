@@ -3,8 +3,8 @@
     python -m examples.studies imitate_expert --seeds 3
     python -m examples.studies imitate_expert --trials examples/studies/data/imitate_expert.parquet
 
-The clone sees what the expert's own drives led to, and on its own comes into places where the expert never was. DAgger
-lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
+The clone sees what the expert's own drives led to, and on its own comes into states that the expert never was in.
+DAgger lets the network drive and asks the expert there. PPO goes on from that by reward, and is compared with PPO from
 nothing. Success is that in 100 random instances that nothing learns from. All of it is in policy files of "ppo". Broken
 off, the same command goes on; some ten minutes a seed. With ``--trials`` nothing is trained, and the table is made of a
 file that it wrote before. The same from the command line: ``d4orm train imitation`` and ``d4orm train ppo
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import require, save_table, study_parser, study_rows, success_of_seeds
+from examples.common import grouped, mean_text, require, save_table, study_parser, study_rows, success_of_seeds
 
 require("rl", "stable_baselines3", "tensorboard")
 
@@ -72,10 +72,8 @@ def summary(rows: Rows) -> list[dict[str, object]]:
     A round learns from so many moments of robots as its episodes happen to have, which differ from seed to seed.
     """
     table = []
-    for way in dict.fromkeys(row["way"] for row in rows):
-        own = [row for row in rows if row["way"] == way]
-        curves = [[row for row in own if row["seed"] == seed] for seed in sorted({row["seed"] for row in own})]
-        points = list(zip(*curves, strict=True))
+    for (way,), own in grouped(rows, "way").items():
+        points = list(zip(*grouped(own, "seed").values(), strict=True))
         shown = points if way == "DAgger" or len(points) == 1 else [points[0], points[-1]]
         table += [_point(way, point) for point in shown]
     return table
@@ -90,7 +88,7 @@ def _point(way: str, point: Rows) -> dict[str, object]:
         "seeds": len(point),
         **success_of_seeds(ends),
         "travel time [s]": f"{np.mean([row['travel_time'] for row in point]):.2f}",
-        "imitation error": f"{np.mean(errors):.2f}" if errors else "",
+        "imitation error": mean_text(errors, none=""),
     }
 
 

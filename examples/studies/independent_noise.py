@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
 from scipy.stats import mannwhitneyu
 
 from d4orm_env import Problem, make_problem, rollout
@@ -61,12 +61,9 @@ def measure(teams: Any, seeds: int, **settings: Any) -> Rows:
 def summary(rows: Rows) -> Rows:
     """A row per team."""
     table = []
-    for team in dict.fromkeys((row["robots"], row["samples"]) for row in rows):
-        rewards = {
-            draw: [row["reward"] for row in rows if (row["robots"], row["samples"], row["noise"]) == (*team, draw)]
-            for draw in ("turned", "apart")
-        }
-        shown = {"robots": team[0], "samples": team[1], "seeds": len(rewards["turned"])}
+    for (robots, samples), own in grouped(rows, "robots", "samples").items():
+        rewards = {draw: [row["reward"] for row in drawn] for (draw,), drawn in grouped(own, "noise").items()}
+        shown = {"robots": robots, "samples": samples, "seeds": len(rewards["turned"])}
         for draw, values in rewards.items():
             mean, lower, upper = mean_interval(values)
             shown[f"reward, {draw}"] = f"{mean:.3f}" + (f" ({lower:.3f} to {upper:.3f})" if lower is not None else "")

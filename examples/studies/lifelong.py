@@ -4,7 +4,7 @@
     python -m examples.studies lifelong --minutes 10 --seeds 10
     python -m examples.studies lifelong --minutes 5 --scenario warehouse --num-robots 32
 
-The throughput is compared with a bound that robots cannot beat in the long run: if nobody were in its way, a robot
+The throughput is compared with a bound that robots cannot beat in the long run: without others in its way, a robot
 would accelerate to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
 pass through. It would drive straight, or among walls along the shortest path, wherever it was heading before.
 """
@@ -16,14 +16,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from examples.outputs import count, save_gif, save_table, study_parser, study_rows
+from examples.common import count, film, save_gif, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
-from numpy.typing import NDArray
 
 from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.lifelong import goal_region
-from d4orm_env.render import FrameRenderer
 from d4orm_planners import make_policy
 from d4orm_planners.evaluation.summary import mean_interval
 
@@ -45,32 +43,7 @@ def least_times(problem: Problem, joint: JointState) -> np.ndarray:
     return (reached - towards) / acceleration + np.maximum(distance - to_top_speed, 0) / speed
 
 
-class Film:
-    """Pictures of the first seconds."""
-
-    def __init__(self, problem: Problem, seconds: float) -> None:
-        self.frames: list[NDArray[np.uint8]] = []
-        self._seconds, self._dt, self._nobody = seconds, problem.dt, np.zeros(problem.num_robots, bool)
-        self._trail: list[np.ndarray] = []
-        # With a view of all places that a goal may come to lie.
-        self._renderer = FrameRenderer(problem, (520, 540), goal_region(problem))
-
-    def show(self, joint: JointState, collided: np.ndarray, reached: int) -> None:
-        """Draw what a step has come to, unless the film is over."""
-        self._trail = [*self._trail[-30:], joint.states[:, :2]]
-        seconds = joint.steps * self._dt
-        if seconds <= self._seconds:
-            trail, caption = np.stack(self._trail), f"{seconds:.1f} s    {reached} goals reached"
-            self.frames.append(
-                self._renderer.draw(joint.states, self._nobody, collided, joint.goals, trail, caption=caption)
-            )
-
-    def close(self) -> None:
-        """Free what draws."""
-        self._renderer.close()
-
-
-def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
+def drive(problem: Problem, seed: int, minutes: float, seconds: float) -> tuple[dict[str, Any], list[Any]]:
     """Drive for so many minutes, and film the first seconds: what was measured, and the film."""
     env = navigation_v0.parallel_env(problem=problem, lifelong=True)
     env.max_cycles = max(round(60 * minutes / problem.dt), 1)
@@ -80,20 +53,18 @@ def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dic
 
     joint = split_state(problem, env.state())
     bounds = list(least_times(problem, joint))
-    act_times, collided = [], np.zeros(problem.num_robots, bool)
-    touched, pictures = collided, Film(problem, film)
-    pictures.show(joint, collided, 0)
+    act_times, joints, goals_reached = [], [joint], [0]
+    collided = [np.zeros(problem.num_robots, bool)]
     while env.agents:
         begin = time.perf_counter()
         actions = policy.act(observations, env.state())
         act_times.append(time.perf_counter() - begin)
         observations, _, _, _, infos = env.step(actions)
-        before, joint = joint, split_state(problem, env.state())
-        bounds.extend(least_times(problem, joint)[(joint.goals != before.goals).any(axis=1)])
-        collided = np.array([infos[agent]["collided"] for agent in env.possible_agents])
-        touched = touched | collided
-        pictures.show(joint, collided, len(bounds) - problem.num_robots)
-    pictures.close()
+        joint = split_state(problem, env.state())
+        bounds.extend(least_times(problem, joint)[(joint.goals != joints[-1].goals).any(axis=1)])
+        joints.append(joint)
+        collided.append(np.array([infos[agent]["collided"] for agent in env.possible_agents]))
+        goals_reached.append(len(bounds) - problem.num_robots)
     metrics, replanned = env.unwrapped.metrics(), sum(loop.replanned for loop in policy.loops)
     env.close()
     row = {
@@ -101,12 +72,16 @@ def drive(problem: Problem, seed: int, minutes: float, film: float) -> tuple[dic
         "seconds": joint.steps * problem.dt,
         "goals": int(metrics["goals_reached"]),
         "least_time": float(np.mean(bounds)),
-        "touched": int(touched.sum()),
+        "touched": int(np.any(collided, axis=0).sum()),
         "contacts": int(metrics["collisions"]),
         "replanned": replanned,
         "loop_seconds": act_times,
     }
-    return row, pictures.frames
+    shown = joints[: 1 + int(seconds / problem.dt)]
+    captions = [f"{j.steps * problem.dt:.1f} s    {count} goals reached" for j, count in zip(shown, goals_reached)]
+    faded = np.zeros((len(shown), problem.num_robots), bool)
+    # With a view of all positions that a goal may have.
+    return row, film(problem, shown, faded, collided[: len(shown)], captions, goal_region(problem))
 
 
 def summary(drives: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -144,15 +119,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=count, default=1, help="how many, one after the other")
     parser.add_argument("--film", type=float, default=20.0, help="seconds of the animation")
     arguments = parser.parse_args()
-    num_robots, minutes, film = arguments.num_robots, arguments.minutes, arguments.film
+    num_robots, minutes, seconds = arguments.num_robots, arguments.minutes, arguments.film
     if arguments.quick:
-        num_robots, minutes, film = 4, 0.1, 2.0
+        num_robots, minutes, seconds = 4, 0.1, 2.0
 
     def measure() -> list[dict[str, Any]]:
         drives: list[dict[str, Any]] = []
         for seed in range(arguments.seed, arguments.seed + arguments.seeds):
             problem = make_problem(arguments.scenario, num_robots=num_robots, seed=seed, **AS_IN_THE_PAPER)
-            row, frames = drive(problem, seed, minutes, 0.0 if drives else film)
+            row, frames = drive(problem, seed, minutes, 0.0 if drives else seconds)
             drives.append({"scenario": arguments.scenario, "seed": seed, **row})
             if seed == arguments.seed:
                 save_gif(frames, arguments.out / "lifelong.gif", problem.dt)

@@ -1,4 +1,4 @@
-"""Kinds of solution that a planner finds: two robots swap places around an obstacle (the paper's appendix A).
+"""Kinds of solution that a planner finds: two robots swap positions around an obstacle (the paper's appendix A).
 
     python -m examples.studies multimodality --seeds 100
     python -m examples.studies multimodality --team 8 --seeds 30
@@ -10,13 +10,13 @@ The other two are cyclic (robot 0 above the obstacle, the obstacle above robot 1
 weave, and pass the other on one side before it passes the obstacle on the other. The signs do not tell how often a
 robot goes round.
 
-With ``--team`` a whole team changes places on a circle, the appendix's harder problem: robots meet pairwise, and pass
+With ``--team`` a whole team swaps positions on a circle, the appendix's harder problem: robots meet pairwise, and pass
 each other on one side or the other. A plan's class is the sign of the angle that each robot sweeps around each other
 one, 28 signs with eight robots. The table has how many seeds were solved, how many classes the solutions are of, and
 ten of them drawn at random, which does not grow with the seeds (rarefaction); how many pairs of solutions are of the
-same class, and how far apart two are (root mean square distance of the robots' places over time, mean over all pairs).
-Slow plans differ more, so the last two rows have plans of equal travel times only. The plot has all solutions along the
-directions in which they differ most.
+same class, and how far apart two are (root mean square distance of the robots' positions over time, mean over all
+pairs). Slow plans differ more, so the last two rows have plans of equal travel times only. The plot has all solutions
+along the directions in which they differ most.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from math import comb
 from typing import Any
 
 import numpy as np
-from examples.outputs import count, plt, require, save_figure, save_table, study_parser, study_rows
+from examples.common import count, mean_text, plt, require, save_figure, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 require("ipopt", "casadi")
@@ -154,8 +154,8 @@ def draw_plan(panel: Any, problem: Problem, positions: np.ndarray, colour: str) 
     for robot, style in enumerate(("-", "--")):
         path = positions[:, robot]
         panel.plot(*path.T, style, color=colour, linewidth=1.4)
-        position, reach = path[nearest], float(problem.team.radius[robot])
-        panel.add_patch(plt.Circle(position, reach, facecolor="white", edgecolor=colour, zorder=3))
+        position, radius = path[nearest], float(problem.team.radius[robot])
+        panel.add_patch(plt.Circle(position, radius, facecolor="white", edgecolor=colour, zorder=3))
         panel.text(*position, str(robot), ha="center", va="center", fontsize=6.5, zorder=4)
     panel.set(xlim=(-2.8, 2.8), ylim=(-1.4, 1.4), aspect="equal")
     panel.set_axis_off()
@@ -171,7 +171,7 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
             pairs = zip(solutions(rows, label), found, strict=True)
             times = [row["travel_time"] for row, of in pairs if of == signs]
             line[f"{label}: plans"] = str(len(times))
-            line[f"{label}: travel time [s]"] = f"{np.mean(times):.2f}" if times else ""
+            line[f"{label}: travel time [s]"] = mean_text(times, none="")
         table.append(line)
     return table
 
@@ -201,8 +201,8 @@ def row_of(label: str, plans: Sequence[Row], trials: int) -> dict[str, Any]:
         "classes": len(set(classes)),
         f"classes of {DRAWN} plans": f"{rarefied(classes, DRAWN):.2f}" if len(plans) >= DRAWN else "-",
         "pairs of one class": f"{same / len(pairs):.0%}" if pairs else "-",
-        "distance [m]": f"{np.mean(apart):.2f}" if pairs else "-",
-        "travel time [s]": f"{np.mean(times):.2f}" if times else "-",
+        "distance [m]": mean_text(apart),
+        "travel time [s]": mean_text(times),
     }
 
 

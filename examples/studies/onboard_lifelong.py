@@ -22,9 +22,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from examples.outputs import argument_parser, count, require, save_figure, save_gif, save_table
+from examples.common import argument_parser, count, require, save_figure, save_gif, save_table
 from examples.studies.onboard.mission import TICK, Mission
-from examples.studies.onboard.results import Row, draw, film, robot_rows, run_row, timeline
+from examples.studies.onboard.results import Row, draw, pictures, robot_rows, run_row, timeline
 from examples.studies.onboard.robot import Robot
 from examples.studies.onboard.thinking import COLUMNS, Log
 from examples.studies.onboard.world import RobotProcesses, World, free_endpoints
@@ -72,21 +72,9 @@ def main() -> int:
             parser.error(f"--kill names robot {robot}; of {robots} robots the last one is {robots - 1}")
     world_endpoint, team_endpoint = free_endpoints(2)
     mission = Mission(
-        robots=robots,
-        seed=arguments.seed,
-        side=4.0,
-        horizon=80,
-        samples=arguments.samples,
-        denoising_steps=50,
-        iterations=2,
-        think=7,
-        agree=3,
-        timeout=arguments.timeout,
-        silence=30.0,
-        namespace=f"onboard-{secrets.token_hex(4)}",
-        world=world_endpoint,
-        team=team_endpoint,
-    )
+        robots=robots, seed=arguments.seed, samples=arguments.samples, timeout=arguments.timeout,
+        namespace=f"onboard-{secrets.token_hex(4)}", world=world_endpoint, team=team_endpoint,
+    )  # fmt: skip
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -145,4 +133,4 @@ def write(world: World, rows: list[Row], out: Path, seconds: float) -> None:
     print(f"wrote {path}")
     until = record.began[min(round(SHOWN / TICK), record.steps - 1)] - record.began[0]
     save_figure(draw(rows, world.problem.num_robots, until), out / "onboard_lifelong_timeline.png")
-    save_gif(film(world.problem, record, seconds), out / "onboard_lifelong.gif", TICK)
+    save_gif(pictures(world.problem, record, seconds), out / "onboard_lifelong.gif", TICK)

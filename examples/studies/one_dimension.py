@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import COLOURS, argument_parser, count, plt, save_figure, save_table
+from examples.common import COLOURS, argument_parser, count, plt, save_figure, save_table
 
 from d4orm_planners.sampling.settings import annealed, constant
 from d4orm_planners.sampling.weights import SoftmaxWeights

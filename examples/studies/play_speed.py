@@ -4,7 +4,7 @@
     python -m examples.studies play_speed --seconds 30 --browser
     python -m examples.studies play_speed --minutes 20 --browser
 
-A team with lifelong goals is driven live, and somebody looks at it: a client that draws nothing, or with `--browser`
+A team with lifelong goals is driven live, and shown to a viewer: a client that draws nothing, or with `--browser`
 headless Chromium, which without a graphics processor draws on the processor that plans. Where Chromium runs, the time
 that it takes is part of the measurement.
 """
@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import require
+from examples.common import require
 from numpy.typing import NDArray
 
 require("viz", "viser")
@@ -38,7 +38,7 @@ from d4orm_planners.play.session import Session
 
 
 class Client:
-    """Somebody who receives what is sent, and draws nothing."""
+    """A client that receives what is sent, and draws nothing."""
 
     def __init__(self, address: str) -> None:
         protocols: Any = [f"viser-v{viser.__version__}"]
@@ -83,7 +83,7 @@ class Browser:
 
 @contextmanager
 def looking(address: str, in_browser: bool) -> Iterator[Client | Browser]:
-    """Somebody who looks."""
+    """Connect a client or a browser."""
     if not in_browser:
         client = Client(address)
         yield client
@@ -147,12 +147,12 @@ def measure(arguments: argparse.Namespace) -> None:
     thread = threading.Thread(target=playground.run)
     thread.start()
     try:
-        with looking(playground.address, arguments.browser) as somebody:
+        with looking(playground.address, arguments.browser) as viewer:
             watch(session, arguments.warmup)
             seconds = 60 * arguments.minutes or arguments.seconds
-            before, begin = somebody.frames(), time.perf_counter()
+            before, begin = viewer.frames(), time.perf_counter()
             loops, held, contacts = watch(session, seconds)
-            passed, after = time.perf_counter() - begin, somebody.frames()
+            passed, after = time.perf_counter() - begin, viewer.frames()
             drops = [drop(session, np.random.default_rng(seed)) for seed in range(arguments.drops)]
             print(f"{problem.name}, {problem.num_robots} robots, {', '.join(session.policies)}: {passed:.0f} s")
             for name, number in after.items():

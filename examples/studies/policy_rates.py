@@ -16,8 +16,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from examples.outputs import require, save_table, study_parser, study_rows
+from examples.common import mean_text, require, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 require("rl", "stable_baselines3")
@@ -108,7 +107,7 @@ def cell(rows: Rows) -> tuple[str, str, str]:
         return "", "", ""
     times = [row["travel_time"] for row in rows if row["success"]]
     lower, upper = wilson_interval(len(times), len(rows))
-    return f"{len(times)} of {len(rows)}", f"{lower:.0%} to {upper:.0%}", f"{np.mean(times):.2f}" if times else "-"
+    return f"{len(times)} of {len(rows)}", f"{lower:.0%} to {upper:.0%}", mean_text(times)
 
 
 def table_of(rows: Rows, table: str) -> list[dict[str, str]]:

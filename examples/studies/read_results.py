@@ -14,7 +14,7 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from examples.outputs import argument_parser, plt, require, save_figure, save_table
+from examples.common import argument_parser, plt, require, save_figure, save_table
 
 require("dev", "pandas")
 import pandas as pd

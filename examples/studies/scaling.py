@@ -1,4 +1,4 @@
-"""Planning time of D4orm-D by team size at constant density.
+"""Planning time of `hybrid` by team size at constant density.
 
     python -m examples.studies scaling --seeds 3
     python -m examples.studies scaling --seeds 1 --num-robots 2000
@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import COLOURS, count, plt, save_figure, save_table, study_parser, study_rows
+from examples.common import COLOURS, count, grouped, plt, save_figure, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import make_problem
@@ -60,8 +60,7 @@ def measure(sizes: Sequence[int], seeds: int, time_limit: float) -> list[dict[st
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """A row per team size."""
     table = []
-    for robots in dict.fromkeys(row["robots"] for row in rows):
-        team = [row for row in rows if row["robots"] == robots]
+    for (robots,), team in grouped(rows, "robots").items():
         seconds = [row["seconds"] for row in team]
         table.append(
             {

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.outputs import argument_parser, count
+from examples.common import argument_parser, count
 
 from d4orm_env import make_problem, rollout
 from d4orm_env.render import save_picture
@@ -34,7 +34,7 @@ SCENARIOS: dict[str, dict[str, Any]] = {
 
 
 def main() -> None:
-    """One picture per scenario, with everybody at the start."""
+    """One picture per scenario, with all robots at the start."""
     parser = argument_parser(__doc__)
     parser.add_argument("--num-robots", "--robots", type=count, default=8)
     parser.add_argument("--seed", type=int, default=0)
@@ -42,8 +42,8 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name, settings in list(SCENARIOS.items())[: 2 if arguments.quick else None]:
         problem = make_problem(name, num_robots=arguments.num_robots, seed=arguments.seed, **settings)
-        standing = rollout(problem.replace(horizon=1), np.zeros((1, problem.num_robots, problem.control_size)))
+        at_rest = rollout(problem.replace(horizon=1), np.zeros((1, problem.num_robots, problem.control_size)))
         path = save_picture(
-            problem, standing, arguments.out / f"scenario_{name}.png", title=f"{name}, {problem.num_robots} robots"
+            problem, at_rest, arguments.out / f"scenario_{name}.png", title=f"{name}, {problem.num_robots} robots"
         )
         print(f"wrote {path}")

@@ -8,7 +8,7 @@
 Random instances differ by seed; those of the AMSwarm comparison have their starts jittered by 5 mm. Every plan that
 counts as solved has passed ``verify()``. Iterations and seconds are those to the first solution, compilation not
 counted; with ``--improve`` the search goes on from there until so many seconds have passed in all. No plan takes
-less time to travel than "least": that of robots which drive straight home with nobody and nothing in the way.
+less time to travel than "least": that of robots which drive straight to their goals with nothing in the way.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.common import grouped, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, verify
@@ -28,13 +28,7 @@ from d4orm_planners import make_planner
 
 
 class Case(NamedTuple):
-    """Instances of a scenario.
-
-    Attributes:
-        label: In the tables.
-        scenario: Its name.
-        settings: Its arguments.
-    """
+    """Instances of a scenario with these arguments, and what the tables call them."""
 
     label: str
     scenario: str
@@ -173,8 +167,7 @@ def measure(chosen: Mapping[str, Cases], seeds: int, preset: str | None, improve
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A row of the table per team and planner; travel times and makespans are those of plans that solve."""
     table = []
-    for team, planner in dict.fromkeys((row["team"], row["planner"]) for row in rows):
-        plans = [row for row in rows if (row["team"], row["planner"]) == (team, planner)]
+    for (team, planner), plans in grouped(rows, "team", "planner").items():
         solved = [row for row in plans if row["solved"]]
         iterations, seconds = ([row[name] for row in plans] for name in ("iterations", "seconds"))
         makespans = [row["makespan"] for row in solved] or [np.inf]
@@ -213,8 +206,8 @@ def main() -> None:
         return measure(chosen, seeds, arguments.preset, arguments.improve)
 
     rows = study_rows(arguments, "solve_rates", plans)
-    for name in dict.fromkeys(row["set"] for row in rows):
-        save_table(summary([row for row in rows if row["set"] == name]), arguments.out / f"solve_rates_{name}.csv")
+    for (name,), own in grouped(rows, "set").items():
+        save_table(summary(own), arguments.out / f"solve_rates_{name}.csv")
     shown = [row for row in rows if row["team"] in README.get(row["set"], ())]
     if shown:
         columns = ("team", "planner", "solved", "first plan [s] (median, most)", "travel time [s]", "least [s]")

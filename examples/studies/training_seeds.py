@@ -1,28 +1,36 @@
 """Reinforcement learning with several seeds: curves of PPO and SAC with 95% intervals of the mean (Student's t).
 
     python -m examples.studies training_seeds --seeds 3
-    python -m examples.studies training_seeds --curves examples/studies/data/training_curves.csv
+    python -m examples.studies training_seeds --trials examples/studies/data/training_seeds.parquet
 
 Trains every learner with every seed, one after another: about three hours of one core. Broken off, it goes on where it
-was. With ``--curves`` it trains nothing, and makes table and picture of a file that it wrote before.
+was. With ``--trials`` it trains nothing, and makes table and picture of a file that it wrote before.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from examples.outputs import COLOURS, argument_parser, count, plt, require, save_figure, save_table, success_of_seeds
+from examples.common import (
+    COLOURS,
+    grouped,
+    plt,
+    require,
+    save_figure,
+    save_table,
+    study_parser,
+    study_rows,
+    success_of_seeds,
+)
 
 require("rl", "stable_baselines3", "tensorboard")
 
-from d4orm_env.core.files import replaced_when_done
 from d4orm_planners.evaluation.summary import mean_interval
-from d4orm_planners.rl.checkpoints import Evaluation
 from d4orm_planners.rl.training import TrainingSettings, train
 
 CROWDS = TrainingSettings(
@@ -51,10 +59,10 @@ LEARNERS: Mapping[str, TrainingSettings] = {
     ),
 }
 QUICK = {"steps": 256, "stages": 2, "validation_worlds": 2, "num_envs": 16}
-Rows = Sequence[Mapping[str, str]]
+Rows = Sequence[Mapping[str, Any]]
 
 
-def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, str]]:
+def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, Any]]:
     """A row per learner, seed and stage."""
     rows = []
     for learner, settings in LEARNERS.items():
@@ -64,45 +72,30 @@ def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, str]]:
                 chosen = replace(chosen, **QUICK, mixture=("random 2", "circle 2") if chosen.mixture else ())
             folder = out / f"{learner.lower().replace(', ', '-').replace(' ', '-')}-{seed}"
             print(f"{learner}, seed {seed}", flush=True)
-            rows += [_row(learner, seed, point) for point in train(chosen, folder).curve]
+            rows += [
+                {"learner": learner, "seed": seed, "steps": point.steps, "success": point.success_rate,
+                 "travel_time": point.travel_time, "seconds": point.seconds, "env_share": point.env_share}
+                for point in train(chosen, folder).curve
+            ]  # fmt: skip
     return rows
-
-
-def _row(learner: str, seed: int, point: Evaluation) -> dict[str, str]:
-    return {
-        "learner": learner,
-        "seed": str(seed),
-        "steps": str(point.steps),
-        "success": f"{point.success_rate:.4f}",
-        "travel_time": f"{point.travel_time:.3f}",
-        "seconds": f"{point.seconds:.1f}",
-        "env_share": f"{point.env_share:.3f}",
-    }
-
-
-def by_learner(rows: Rows) -> dict[str, dict[int, list[Mapping[str, str]]]]:
-    """Rows by learner and steps, a row per seed."""
-    found: dict[str, dict[int, list[Mapping[str, str]]]] = {}
-    for row in rows:
-        found.setdefault(row["learner"], {}).setdefault(int(row["steps"]), []).append(row)
-    return found
 
 
 def summary(rows: Rows) -> list[dict[str, object]]:
     """A row per learner: what its seeds came to in the end, and what they took."""
     table: list[dict[str, object]] = []
-    for learner, stages in by_learner(rows).items():
-        last, every = stages[max(stages)], [row for stage in stages.values() for row in stage]
-        ends = [100 * float(row["success"]) for row in last]
-        minutes = sum(float(row["seconds"]) for row in every) / len(last) / 60
+    for (learner,), every in grouped(rows, "learner").items():
+        steps = max(row["steps"] for row in every)
+        last = [row for row in every if row["steps"] == steps]
+        ends = [100 * row["success"] for row in last]
+        minutes = sum(row["seconds"] for row in every) / len(last) / 60
         row = {
             "learner": learner,
             "seeds": len(last),
-            "robot-steps": f"{max(stages) / 1e6:.1f} million",
+            "robot-steps": f"{steps / 1e6:.1f} million",
             **success_of_seeds(ends, "success in the end"),
-            "travel time [s]": f"{np.mean([float(one['travel_time']) for one in last]):.2f}",
+            "travel time [s]": f"{np.mean([one['travel_time'] for one in last]):.2f}",
             "minutes each": f"{minutes:.0f}",
-            "environment's share": f"{np.mean([float(one['env_share']) for one in every]):.0%}",
+            "environment's share": f"{np.mean([one['env_share'] for one in every]):.0%}",
         }
         table.append(row)
     return table
@@ -110,11 +103,12 @@ def summary(rows: Rows) -> list[dict[str, object]]:
 
 def draw(rows: Rows, path: Path) -> None:
     """Every seed thin, their mean thick, and its interval."""
-    found = by_learner(rows)
+    found = grouped(rows, "learner")
     figure, axes = plt.subplots(1, len(found), figsize=(3.6 * len(found), 3), sharey=True, squeeze=False)
-    for axis, (learner, stages), colour in zip(axes[0], found.items(), COLOURS.values(), strict=False):
-        steps = np.array(sorted(stages)) / 1e6
-        seeds = np.array([[100 * float(row["success"]) for row in stages[number]] for number in sorted(stages)])
+    for axis, ((learner,), own), colour in zip(axes[0], found.items(), COLOURS.values(), strict=False):
+        stages = dict(sorted(grouped(own, "steps").items()))
+        steps = np.array([number for (number,) in stages]) / 1e6
+        seeds = np.array([[100 * row["success"] for row in stage] for stage in stages.values()])
         ends = [mean_interval(values) for values in seeds.tolist()]
         axis.plot(steps, seeds, color=colour, linewidth=0.7, alpha=0.6)
         axis.plot(steps, seeds.mean(axis=1), color=colour, linewidth=2)
@@ -129,20 +123,8 @@ def draw(rows: Rows, path: Path) -> None:
 
 def main() -> None:
     """Train, or read curves; write the curves, a table of their ends and the picture."""
-    parser = argument_parser(__doc__)
-    parser.add_argument("--seeds", type=count, default=3, help="trainings per learner")
-    parser.add_argument("--curves", type=Path, help="train nothing; a training_curves.csv")
-    arguments: argparse.Namespace = parser.parse_args()
-    rows: Rows
-    if arguments.curves is None:
-        rows = measure(arguments.seeds, arguments.out, arguments.quick)
-        path = arguments.out / "training_curves.csv"
-        with replaced_when_done(path) as temporary, temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-    else:
-        with arguments.curves.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+    arguments = study_parser(__doc__, seeds=3).parse_args()
+    trainings = partial(measure, arguments.seeds, arguments.out, arguments.quick)
+    rows = study_rows(arguments, "training_seeds", trainings)
     save_table(summary(rows), arguments.out / "training_seeds.csv")
     draw(rows, arguments.out / "training_seeds.png")

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from examples.outputs import count, save_table, study_parser, study_rows
+from examples.common import count, grouped, save_table, study_parser, study_rows
 from examples.studies.training_seeds import LEARNERS, QUICK
 from examples.studies.tune_rivals import FIRST_SEED, KEPT, Between, OneOf, Settings, candidates
 
@@ -75,9 +75,8 @@ def tune(learner: str, number: int, quick: bool, out: Path) -> list[dict[str, An
 def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, object]]:
     """A row per learner and settings: those that came furthest first, and of these the best."""
     table: list[dict[str, object]] = []
-    for learner in TRAININGS:
-        own = [row for row in rows if row["learner"] == learner]
-        by_candidate = {row["candidate"]: [one for one in own if one["candidate"] == row["candidate"]] for row in own}
+    for (learner,), own in grouped(rows, "learner").items():
+        by_candidate = grouped(own, "candidate")
         for trained in sorted(by_candidate.values(), key=lambda each: (-len(each), -each[-1]["success"])):
             settings = json.loads(trained[0]["settings"])
             successes = [f"{row['success']:.0%}" for row in trained]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import count, is_solved, penalised_steps, save_table, study_parser
+from examples.common import count, is_solved, penalised_steps, save_table, study_parser
 
 from d4orm_planners import make_planner
 from d4orm_planners.evaluation.evaluate import run_study
@@ -162,7 +162,7 @@ def main() -> None:
         number, seeds, budget = (2, 1, TINY) if arguments.quick else (arguments.candidates, arguments.seeds, BUDGET)
         methods = arguments.method or SPACES
         trials = [trial for method in methods for trial in tune(method, number, seeds, budget, arguments.out)]
-        write_parquet(arguments.out / "tuning.parquet", trials)
+        write_parquet(arguments.out / "tune_rivals.parquet", trials)
     else:
         trials = read_parquet(arguments.trials)
     rows = rows_of(trials)

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.outputs import save_table, study_parser, study_rows
+from examples.common import grouped, mean_text, save_table, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, navigation_v0
@@ -69,16 +69,16 @@ def measure(planners: Sequence[str], cases: Sequence[tuple[str, int]], seeds: in
 def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """A row of the table per planner, team and beginning."""
     table = []
-    for key in dict.fromkeys((row["planner"], row["team"], row["from"]) for row in rows):
-        runs = [row for row in rows if (row["planner"], row["team"], row["from"]) == key]
+    columns = ("planner", "team", "from")
+    for key, runs in grouped(rows, *columns).items():
         times, iterations = [row["travel"] for row in runs if row["solved"]], [row["iterations"] for row in runs]
         table.append(
             {
-                **dict(zip(("planner", "team", "from"), key, strict=True)),
+                **dict(zip(columns, key, strict=True)),
                 "solved": f"{len(times)} of {len(runs)}",
                 "iterations, median": "" if None in iterations else f"{np.median(iterations):g}",
                 "seconds, median": f"{np.median([row['seconds'] for row in runs]):.3f}",
-                "travel time [s]": f"{np.mean(times):.2f}" if times else "",
+                "travel time [s]": mean_text(times, none=""),
             }
         )
     return table

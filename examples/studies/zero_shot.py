@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from examples.outputs import require, save_table, study_parser, study_rows
+from examples.common import grouped, require, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.core.robot_types import find_robot
@@ -61,7 +61,7 @@ SCENARIOS = ("swap of ten", "circle of eight", "figure of ten")
 
 
 def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
-    """Who has touched something in each step of a plan; nothing where it is not solved."""
+    """Robots in contact in each step of a plan; nothing where it is not solved."""
     plan = make_planner().solve(problem, seed=seed, time_limit=60)
     if not plan.solved:
         return
@@ -74,7 +74,7 @@ def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
 
 
 def fly_controller(problem: Problem, seed: int, bodies: Any, mode: Any) -> Iterator[np.ndarray]:
-    """Who has touched something in each step of D4orm-C2F."""
+    """Robots in contact in each step of D4orm-C2F."""
     with Controller("d4orm-c2f", mode=mode, tracker=True, lag=find_robot(ROBOT).lag, refine="sync") as controller:
         last, step, calm = bodies.states, 0, 0
         controller.begin(problem, last, seed=seed)
@@ -142,7 +142,5 @@ def main() -> None:
     if arguments.trials is None:
         require("drones", "crazyflow")
     rows = study_rows(arguments, "zero_shot", lambda: measure(1 if arguments.quick else arguments.seeds))
-    groups = {(row["scenario"], row["condition"]): [] for row in rows}
-    for row in rows:
-        groups[row["scenario"], row["condition"]].append(row)
+    groups = grouped(rows, "scenario", "condition")
     save_table([row_of(*key, group) for key, group in groups.items()], arguments.out / "zero_shot.csv")

@@ -77,10 +77,6 @@ def test_spread_is_the_five_numbers() -> None:
     spread = Spread.of([5.0, 1.0, 2.0, 4.0, 3.0])
     assert spread == Spread(3.0, 2.0, 4.0, 1.0, 5.0, 5)
     assert spread.times(10) == Spread(30.0, 20.0, 40.0, 10.0, 50.0, 5)
-    with pytest.raises(ValueError, match="at least once"):
-        Spread.of([])
-    with pytest.raises(ValueError, match="positive"):
-        spread.times(-1)
 
 
 @pytest.mark.parametrize(("ticks", "count"), [([1.0, 1.0, 1.0, 1.0], 3), ([2.0, 3.0, 9.0, 9.0], 2)])

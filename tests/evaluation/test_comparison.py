@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from examples.outputs import holm, penalised_steps, steps_to_solution
+from examples.common import holm, penalised_steps, steps_to_solution
 from hypothesis import given
 from hypothesis import strategies as st
 

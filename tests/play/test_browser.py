@@ -321,8 +321,8 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
         tick(page, "D4orm-C2F")
         wait_for(lambda: session.policies == ("go-to-goal", "d4orm-c2f"))
         page.until("document.body.textContent.includes('circle, 3 robots, go-to-goal, d4orm-c2f')")
-        wait_for(lambda: len(playground._view._lanes) == 2)
-        offset = playground._view._lanes[1]._nodes[""].position[:2]
+        wait_for(lambda: len(playground._view._viewports) == 2)
+        offset = playground._view._viewports[1]._nodes[""].position[:2]
         goal = session.frames[1].goals[0]
         wait_for(lambda: abs(pixel(playground, goal + offset)[0]) < 1200)
         page.frames(8)
@@ -349,7 +349,7 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
             tick(other, "Lifelong goals")
             lifelong = beside("Lifelong goals", "input[type=checkbox]")
             page.until(f"{lifelong}.checked")
-            wait_for(lambda: session._terms.lifelong)
+            wait_for(lambda: session._options.lifelong)
             wait_for(lambda: abs(pixel(playground, session.frame.goals[0])[0]) < 1200)
             goals = session.frame.goals
             for each in (page, other):
@@ -373,7 +373,7 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
             other.mouse("Moved", *pixel(playground, (0.1, 0.1)))
             other.frames(4)
         wait_for(lambda: len(playground.clients) == 1)  # it is killed with the robot in its hand
-        wait_for(lambda: not playground._view._lanes[0]._held)
+        wait_for(lambda: not playground._view._viewports[0]._held)
         session.pause(False)
         wait_for(lambda: session.frame.status.time > 0)
         assert session.failure is None
@@ -420,7 +420,7 @@ def test_a_slider_disturbs_from_the_next_step_on(page: Page) -> None:
         page.until(f"!!{bar}")
         repeat_until(lambda: session.levels.get("intruder"), lambda: click_on(page, bar))
         wait_for(lambda: len(session.frame.bodies) == session.levels["intruder"])
-        wait_for(lambda: "bodies" in playground._view._lanes[0]._nodes)
+        wait_for(lambda: "bodies" in playground._view._viewports[0]._nodes)
         click(page, "Nothing")
         wait_for(lambda: not session.levels)
 
@@ -430,7 +430,7 @@ def test_elsewhere_the_playground_asks_for_its_token(page: Page) -> None:
     with running(make_problem("circle", num_robots=2), "go-to-goal", host="127.0.0.2") as playground:
         page.offline(False)
         page.open(playground.address.partition("?")[0])
-        assert page.evaluate("document.body.textContent").startswith("open the address with the token")
+        assert page.evaluate("document.body.textContent").startswith("open the address that d4orm play has printed")
         assert not playground.clients
         page.open("about:blank")
         page.open(playground.address)

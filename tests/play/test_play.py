@@ -1,4 +1,4 @@
-"""The playground: what may be done to a scene, a session that goes on by itself, the door before a page."""
+"""The playground: what may be done to a scene, and a session that goes on by itself."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits
-from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.scene_frame import closest_approach
 from d4orm_planners.play.session import Session
 
@@ -77,7 +76,7 @@ def test_a_robot_stands_where_it_is_put(scene: Problem) -> None:
     [
         (lambda p: edits.move_goal(p, 0, p.goal[1]), "the goal of robot_0 would touch that of robot_1"),
         (lambda p: edits.move_robot(p, 0, p.start[1, :2]), "the robot of robot_0 would touch that of robot_1"),
-        (lambda p: edits.move_goal(p, 0, [np.nan, 0]), "is not at a place"),
+        (lambda p: edits.move_goal(p, 0, [np.nan, 0]), "is at no position"),
         (lambda p: edits.move_goal(p, 0, [1e5, 0]), "float32 resolves"),
         (edits.remove_obstacle, "there is no obstacle to remove"),
         (lambda p: edits.remove_robot(p.select([0])), "the last robot stays"),
@@ -169,7 +168,7 @@ def test_a_robot_is_pushed_in_all_that_drive_and_nobody_plans_anew(session: Sess
         np.testing.assert_allclose(new.states[1] - old.states[1], [0, 0, 0.1, -0.2], atol=1e-6)
         np.testing.assert_array_equal(np.delete(new.states, 1, 0), np.delete(old.states, 1, 0))
     assert [frame.replanned for frame in session.frames] == planned
-    session.push(1, [50.0, 0.0], lane=1)
+    session.push(1, [50.0, 0.0], viewport=1)
     until(lambda: session.frame.states[1, 2] > 0.5)
     speeds = np.linalg.norm(session.frame.states[:, 2:], axis=1)
     assert (speeds <= session.frame.problem.team.max_speed + 1e-5).all(), "none is faster than it may be"
@@ -219,7 +218,7 @@ def test_a_step_that_fails_pauses_and_says_why(session: Session, monkeypatch: py
         raise RuntimeError("no room for a goal")
 
     with monkeypatch.context() as patch:
-        patch.setattr(session._lanes[0]._env, "step", fail)
+        patch.setattr(session._viewports[0]._env, "step", fail)
         until(lambda: session.frame.status.message)
     assert session.frame.status.message == "no room for a goal"
     assert session.frame.status.state == "paused"
@@ -239,7 +238,7 @@ def test_everybody_arrives_and_is_sent_on(session: Session) -> None:
 
 
 def test_what_happened_becomes_a_replay(session: Session) -> None:
-    until(lambda: len(session._lanes[0].recording) > 3)
+    until(lambda: len(session._viewports[0].recording) > 3)
     assert "circle, 4 robots by go-to-goal" in session.replay().html
     session.edit(edits.remove_robot)
     until(lambda: session.frame.problem.num_robots == 3)
@@ -247,12 +246,12 @@ def test_what_happened_becomes_a_replay(session: Session) -> None:
 
 
 def test_a_replay_shows_intruders_while_they_were_there(session: Session) -> None:
-    until(lambda: len(session._lanes[0].recording) > 3)
+    until(lambda: len(session._viewports[0].recording) > 3)
     assert "bodies" not in session.replay().motions[0].content
     session.disturb({"intruder": 2})
     until(lambda: session.levels)
-    steps = len(session._lanes[0].recording) - 1
-    until(lambda: len(session._lanes[0].recording) > steps + 2)
+    steps = len(session._viewports[0].recording) - 1
+    until(lambda: len(session._viewports[0].recording) > steps + 2)
     bodies = session.replay().motions[0].content["bodies"]
     assert bodies["count"] == 2
     assert bodies["low"][-1] == 0, "at first there were none"
@@ -288,7 +287,7 @@ def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene:
     until(lambda: session.frame.status.time > 0.3)
     session.choose("go-to-goal", "random")
     session.reset()
-    until(lambda: len(session.frames) == 2 and len(session._lanes[0].recording) > 4)
+    until(lambda: len(session.frames) == 2 and len(session._viewports[0].recording) > 4)
     session.pause(True)
     until(lambda: session.frame.status.state == "paused")
     first, second = session.frames
@@ -309,11 +308,11 @@ def test_policies_drive_side_by_side_with_the_same_seed(session: Session, scene:
 def test_what_is_changed_for_one_is_changed_for_all(session: Session) -> None:
     session.choose("go-to-goal", "random")
     session.set_speed(5)
-    until(lambda: len(session.frames) == 2 and len(session._lanes[0].recording) > 26)
+    until(lambda: len(session.frames) == 2 and len(session._viewports[0].recording) > 26)
     session.pause(True)
     until(lambda: session.frame.status.state == "paused")
     before = session.frames
-    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]), lane=1)
+    session.edit(lambda scene: edits.move_goal(scene, 0, [0.7, 0.9]), viewport=1)
     until(lambda: np.allclose(session.frame.goals[0], [0.7, 0.9]))
     for old, new in zip(before, session.frames, strict=True):
         np.testing.assert_array_equal(new.states, old.states)
@@ -347,14 +346,14 @@ def test_whatever_goes_wrong_goes_wrong_from_the_next_step_on(session: Session, 
     session.set_speed(20)
     session.disturb({name: level})
     until(lambda: session.levels == {name: level})
-    assert session._lanes[0]._env.unwrapped._simulation.setup.disturbances
+    assert session._viewports[0]._env.unwrapped._simulation.setup.disturbances
     assert len(session.frame.bodies) == (2 if name == "intruder" else 0)
     status = session.frame.status
     assert not status.message
     until(lambda: session.frame.status.time > status.time or session.frame.finished)
     session.disturb({})
     until(lambda: not session.levels)
-    assert not session._lanes[0]._env.unwrapped._simulation.setup.disturbances
+    assert not session._viewports[0]._env.unwrapped._simulation.setup.disturbances
 
 
 def test_the_page_shows_the_truth_and_not_what_the_policy_sees(session: Session) -> None:
@@ -434,61 +433,6 @@ def test_a_file_that_is_no_scene_is_refused(content: bytes, complaint: str) -> N
 
 def test_messages_are_shown_as_they_are() -> None:
     assert markdown_text("<b>[x](y)</b> *\n{z}") == "\\<b\\>\\[x\\](y)\\</b\\> \\* \\{z\\}"
-
-
-@pytest.fixture
-def gate() -> Iterator[AuthenticatingProxy]:
-    """A gate before something that echoes the first line."""
-    with socket.create_server(("127.0.0.1", 0)) as behind:
-
-        def answer() -> None:
-            while True:
-                try:
-                    connection, _ = behind.accept()
-                except OSError:
-                    return
-                with connection:
-                    line = connection.recv(65536).split(b"\r\n")[0]
-                    connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(line), line))
-
-        threading.Thread(target=answer, daemon=True).start()
-        gate = AuthenticatingProxy("127.0.0.1", 0, behind.getsockname()[1])
-        yield gate
-        gate.close()
-
-
-def asked(gate: AuthenticatingProxy, path: str, **headers: str) -> tuple[int, str, str]:
-    """Status, cookie and body of an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", gate.port, timeout=TIMEOUT)
-    connection.request("GET", path, headers=headers)
-    answer = connection.getresponse()
-    body = answer.read().decode()
-    connection.close()
-    return answer.status, answer.getheader("Set-Cookie") or "", body
-
-
-def test_only_who_has_the_token_comes_in(gate: AuthenticatingProxy) -> None:
-    assert asked(gate, "/")[0] == 403
-    assert asked(gate, "/?token=guess")[0] == 403
-    assert asked(gate, "/", Cookie=f"d4orm_play_{gate.port}=guess")[0] == 403
-    status, cookie, _ = asked(gate, f"/?token={gate.token}")
-    assert status == 303
-    assert "HttpOnly" in cookie
-    shown = cookie.partition(";")[0]
-    assert asked(gate, "/page", Cookie=shown) == (200, "", "GET /page HTTP/1.1")
-
-
-def test_pages_of_others_do_not_come_in_with_the_token(gate: AuthenticatingProxy) -> None:
-    cookie = f"d4orm_play_{gate.port}={gate.token}"
-    assert asked(gate, "/", Cookie=cookie, Origin="http://elsewhere.example")[0] == 403
-    assert asked(gate, "/", Cookie=cookie, Origin=f"http://127.0.0.1:{gate.port}")[0] == 200
-
-
-def test_a_closed_gate_leaves_no_port(gate: AuthenticatingProxy) -> None:
-    other = AuthenticatingProxy("127.0.0.1", 0, gate.port)
-    other.close()
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", other.port), timeout=TIMEOUT)
 
 
 def test_without_the_extra_one_line_names_it() -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import http.client
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
 
 import pytest
 
@@ -13,10 +13,11 @@ from d4orm_env import make_problem
 pytest.importorskip("viser")
 
 import msgspec
-from play_support import opened, reached, running, until
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from play_support import opened, reached, running, update
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection
 
+from d4orm_planners.play.origin_check import OriginCheck
 from d4orm_planners.play.playground import Playground
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
@@ -30,22 +31,14 @@ def playground(request: pytest.FixtureRequest) -> Iterator[Playground]:
 
 
 def ticks(connection: ClientConnection, playground: Playground) -> bool:
-    """Whether somebody who ticks a box of the page is obeyed, rather than hung up on."""
+    """Whether somebody who ticks a box of the page is obeyed."""
     box = playground._panel.paused
-    told = {"type": "GuiUpdateMessage", "uuid": box._impl.uuid, "updates": {"value": True}}
-    try:
-        connection.send(msgspec.msgpack.encode(told))
-        while not box.value:
-            with suppress(TimeoutError):  # a page that is paused has no more to say
-                connection.recv(timeout=0.1)
-    except ConnectionClosed as closed:
-        code = None if closed.rcvd is None else closed.rcvd.code
-    else:
-        return True
-    finally:
-        connection.close()
-    assert code == 1008
-    return False
+    connection.send(msgspec.msgpack.encode(update(box, True)))
+    while not box.value:
+        with suppress(TimeoutError):  # a page that is paused has no more to say
+            connection.recv(timeout=0.1)
+    connection.close()
+    return True
 
 
 @pytest.mark.parametrize(
@@ -76,24 +69,56 @@ def test_its_own_page_drives(playground: Playground, host: str, origin: str | No
 )
 def test_a_foreign_page_does_not(playground: Playground, host: str, origin: str | None) -> None:
     port = playground._server.get_port()
-    connection = opened(reached(port), host.format(port=port), origin and origin.format(port=port))
-    assert not ticks(connection, playground)
-    until(lambda: not playground.clients)
+    with pytest.raises(InvalidStatus, match="403"):
+        opened(reached(port), host.format(port=port), origin and origin.format(port=port))
+    assert (
+        asked(playground, "/", Host=host.format(port=port), **({} if origin is None else {"Origin": origin}))[0] == 403
+    )
+    assert not playground.clients
     assert not playground._panel.paused.value
 
 
-@pytest.mark.parametrize("playground", ["127.0.0.2"], indirect=True)
-def test_nobody_goes_round_the_gate(playground: Playground) -> None:
-    gate, behind = playground._gate, playground._server.get_port()
-    assert gate is not None
-    assert not ticks(opened(reached(behind), f"127.0.0.1:{behind}", None), playground)
-    assert not ticks(opened(reached(behind), f"127.0.0.1:{behind}", None, {"X-D4orm-Gate": "guess"}), playground)
-    with pytest.raises(InvalidStatus, match="403"):
-        through(gate, None)
-    assert ticks(through(gate, gate.token), playground)
+def asked(playground: Playground, path: str, **headers: str) -> tuple[int, str]:
+    """Status and cookie of the page's answer."""
+    connection = http.client.HTTPConnection(playground._server.get_host(), playground._server.get_port(), timeout=60)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer.status, answer.getheader("Set-Cookie") or ""
 
 
-def through(gate: Any, token: str | None) -> ClientConnection:
-    """A web socket through a gate, with the cookie of who has shown a token."""
-    cookie = {} if token is None else {"Cookie": f"d4orm_play_{gate.port}={token}"}
-    return opened(reached(gate.port, "127.0.0.2"), f"127.0.0.2:{gate.port}", f"http://127.0.0.2:{gate.port}", cookie)
+elsewhere = pytest.mark.parametrize("playground", ["127.0.0.2"], indirect=True)
+
+
+@elsewhere
+def test_only_who_has_the_token_comes_in(playground: Playground) -> None:
+    port, token = playground._server.get_port(), playground.address.partition("=")[2]
+    assert asked(playground, "/")[0] == 403
+    assert asked(playground, "/?token=guess")[0] == 403
+    assert asked(playground, "/", Cookie=f"d4orm_play_{port}=guess")[0] == 403
+    status, cookie = asked(playground, f"/?token={token}")
+    assert status == 303
+    assert "HttpOnly" in cookie
+    shown = cookie.partition(";")[0]
+    assert asked(playground, "/", Cookie=f"a[b]=c; {shown}") == (200, "")
+    assert asked(playground, "/", Cookie=shown, Origin="http://elsewhere.example")[0] == 403
+    assert asked(playground, "/", Cookie=shown, Origin=f"http://127.0.0.2:{port}")[0] == 200
+
+
+@elsewhere
+def test_web_sockets_need_the_token_too(playground: Playground) -> None:
+    port, token = playground._server.get_port(), playground.address.partition("=")[2]
+    for shown in (None, "guess", token):
+        cookie = {} if shown is None else {"Cookie": f"d4orm_play_{port}={shown}"}
+        raw, origin = reached(port, "127.0.0.2"), f"http://127.0.0.2:{port}"
+        if shown == token:
+            assert ticks(opened(raw, f"127.0.0.2:{port}", origin, cookie), playground)
+        else:
+            with pytest.raises(InvalidStatus, match="403"):
+                opened(raw, f"127.0.0.2:{port}", origin, cookie)
+
+
+def test_a_server_that_nobody_can_guard_is_an_error() -> None:
+    with pytest.raises(RuntimeError, match="install viser"), OriginCheck(None, "cookie").installed():
+        pass

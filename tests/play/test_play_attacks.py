@@ -24,7 +24,6 @@ from play_support import (
     TIMEOUT,
     control,
     drag,
-    reached,
     running,
     say,
     until,
@@ -40,7 +39,6 @@ from d4orm_planners.play import edits, panel
 from d4orm_planners.play.edits import MOST_WAITING
 from d4orm_planners.play.origin_check import LARGEST_UPLOAD
 from d4orm_planners.play.playground import Playground
-from d4orm_planners.play.proxy import AuthenticatingProxy
 from d4orm_planners.play.session import Session
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
@@ -119,11 +117,29 @@ def test_a_control_takes_what_it_offers(
 
 
 def test_a_control_takes_all_that_it_offers(playground: Playground, connection: ClientConnection) -> None:
+    until(lambda: playground._panel._refused == playground.session.frame.status.refused)  # or it sets sliders back
     for label, value in (("Robots", 64), ("Noise on controls", 0.06), ("Noise on controls", 0.0), ("Seed", 7),
                          ("Scenario", "maze"), ("Trails", False), ("Model", "car")):  # fmt: skip
         used = control(playground, label)
         say(connection, update(used, value))
         until(lambda used=used, value=value: used.value == value)  # type: ignore[misc]
+
+
+def test_a_refusal_takes_no_change_back_that_waits() -> None:
+    playground = Playground(make_problem("circle", num_robots=2), "go-to-goal")  # whose clock does not run
+    try:
+        slider = control(playground, "Drag [1/s]")
+        slider.value = 0.5
+        playground.session.disturb({"drag": 0.5})
+        playground.session._say_refused(1, "another change")
+        playground._panel.update()
+        assert slider.value == 0.5
+        playground.session._obey()
+        playground._panel._status_at = 0.0
+        playground._panel.update()
+        assert slider.value == playground.session.levels["drag"] == 0.5
+    finally:
+        playground.close()
 
 
 @pytest.mark.parametrize("name", ["update_cb", "uuid", "removed", "gui_api", "value_"])
@@ -206,30 +222,59 @@ def test_who_sends_garbage_is_hung_up_on_in_silence(
     assert not caplog.records
 
 
-@pytest.mark.parametrize(
-    "sent",
-    [
-        b"GET http://[ HTTP/1.1\r\n\r\n",
-        b"\x16\x03\x01garbage\r\n\r\n",
-        b"GET / HTTP/1.1\r\nno header\r\n\r\n",
-        b"GET /",
-    ],
-)
-def test_requests_that_cannot_be_read_are_not_printed(
-    playground: Playground, sent: bytes, capfd: pytest.CaptureFixture[str]
+REQUESTS = [
+    b"GET http://[ HTTP/1.1\r\n\r\n",
+    b"GET //[/?token=x HTTP/1.1\r\n\r\n",
+    b"GET /?token=%ff%fe HTTP/1.1\r\n\r\n",
+    b"GET /?token=\xff HTTP/1.1\r\n\r\n",
+    b"GET\r\n\r\n",
+    b"\r\n\r\n",
+    b"\x00\xff\x80\r\n\r\n",
+    b"\x16\x03\x01garbage\r\n\r\n",
+    b"GET / HTTP/1.1\r\nno header\r\n\r\n",
+    b"GET / HTTP/1.1\r\n: :\r\n\xff\r\nCookie\r\n\r\n",
+    b"GET / HTTP/1.1\r\nCookie: a[b]=c; d4orm_play_1=\xff; =; ;;\r\n\r\n",
+    b"GET / HTTP/1.1\r\nX: " + b"y" * 15_000 + b"\r\n\r\n",
+    b"GET /",
+    b"",
+    b"x" * 100_000,
+]
+
+
+@pytest.fixture(scope="module", params=["127.0.0.1", "127.0.0.2"])
+def address(request: pytest.FixtureRequest) -> Iterator[tuple[str, int]]:
+    """Host and port of a page for this machine, and of one with a token."""
+    with running(make_problem("circle", num_robots=2), "go-to-goal", host=request.param) as shown:
+        yield request.param, shown._server.get_port()
+
+
+@pytest.mark.parametrize("sent", REQUESTS, ids=lambda sent: sent[:30])
+def test_a_request_that_cannot_be_read_is_refused_in_silence(
+    address: tuple[str, int], sent: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    handlers = logging.root.handlers[:]
+    handlers, heard = logging.root.handlers[:], b""
     logging.root.handlers.clear()  # as without pytest: what nobody takes, Python prints
     try:
-        with socket.create_connection(("127.0.0.1", playground._server.get_port()), timeout=TIMEOUT) as raw:
+        with socket.create_connection(address, timeout=TIMEOUT) as raw, suppress(ConnectionError):
             raw.sendall(sent)
             raw.shutdown(socket.SHUT_WR)
-            with suppress(ConnectionError):
-                while raw.recv(1000):
-                    pass
+            while data := raw.recv(1000):
+                heard += data
     finally:
         logging.root.handlers[:] = handlers
+    assert heard[:12] in (b"", b"HTTP/1.1 400", b"HTTP/1.1 403", b"HTTP/1.1 414", b"HTTP/1.1 431")
     assert capfd.readouterr().err == ""
+
+
+def test_many_who_say_nothing_keep_nobody_out(address: tuple[str, int]) -> None:
+    silent = [socket.create_connection(address, timeout=TIMEOUT) for _ in range(300)]
+    try:
+        with socket.create_connection(address, timeout=TIMEOUT) as raw:
+            raw.sendall(b"GET / HTTP/1.1\r\nHost: elsewhere.example\r\n\r\n")
+            assert raw.recv(12) == b"HTTP/1.1 403"
+    finally:
+        for raw in silent:
+            raw.close()
 
 
 def upload(playground: Playground, size: int, parts: int = 1) -> dict[str, object]:
@@ -346,73 +391,6 @@ def test_no_edit_ends_the_session(error: Exception) -> None:
     until(lambda: session.frame.status.time > time)
     session.close()
     assert session.failure is None
-
-
-REQUESTS = [
-    b"GET http://[ HTTP/1.1\r\n\r\n",
-    b"GET //[/?token=x HTTP/1.1\r\n\r\n",
-    b"GET /?token=%ff%fe HTTP/1.1\r\n\r\n",
-    b"GET\r\n\r\n",
-    b"\r\n\r\n",
-    b"\x00\xff\x80\r\n\r\n",
-    b"GET / HTTP/1.1\r\n: :\r\n\xff\r\nCookie\r\n\r\n",
-    b"GET / HTTP/1.1\r\nCookie: a[b]=c; d4orm_play_1=\xff; =; ;;\r\n\r\n",
-    b"GET / HTTP/1.1\r\nX: " + b"y" * 15_000 + b"\r\n\r\n",
-]
-
-
-def answers(gate: AuthenticatingProxy, sent: bytes) -> bytes:
-    """All that a gate says to a request."""
-    heard = b""
-    with reached(gate.port) as raw:
-        raw.sendall(sent)
-        raw.shutdown(socket.SHUT_WR)
-        with suppress(ConnectionError):
-            while data := raw.recv(1000):
-                heard += data
-    return heard
-
-
-@pytest.fixture
-def gate() -> Iterator[AuthenticatingProxy]:
-    with socket.create_server(("127.0.0.1", 0)) as behind:
-        gate = AuthenticatingProxy("127.0.0.1", 0, behind.getsockname()[1])
-        yield gate
-        gate.close()
-
-
-@pytest.mark.parametrize("sent", REQUESTS)
-def test_a_request_that_cannot_be_read_is_forbidden_in_silence(
-    gate: AuthenticatingProxy, sent: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    assert answers(gate, sent).startswith(b"HTTP/1.1 403 Forbidden\r\n")
-    assert not caplog.records
-
-
-@pytest.mark.parametrize("sent", [b"", b"GET / HT", b"x" * 100_000])
-def test_a_request_without_an_end_is_hung_up_on(
-    gate: AuthenticatingProxy, sent: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    assert answers(gate, sent)[:12] in (b"", b"HTTP/1.1 403")
-    assert answers(gate, REQUESTS[0]), "and it goes on"
-    assert not caplog.records
-
-
-def test_cookies_of_other_pages_do_not_hide_the_gate_s_own(gate: AuthenticatingProxy) -> None:
-    assert gate._answer(f"GET / HTTP/1.1\r\nCookie: a[b]=c; d4orm_play_{gate.port}={gate.token}".encode()) == b""
-
-
-def test_many_who_say_nothing_keep_nobody_out(gate: AuthenticatingProxy) -> None:
-    silent = [reached(gate.port) for _ in range(300)]
-    try:
-        until(lambda: gate._waiting > 0)
-        for raw in silent:
-            raw.close()
-        until(lambda: gate._waiting == 0)
-    finally:
-        for raw in silent:
-            raw.close()
-    assert answers(gate, b"GET / HTTP/1.1\r\n\r\n").startswith(b"HTTP/1.1 403")
 
 
 @pytest.mark.parametrize("wrong", [{"look_at": [0, 0, 9]}, {"up_direction": [0, 0, 0]}, {"wxyz": [0, 0, 0, 0]}])

@@ -225,7 +225,7 @@ def test_rivals_are_tuned_and_a_second_call_runs_nothing(tmp_path: Path) -> None
     trials = (out / "trials.sqlite").read_bytes()
     completed("tune_rivals", out, "--method", "cem")
     assert (out / "trials.sqlite").read_bytes() == trials
-    completed("tune_rivals", tmp_path / "again", "--trials", str(out / "tuning.parquet"))
+    completed("tune_rivals", tmp_path / "again", "--trials", str(out / "tune_rivals.parquet"))
     assert table(tmp_path / "again" / "tuning.csv") == rows
 
 
@@ -816,7 +816,7 @@ def test_learners_are_trained_with_several_seeds_and_their_curves_read_again(tmp
     assert [row["learner"].split(",")[0] for row in rows] == ["PPO", "PPO", "PPO", "SAC", "SAC"]
     assert {row["seeds"] for row in rows} == {"2"}
     assert (out / "training_seeds.png").read_bytes().startswith(PNG)
-    completed("training_seeds", again, "--curves", str(out / "training_curves.csv"))
+    completed("training_seeds", again, "--trials", str(out / "training_seeds.parquet"))
     assert table(again / "training_seeds.csv") == rows
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from examples.outputs import steps_to_solution, study_trials
+from examples.common import steps_to_solution, study_trials
 from examples.studies.paper import main
 from examples.studies.paper.figure import Figure, Group, Section, grouped
 from examples.studies.paper.figure_report import markdown, write_figure

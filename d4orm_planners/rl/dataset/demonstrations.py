@@ -26,12 +26,12 @@ from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, origin, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
+from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Condition
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
-LARGEST_SEED = 2**63 - 1
 AGENTS = ("team", "robot")
 """Owner of an episode of a dataset."""
 
@@ -77,7 +77,7 @@ class Demonstrations:
             raise ValueError(f"agents is {short_repr(self.agents)}; choose 'team' or 'robot'")
         if not isinstance(self.seeds, Iterable):
             raise ValueError(f"seeds is {short_repr(self.seeds)}; give the seeds themselves, as range(100)")
-        seeds = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_SEED) for seed in self.seeds))
+        seeds = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_NUMBER) for seed in self.seeds))
         if not seeds:
             raise ValueError("seeds is empty; give at least one")
         object.__setattr__(self, "seeds", seeds)

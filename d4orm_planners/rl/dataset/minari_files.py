@@ -70,8 +70,8 @@ class DatasetFiles:
         parts = [(episode, *part) for episode in episodes for part in _parts(episode, self.agents)]
         storage.update_episodes(_buffer(episode, steps, who) for episode, steps, who, _ in parts)
         storage.update_episode_metadata(
-            {**episode.metadata, **extra, "id": sum(before) + position}
-            for position, (episode, _, _, extra) in enumerate(parts)
+            {**episode.metadata, **extra, "id": sum(before) + index}
+            for index, (episode, _, _, extra) in enumerate(parts)
         )
         storage.update_metadata({"recorded_seeds": [int(episode.metadata["seed"]) for episode in episodes]})
         partial.rename(final)
@@ -86,9 +86,9 @@ class DatasetFiles:
         with h5py.File(partial / MAIN, "a", track_order=True) as main:
             for shard in self.shards:
                 own = _metadata(shard)
-                for position in range(own["total_episodes"]):
-                    link = h5py.ExternalLink(f"shards/{shard.name}/{MAIN}", f"/episode_{position}")
-                    main[f"episode_{count + position}"] = link
+                for index in range(own["total_episodes"]):
+                    link = h5py.ExternalLink(f"shards/{shard.name}/{MAIN}", f"/episode_{index}")
+                    main[f"episode_{count + index}"] = link
                 steps, count = steps + own["total_steps"], count + own["total_episodes"]
         size = sum(path.stat().st_size for shard in self.shards for path in shard.iterdir()) / 1e6
         totals = {"total_steps": steps, "total_episodes": count, "dataset_size": round(size, 1)}

@@ -89,9 +89,9 @@ class Course:
         return bool(np.abs(self.states_at(tick) - states)[:, :dimension].max() > DRIFT)
 
     def with_stops(self, problem: Problem, engine: Engine, joint: JointState, lost: Collection[int]) -> Course:
-        """The rest of the course when these robots stand: whoever would come too near to another one stops too.
+        """The rest of the course when these robots stop: a robot that would come too near to another one stops too.
 
-        In the last resort everybody stands, which is safe for robots that can stop at once.
+        In the last resort all robots stop, which is safe for robots that can stop at once.
         """
         controls = self.rest(joint.steps, problem.horizon)
         here = present_problem(problem, joint.states, joint.goals, lost)

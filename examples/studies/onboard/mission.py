@@ -29,47 +29,35 @@ class Mission:
     Attributes:
         robots: Number of robots.
         seed: Of starts, goals and planning.
-        side: Side of the square that they drive in [m].
-        horizon: Steps of a plan.
         samples: Of all robots together in an iteration; each draws its share.
-        denoising_steps: ``N`` of an iteration.
-        iterations: Of a round, at least; where they take longer than real time allows, the clock waits for them.
-        think: Ticks that a round of planning is given.
-        agree: Ticks from then on until the best plan, which the robots agree on meanwhile, takes over.
         timeout: Seconds that the world waits for a robot's command before it is given up.
-        silence: Seconds without a word from the world after which a robot ends.
         namespace: Of the run on the network.
         world: Endpoint that the world listens at for the robots.
         team: Endpoint on which the robots find each other.
+        side: Side of the square that they drive in [m].
+        horizon: Steps of a plan.
+        denoising_steps: ``N`` of an iteration.
+        iterations: Of a round, at least; where they take longer than real time allows, the clock waits for them.
+        think: Ticks that a round of planning is given.
+        agree: Ticks from then on until the best plan, which the robots agree on meanwhile, takes over; at least 3: to
+            end, to announce the best and to settle on one.
+        silence: Seconds without a message from the world after which a robot ends.
     """
 
     robots: int
     seed: int
-    side: float
-    horizon: int
     samples: int
-    denoising_steps: int
-    iterations: int
-    think: int
-    agree: int
     timeout: float
-    silence: float
     namespace: str
     world: str
     team: str
-
-    def __post_init__(self) -> None:
-        if self.agree < 3:
-            raise ValueError(f"agree is {self.agree}; to end, to announce the best and to settle on one takes 3 ticks")
-
-    @classmethod
-    def read(cls, text: str) -> Mission:
-        """A mission from what :meth:`written` gave."""
-        return cls(**json.loads(text))
-
-    def written(self) -> str:
-        """Return the settings as JSON."""
-        return json.dumps(asdict(self))
+    side: float = 4.0
+    horizon: int = 80
+    denoising_steps: int = 50
+    iterations: int = 2
+    think: int = 7
+    agree: int = 3
+    silence: float = 30.0
 
     @property
     def round_ticks(self) -> int:
@@ -79,7 +67,7 @@ class Mission:
     def problem(self) -> Problem:
         """The team of ground robots in the square, with its first goals."""
         team = Team(("velocity2d",) * self.robots)
-        # Who follows another one does not touch it when that one stops at once.
+        # A robot that follows another one does not touch it when that one stops at once.
         margin = float(np.max(np.asarray(team.max_speed))) * TICK + ROOM
         size = self.side - 2 * (float(np.max(np.asarray(team.radius))) + margin)
         problem = make_problem(
@@ -155,15 +143,15 @@ class Command:
 
 END = Tick(-1, [], [], [], [])
 
-Word = TypeVar("Word", Tick, Command)
+Message = TypeVar("Message", Tick, Command)
 
 
-def encode(word: Tick | Command) -> bytes:
+def encode(message: Tick | Command) -> bytes:
     """A message as bytes."""
-    return json.dumps(asdict(word)).encode()
+    return json.dumps(asdict(message)).encode()
 
 
-def decode(data: bytes, kind: type[Word]) -> Word | None:
+def decode(data: bytes, kind: type[Message]) -> Message | None:
     """A message of that kind; ``None`` for one of another kind, or anything else."""
     try:
         return TypeAdapter(kind).validate_json(data) if len(data) <= MAX_BYTES else None

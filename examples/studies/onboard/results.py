@@ -10,13 +10,13 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from examples.common import film
 from examples.studies.onboard.thinking import COLUMNS
 from examples.studies.onboard.world import Record
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from d4orm_env import Problem
-from d4orm_env.render import FrameRenderer
 from d4orm_env.render.panels import robot_colors
 
 Row = dict[str, Any]
@@ -49,7 +49,7 @@ def timeline(record: Record, logs: Sequence[Path]) -> list[Row]:
     return sorted(rows, key=lambda row: row["time"])
 
 
-def makers(rows: Sequence[Row]) -> dict[str, int]:
+def authors_of(rows: Sequence[Row]) -> dict[str, int]:
     """Return the robot that computed each plan first, by the plan's digest."""
     found: dict[str, int] = {}
     for row in rows:
@@ -87,7 +87,7 @@ def run_row(record: Record, rows: Sequence[Row], dt: float) -> Row:
 
 def robot_rows(record: Record, rows: Sequence[Row]) -> list[Row]:
     """Each robot in figures."""
-    made = makers(rows)
+    made = authors_of(rows)
     taken = {row["plan"] for row in rows if row["event"] == "takes over"}
     table = []
     for robot in range(len(record.reached[0])):
@@ -112,20 +112,16 @@ def robot_rows(record: Record, rows: Sequence[Row]) -> list[Row]:
     return table
 
 
-def film(problem: Problem, record: Record, seconds: float) -> list[Any]:
+def pictures(problem: Problem, record: Record, seconds: float) -> list[Any]:
     """Images of the first seconds, one for every tick; robots that were given up are pale."""
-    renderer = FrameRenderer(problem, (520, 540))
-    frames = []
-    for step in range(min(record.steps, round(seconds / problem.dt))):
-        joint = record.joints[step + 1]
-        trail = np.stack([past.states[:, :2] for past in record.joints[max(step - 25, 0) : step + 2]])
-        lost = np.isin(np.arange(problem.num_robots), record.lost[step])
-        goals = int(np.sum(record.reached[: step + 1]))
-        note = f"    {lost.sum()} given up" if lost.any() else ""
-        caption = f"{joint.steps * problem.dt:.1f} s    {goals} goals reached{note}"
-        frames.append(renderer.draw(joint.states, lost, record.collided[step], joint.goals, trail, caption=caption))
-    renderer.close()
-    return frames
+    steps = min(record.steps, round(seconds / problem.dt))
+    lost = [np.isin(np.arange(problem.num_robots), record.lost[step]) for step in range(steps)]
+    captions = [
+        f"{joint.steps * problem.dt:.1f} s    {np.sum(record.reached[: step + 1])} goals reached"
+        + (f"    {given_up.sum()} given up" if given_up.any() else "")
+        for step, (joint, given_up) in enumerate(zip(record.joints[1:], lost))
+    ]
+    return film(problem, record.joints[1 : steps + 1], lost, record.collided[:steps], captions)
 
 
 def _median(values: Any) -> str:
@@ -138,13 +134,7 @@ HEIGHT = 0.5
 
 
 def draw(rows: Sequence[Row], num_robots: int, seconds: float) -> Any:
-    """The figure.
-
-    Args:
-        rows: The timeline.
-        num_robots: Number of robots.
-        seconds: Part of the run that is shown below.
-    """
+    """Draw a timeline: above the round with the most to see, below the first seconds of the run."""
     figure, (above, below) = plt.subplots(
         2, 1, figsize=(9.5, 2.4 + 0.75 * num_robots), layout="constrained", height_ratios=(1.25, 1)
     )
@@ -171,7 +161,7 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
     own = [row for row in rows if row["round"] == number]
     start = min(row["time"] for row in own if row["event"] == "begins")
     colors = robot_colors(num_robots)
-    made = makers(rows)
+    made = authors_of(rows)
 
     def ms(seconds: float) -> float:
         return 1000 * (seconds - start)
@@ -180,12 +170,10 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
     for row in own:
         if row["event"] == "computed":
             span = [(ms(row["time"]), ms(row["until"]) - ms(row["time"]))]
-            style = {
-                "facecolor": colors[row["robot"]],
-                "edgecolor": "white",
-                "hatch": None if row["solved"] else "////",
-            }
-            axes.broken_barh(span, (row["robot"] - HEIGHT / 2, HEIGHT), zorder=2, **style)
+            axes.broken_barh(
+                span, (row["robot"] - HEIGHT / 2, HEIGHT), zorder=2, facecolor=colors[row["robot"]], edgecolor="white",
+                hatch=None if row["solved"] else "////",
+            )  # fmt: skip
     first = {event: {} for event in ("announces", "takes over")}
     for row in own:
         if row["event"] in first and row["plan"]:
@@ -194,14 +182,10 @@ def draw_round(axes: Any, rows: Sequence[Row], number: int, num_robots: int) -> 
         axes.plot(time, robot, "D", color="white", mec=INK, ms=5, zorder=6)
     for robot, time in first["takes over"].items():
         axes.plot(time, robot, ">", color=INK, ms=7, zorder=6)
-    plans = {row["plan"] for row in own if row["event"] == "takes over"}
-    maker = {made.get(plan) for plan in plans}
-    whose = f"robot {maker.pop()}" if len(maker) == 1 and None not in maker else "an unknown robot"
-    axes.set(
-        xlabel="time since the round began [ms]",
-        ylabel="robot",
-        title=f"Round {number}: the plan of {whose} is taken over",
-    )
+    authors = {made.get(row["plan"]) for row in own if row["event"] == "takes over"}
+    author = f"robot {authors.pop()}" if len(authors) == 1 and None not in authors else "an unknown robot"
+    title = f"Round {number}: the plan of {author} is taken over"
+    axes.set(xlabel="time since the round began [ms]", ylabel="robot", title=title)
     _rows_of(axes, num_robots)
     _explain_round(axes)
 

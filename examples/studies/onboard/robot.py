@@ -8,6 +8,7 @@ every tick, so that all of them execute the same one.
 
 from __future__ import annotations
 
+import json
 import logging
 import signal
 import sys
@@ -28,14 +29,7 @@ LOOK = 0.5
 
 
 class Robot:
-    """A robot from tick to tick.
-
-    Args:
-        mission: The settings.
-        number: Its number, from 0.
-        team: Network for candidates.
-        log: Its log.
-    """
+    """A robot from tick to tick; ``team`` is the network for candidates."""
 
     def __init__(self, mission: Mission, number: int, team: Transport, log: Log) -> None:
         self._mission, self._number, self._team, self._log = mission, number, team, log
@@ -162,7 +156,7 @@ def drive(mission: Mission, number: int, robot: Robot, world: Transport) -> None
 def main() -> None:
     """Run one robot."""
     path, number, log_path = sys.argv[1:]
-    mission, own = Mission.read(Path(path).read_text()), int(number)
+    mission, own = Mission(**json.loads(Path(path).read_text())), int(number)
     # Ctrl-C is for the one that started the robots, and the world tells them when it is over.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Candidates that come too late for their round are counted, not worth a line each.

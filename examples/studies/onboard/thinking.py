@@ -28,11 +28,7 @@ COLUMNS = (
 
 
 class Log:
-    """A CSV file with a row per event; times are :func:`time.perf_counter`, the same clock for all processes.
-
-    Args:
-        path: The file.
-        robot: Its owner.
+    """A CSV file of a robot's events; times are :func:`time.perf_counter`, the same clock for all processes.
 
     Attributes:
         tick: The present tick.
@@ -84,7 +80,7 @@ TIMEOUT = 0.25
 """Seconds that a node waits for the others after each of its iterations."""
 
 RESEND = 0.2
-"""Seconds between two looks at whether everybody has the best candidate, once all had it."""
+"""Seconds between two looks at whether all nodes have the best candidate, once all had it."""
 
 LOOK = 0.02
 """Seconds between two looks at what has arrived, before that."""
@@ -115,13 +111,7 @@ class Agenda:
 class Round:
     """Planning from where the team will be when the plan takes over.
 
-    Args:
-        agenda: Task of the round.
-        mission: The settings.
-        robot: Owner of the node.
-        engine: Engine for rollouts and samples.
-        team: Network for candidates.
-        observer: Called with what the node does, and the digest of the plan that it is about.
+    ``observer`` is called with what the node does, and the digest of the plan that it is about.
     """
 
     def __init__(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,7 +24,7 @@ from d4orm_planners.d_d4orm.transport import Transport
 AGAIN = 0.25
 """Seconds after which robots that have not answered are told again, as messages may get lost."""
 
-FAREWELLS, FAREWELL = 3, 0.1
+ENDS, END_PERIOD = 3, 0.1
 """Number of times that the robots are told that it is over, and the seconds between."""
 
 START = 300.0
@@ -71,14 +72,9 @@ class Record:
 class World:
     """The environment, in lifelong mode, at the other end of the robots' network.
 
-    A tick begins when all robots have answered the one before, but no sooner than real time allows: who is slow
-    holds the world up, and who does not answer within the mission's timeout is given up and stops.
-
-    Args:
-        mission: The settings.
-        robots: The network.
-        ticks: Most ticks.
-        speed: Simulated seconds per second at most.
+    A tick begins when all robots have answered the one before, but no sooner than real time allows, of which one second
+    is ``speed`` simulated ones: a slow robot holds the world up, and one that does not answer within the mission's
+    timeout is given up and stops.
     """
 
     def __init__(self, mission: Mission, robots: Transport, ticks: int, speed: float) -> None:
@@ -94,13 +90,10 @@ class World:
         self._commands: dict[int, Command] = {}
 
     def await_robots(self, check: Callable[[], None]) -> None:
-        """Wait for the first answer of every robot.
-
-        Args:
-            check: Called again and again; raises if there is no use in waiting.
+        """Wait for the first answer of every robot, and call meanwhile ``check``, which may raise.
 
         Raises:
-            RuntimeError: If somebody does not answer.
+            RuntimeError: If a robot does not answer.
         """
         deadline = time.perf_counter() + START
         while missing := self._ask(0, AGAIN):
@@ -109,11 +102,7 @@ class World:
                 raise RuntimeError(f"robots {sorted(missing)} have not answered within {START:g} s")
 
     def run(self, each_tick: Callable[[int], None]) -> None:
-        """Simulate to the end.
-
-        Args:
-            each_tick: Called with the number of every tick before it begins.
-        """
+        """Simulate to the end; ``each_tick`` is called with the number of every tick before it begins."""
         record, due = self.record, time.perf_counter()
         record.joints.append(split_state(self.problem, self._env.state()))
         while self._env.agents:
@@ -129,20 +118,20 @@ class World:
 
     def end(self) -> None:
         """Tell the robots that it is over."""
-        for _ in range(FAREWELLS):
+        for _ in range(ENDS):
             self._robots.publish(encode(END))
-            time.sleep(FAREWELL)
+            time.sleep(END_PERIOD)
         self._env.close()
 
     def _ask(self, tick: int, seconds: float) -> set[int]:
-        """Tell where everybody is and collect the commands; who has not answered in time."""
+        """Tell all robots the joint state, and collect their commands; the robots that have not answered in time."""
         state = [float(value) for value in self._env.state()]
         former = [self._commands.get(robot) for robot in range(len(self.agents))]
         ballots = ["" if command is None else command.ballot for command in former]
         rewards = [0.0 if command is None else command.reward for command in former]
         question = encode(Tick(tick, state, sorted(self._lost), ballots, rewards))
         deadline, again = time.perf_counter() + seconds, 0.0
-        while missing := {robot for robot in range(len(self.agents)) if self._is_awaited(robot, tick)}:
+        while missing := set(range(len(self.agents))) - self._lost - self._answered(tick):
             now = time.perf_counter()
             if now >= deadline:
                 break
@@ -158,8 +147,8 @@ class World:
         """Names of the robots."""
         return list(self._env.possible_agents)
 
-    def _is_awaited(self, robot: int, tick: int) -> bool:
-        return robot not in self._lost and (robot not in self._commands or self._commands[robot].number != tick)
+    def _answered(self, tick: int) -> set[int]:
+        return {robot for robot, command in self._commands.items() if command.number == tick}
 
     def _take(self, command: Command | None, tick: int) -> None:
         if command is None or command.number != tick or not 0 <= command.robot < len(self.agents):
@@ -186,27 +175,20 @@ GRACE = 15.0
 
 
 class RobotProcesses:
-    """A process for every robot, which ends with the block at the latest.
-
-    Args:
-        mission: Their settings.
-        folder: Folder of their logs.
-    """
+    """A process for every robot, with its log in ``folder``, which ends with the block at the latest."""
 
     def __init__(self, mission: Mission, folder: Path) -> None:
         self.logs = [folder / f"robot_{robot}.csv" for robot in range(mission.robots)]
         self.killed: set[int] = set()
         path = folder / "mission.json"
-        path.write_text(mission.written())
+        path.write_text(json.dumps(asdict(mission)))
         root = str(Path(__file__).resolve().parents[3])
-        environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
-        }
+        paths = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
         command = [sys.executable, "-m", "examples.studies.onboard.robot", str(path)]
-        self._processes: list[subprocess.Popen[bytes]] = []
-        for robot, log in enumerate(self.logs):
-            self._processes.append(subprocess.Popen([*command, str(robot), str(log)], env=environment))
+        self._processes = [
+            subprocess.Popen([*command, str(robot), str(log)], env={**os.environ, "PYTHONPATH": paths})
+            for robot, log in enumerate(self.logs)
+        ]
 
     def __enter__(self) -> Self:
         return self
@@ -239,7 +221,7 @@ class RobotProcesses:
 
 
 def free_endpoints(number: int) -> list[str]:
-    """Endpoints on loopback that nobody listens at."""
+    """Endpoints on loopback that are free."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(number)]
     ports = [one.getsockname()[1] for one in sockets]
     for one in sockets:

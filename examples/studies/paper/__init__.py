@@ -14,7 +14,7 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Sequence
 
-from examples.outputs import count, study_trials, trials_parser
+from examples.common import count, study_trials, trials_parser
 from examples.studies.paper.figure import Figure, grouped
 from examples.studies.paper.figure_report import markdown, write_figure
 from examples.studies.paper.paper_figures import FIGURES

@@ -89,7 +89,7 @@ class Figure:
     Attributes:
         name: Its name on the command line.
         title: Its title.
-        source: Its place in the paper.
+        source: Section of the paper that has it.
         sections: Its panels.
         across: Attribute that varies from left to right.
         metrics: Metrics in the tables, see :data:`~examples.studies.paper.numbers.METRICS`.
@@ -154,10 +154,10 @@ class Figure:
         """
         known = [section.title for section in self.sections]
         policies = list(dict.fromkeys(label for section in self.sections for label in section.policies))
-        for what, wanted, there in (("section", titles, known), ("policy", labels, policies)):
+        for what, wanted, offered in (("section", titles, known), ("policy", labels, policies)):
             for name in wanted:
-                if name not in there:
-                    raise ValueError(f"{self.name} has no {what} {name!r}; choose of {'; '.join(there)}")
+                if name not in offered:
+                    raise ValueError(f"{self.name} has no {what} {name!r}; choose of {'; '.join(offered)}")
         kept = []
         for section in self.sections:
             chosen = {label: section.policies[label] for label in section.policies if label in labels or not labels}
@@ -182,20 +182,20 @@ def grouped(figure: Figure, trials: Sequence[Trial]) -> list[Group]:
         ValueError: If none of the trials is one of the figure's.
         ImportError: If a policy needs a library that is not installed.
     """
-    there = {_position(trial.label, trial.key): trial for trial in trials}
+    by_cell = {_cell(trial.label, trial.key): trial for trial in trials}
     groups = []
     for title, study in figure.studies(1 + max((trial.seed for trial in trials), default=0)):
         for jobs in study.groups():
             label = jobs[0].policy.label
             for condition in jobs[0].conditions:
-                positions = [_position(label, job.key(condition)) for job in jobs]
-                if found := [there[position] for position in positions if position in there]:
+                cells = [_cell(label, job.key(condition)) for job in jobs]
+                if found := [by_cell[cell] for cell in cells if cell in by_cell]:
                     groups.append(Group(title, label, found))
     if not groups:
         raise ValueError(f"none of the {len(trials)} trials is one of the figure {figure.name!r}; give it its own")
     return groups
 
 
-def _position(label: str, key: TrialKey) -> tuple[object, ...]:
-    """Return a trial's place in a figure."""
+def _cell(label: str, key: TrialKey) -> tuple[object, ...]:
+    """Return what tells a trial from all others of a figure."""
     return label, json.loads(key.config).get("nodes"), *key[2:]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from examples.outputs import holm, steps_to_solution
+from examples.common import holm, steps_to_solution
 from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from examples.studies.paper.plots import draw
@@ -93,22 +93,22 @@ def _said(figure: Figure, row: Measured, metric: str) -> str:
 
 def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
     """A table per section of the other policies beside the reference; none without it."""
-    placed = {(group.section, column(figure, row), group.label): group.trials
+    by_cell = {(group.section, column(figure, row), group.label): group.trials
               for group in groups for row in [measured(group)]}  # fmt: skip
     one_column = figure.across == "policy"
     tests: dict[tuple[str, str, str], Paired] = {}
-    for (section, position, label), trials in placed.items():
-        others = placed.get((section, str(figure.reference) if one_column else position, str(figure.reference)))
+    for (section, where, label), trials in by_cell.items():
+        others = by_cell.get((section, str(figure.reference) if one_column else where, str(figure.reference)))
         if others is None or label == figure.reference:
             continue
         cost = _cost(figure, [*trials, *others])
-        tests[section, position, label] = paired(trials, others, cost, lambda one: first_solution(one) is not None)
+        tests[section, where, label] = paired(trials, others, cost, lambda one: first_solution(one) is not None)
     p_values = iter(holm([p for test in tests.values() for p in (test.success_p, test.cost_p)]))
     blocks: dict[str, list[tuple[str, ...]]] = {}
-    for (section, position, label), test in tests.items():
+    for (section, where, label), test in tests.items():
         counts = (str(count) for count in (test.pairs, test.only_first, test.only_second))
         blocks.setdefault(section, []).append(
-            (label, *[position] * (not one_column), *counts, f"{next(p_values):.2g}", f"{test.difference:+.2f}",
+            (label, *[where] * (not one_column), *counts, f"{next(p_values):.2g}", f"{test.difference:+.2f}",
              f"{next(p_values):.2g}")
         )  # fmt: skip
     header = ("policy", *[figure.across] * (not one_column), "pairs", "only it", f"only {figure.reference}", "p",
@@ -160,7 +160,7 @@ def write_figure(folder: Path, figure: Figure, groups: Sequence[Group]) -> list[
     paths = [folder / f"{figure.name}.{kind}" for kind in ("csv", "md", "png")]
     said = [{f"paper_{metric}": _said(figure, row, metric) for metric in figure.metrics} for row in rows]
     columns = [{name: value for name, value in vars(row).items() if _is_told(figure, name)} for row in rows]
-    write_csv(paths[0], [{**shown, **beside} for shown, beside in zip(columns, said)])
+    write_csv(paths[0], [{**shown, **papers} for shown, papers in zip(columns, said)])
     with target(paths[1]) as temporary:
         temporary.write_text(markdown(figure, groups), encoding="utf-8")
     with target(paths[2]) as temporary:

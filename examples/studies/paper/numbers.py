@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from examples.outputs import steps_to_solution
+from examples.common import steps_to_solution
 from examples.studies.paper.figure import TIMES, Figure, Group
 
 from d4orm_planners.evaluation.store import Trial
@@ -88,7 +88,7 @@ def measured(group: Group) -> Measured:
         reward=float(np.mean(rewards)) if rewards else None,
         jerk=mean("mean_squared_jerk"),
         nodes=_nodes(trials[0]),
-        step_time=_step_time([trial for trial, _ in solved]),
+        step_time=None if any(trial.status for trial in trials) else mean("decision_time"),
         **{name: mean(name) for name in means},
     )  # fmt: skip
 
@@ -106,15 +106,6 @@ def _mean_and_deviation(seconds: Sequence[float]) -> tuple[float | None, float |
     if not seconds:
         return None, None
     return float(np.mean(seconds)), float(np.std(seconds, ddof=min(len(seconds) - 1, 1)))
-
-
-def _step_time(trials: Sequence[Trial]) -> float | None:
-    values = [
-        (trial.wall_time - trial.preparation) / trial.steps
-        for trial in trials
-        if not trial.status and trial.wall_time is not None and trial.preparation is not None and trial.steps
-    ]
-    return float(np.mean(values)) if values else None
 
 
 def _nodes(trial: Trial) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 from examples.studies import AS_IN_THE_PAPER
 from examples.studies.paper.figure import Figure, Section
+from examples.studies.paper.published import AMSWARM, BIG_TEAMS, COARSENESS, D4ORM_SECONDS, IPOPT
 
 from d4orm_planners.d_d4orm.inbox import SELECTIONS
 
@@ -17,6 +18,9 @@ C2F: dict[str, object] = {"policy": "d4orm-c2f", "refine": "sync"}
 """Refinement in the background would make the result depend on how busy the machine is."""
 BOTH_C2F: Mapping[str, Mapping[str, object]] = {"d4orm-c2f": {**C2F, **PAPER}, "d4orm-c2f, ours": C2F}
 """Algorithm 4, and our controller. What is not the paper's method has a label that says so."""
+DENOISERS: Mapping[str, Mapping[str, object]] = MappingProxyType({
+    "d4orm": PAPER, "d4orm, defaults": {"policy": "d4orm"}, "d4orm-d": PAPER, "hybrid": {"policy": "hybrid"}
+})  # fmt: skip
 SIZES = (4, 8, 12, 16)
 Environment = tuple[str, str, str | None]
 """Title, scenario, model."""
@@ -27,8 +31,6 @@ SPACE: Environment = ("3D Holonomic", "paper_sphere", None)
 OBSTACLES: Environment = ("2D Holo 4 Obs", "paper_obstacles", None)
 ENVIRONMENTS = (DRIVES, PLANE, MIXED, SPACE, OBSTACLES)
 """The paper's, in its order."""
-D4ORM_SECONDS = {"4": "0.12", "8": "0.13", "12": "0.30", "16": "1.25"}
-"""Table II, means."""
 
 
 def _sections(
@@ -85,14 +87,6 @@ def _ipopt() -> Figure:
         "d4orm": PAPER,
         "d4orm, defaults": {"policy": "d4orm"},
     }
-    paper = {
-        ("2D Holonomic", "ipopt", "mean_runtime"): {
-            "4": "1.12 ± 0.526", "8": "6.33 ± 2.284", "12": "35.32 ± 11.53", "16": "failed",
-        },
-        ("2D Holonomic", "d4orm", "mean_runtime"): {
-            "4": "0.12 ± 0.002", "8": "0.13 ± 0.002", "12": "0.30 ± 0.217", "16": "1.25 ± 1.016",
-        },
-    }  # fmt: skip
     return Figure(
         name="ipopt",
         title="D4orm and direct collocation with IPOPT",
@@ -102,50 +96,30 @@ def _ipopt() -> Figure:
         metrics=("mean_runtime", "success"),
         plots=("runtime", "success"),
         reference="d4orm",
-        paper=paper,
+        paper=IPOPT,
     )
 
 
 def _big_teams() -> Figure:
-    policies = {
-        "d4orm": PAPER,
-        "d4orm, defaults": {"policy": "d4orm"},
-        "d4orm-d": PAPER,
-        "hybrid": {"policy": "hybrid"},
-        **BOTH_C2F,
-    }
-    paper = {
-        ("2D Holonomic", "d4orm", "runtime"): D4ORM_SECONDS,
-        ("2D Holonomic", "d4orm-c2f", "runtime"): {"16": "about 0.2"},
-        ("2D Holonomic", "d4orm-c2f", "step_time"): {"16": "30"},
-        ("2D Holo Random", "d4orm-d", "runtime"): {"64": "within 2"},
-        ("2D Holo Random, 100", "d4orm-d", "runtime"): {"100": "within 30"},
-        ("2D Holo Random", "d4orm-c2f", "runtime"): {"64": "within 2"},
-    }
+    policies = {**DENOISERS, **BOTH_C2F}
     random: Environment = ("2D Holo Random", "paper_random", None)
     hundred: Environment = ("2D Holo Random, 100", "random", None)
+    few = {"quick_robots": (3,), "time_limit": 60.0}
     return Figure(
         name="big-teams",
         title="D4orm, D4orm-D and D4orm-C2F",
         source="section VIII-A, figure of the variants",
         sections=(
             *_sections(policies, *ENVIRONMENTS, num_robots=SIZES, time_limit=30.0),
-            *_sections(policies, random, num_robots=(16, 32, 64), quick_robots=(3,), time_limit=60.0),
-            *_sections(
-                policies,
-                hundred,
-                num_robots=(100,),
-                quick_robots=(3,),
-                time_limit=60.0,
-                scenario_settings=AS_IN_THE_PAPER,
-            ),
+            *_sections(policies, random, num_robots=(16, 32, 64), **few),
+            *_sections(policies, hundred, num_robots=(100,), scenario_settings=AS_IN_THE_PAPER, **few),
         ),
         across="num_robots",
         metrics=("success", "runtime", "travel_time", "step_time"),
         plots=("runtime", "travel_time", "success", "survival"),
         deadlines=(1, 2, 10, 30),
         reference="d4orm",
-        paper=paper,
+        paper=BIG_TEAMS,
         remarks=(
             "Runtime is that of the first solution, or of the coarse plan of d4orm-c2f. Within deadlines d4orm-c2f "
             "counts with all its control loops. `d4orm-c2f` is Algorithm 4 (preset `paper`), with few seeds.",
@@ -177,16 +151,8 @@ OURS = "ours, "
 
 
 def _coarseness() -> Figure:
-    table = {
-        (1, 1): ("0.75", "6.23", "7.23"),
-        (2, 1): ("0.37", "6.27", "7.31"),
-        (3, 1): ("0.32", "6.35", "7.52"),
-        (4, 1): ("0.23", "6.42", "7.62"),
-        (1, 5): ("0.57", "6.31", "7.49"),
-        (1, 10): ("0.43", "6.36", "7.58"),
-    }
     metrics = ("runtime", "travel_time", "makespan")
-    labels = {(f, o): f"f={f}, o={o}" for f, o in table}
+    labels = {(f, o): f"f={f}, o={o}" for f, o in COARSENESS}
     policies = {
         prefix + label: {**C2F, **preset, "coarse_factor": f, "check_interval": o}
         for prefix, preset in (("", PAPER), (OURS, {}))
@@ -204,7 +170,7 @@ def _coarseness() -> Figure:
         compared_by="travel_time",
         paper={
             (OBSTACLES[0], labels[key], metric): {labels[key]: value}
-            for key, values in table.items()
+            for key, values in COARSENESS.items()
             for metric, value in zip(metrics, values)
         },
         remarks=(
@@ -235,34 +201,14 @@ def _noise_schedule() -> Figure:
 
 def _amswarm() -> Figure:
     scenarios = tuple(f"amswarm_{number}" for number in range(1, 6))
-    numbers = {
-        "amswarm": (("0.83", "failed", "0.88", "0.81", "failed"), ("9.60", "failed", "9.10", "8.70", "failed"),
-                    ("10.43", "failed", "11.05", "10.08", "failed")),
-        "d4orm": (("0.17", "0.33", "0.76", "1.17", "1.31"), ("7.00", "7.25", "8.10", "8.36", "7.13"),
-                  ("46.62", "43.29", "44.62", "43.11", "43.08")),
-        "d4orm-d": (("0.19", "0.29", "0.33", "0.40", "0.35"), ("7.02", "7.11", "7.77", "8.04", "7.38"),
-                    ("46.58", "44.01", "43.57", "42.62", "42.33")),
-    }  # fmt: skip
     metrics, title = ("runtime", "makespan", "jerk"), "Ten 3D holonomic robots"
+    policies = {**DENOISERS, "amswarm": {**PAPER, "max_iterations": 1}, "amswarm, ours": {"policy": "amswarm"}}
     return Figure(
         name="amswarm",
         title="D4orm, D4orm-D and AMSwarm in the environments of AMSwarm",
         source="section VIII-C, figure of AMSwarm",
         sections=(
-            Section(
-                title=title,
-                policies={
-                    "d4orm": PAPER,
-                    "d4orm, defaults": {"policy": "d4orm"},
-                    "d4orm-d": PAPER,
-                    "hybrid": {"policy": "hybrid"},
-                    "amswarm": {**PAPER, "max_iterations": 1},
-                    "amswarm, ours": {"policy": "amswarm"},
-                },
-                scenarios=scenarios,
-                quick_robots=(None,),
-                time_limit=60.0,
-            ),
+            Section(title=title, policies=policies, scenarios=scenarios, quick_robots=(None,), time_limit=60.0),
         ),
         across="scenario",
         metrics=(*metrics, "success"),
@@ -270,7 +216,7 @@ def _amswarm() -> Figure:
         reference="d4orm-d",
         paper={
             (title, label, metric): dict(zip(scenarios, row))
-            for label, rows in numbers.items()
+            for label, rows in AMSWARM.items()
             for metric, row in zip(metrics, rows)
         },
         remarks=("The paper shows one run each; ours are medians of runtime and means of the rest over seeds of the "

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from examples.outputs import steps_spent, steps_to_solution
+from examples.common import steps_spent, steps_to_solution
 from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import Measured, column, first_solution
 
@@ -30,17 +30,7 @@ INSTANTS = 200
 
 @own_style()
 def draw(path: Path, figure: Figure, groups: Sequence[Group], rows: Sequence[Measured]) -> None:
-    """Write the picture.
-
-    Args:
-        path: A PNG file.
-        figure: The figure, with at least one plot.
-        groups: Its trials.
-        rows: Their numbers, one per group.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write a figure with at least one plot as PNG, from its trials and their numbers, a row per group."""
     # Made without pyplot, which would keep state and want a display.
     from matplotlib.figure import Figure as Canvas
 
@@ -185,11 +175,7 @@ def _anytime(ax: Axes, figure: Figure, shown: Shown) -> None:
 PLOTS: Mapping[str, Callable[[Axes, Figure, Shown], None]] = MappingProxyType({
     "runtime": partial(_metric, value="runtime", ends=("runtime_lower", "runtime_upper"), label="runtime, s", log=True),
     "first_steps": partial(
-        _metric,
-        value="first_steps",
-        ends=("first_steps_lower", "first_steps_upper"),
-        label="denoising steps",
-        log=True,
+        _metric, value="first_steps", ends=("first_steps_lower", "first_steps_upper"), label="denoising steps", log=True
     ),
     "success": _success,
     "travel_time": partial(_metric, value="travel_time", ends=None, label="travel time, s"),

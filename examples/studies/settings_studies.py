@@ -2,7 +2,7 @@
 
     python -m examples.studies head_to_head --seeds 20 --out head_to_head
 
-Columns are those of :func:`examples.outputs.first_solutions`: success with its 95% interval (Wilson), the mean number
+Columns are those of :func:`examples.common.first_solutions`: success with its 95% interval (Wilson), the mean number
 of denoising steps to the first solution, a trial without one counting twice the budget (PAR-2), the mean travel time of
 the solutions, and how likely it is that a row and the reference are equally good (McNemar on solutions, Wilcoxon on
 steps, paired by seed).
@@ -15,9 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.outputs import (
+from examples.common import (
     first_solutions,
     is_solved,
+    mean_text,
     penalised_steps,
     save_table,
     solved_columns,
@@ -36,18 +37,14 @@ from d4orm_planners.sampling.settings import TUNED
 Settings = Mapping[str, dict[str, Any]]
 """Settings of policies by their labels."""
 PAPER, AUTHORS = {"preset": "paper"}, {"preset": "authors"}
+BUDGET = 2000
+"""Denoising steps of a trial of tuned rivals."""
 
 
 class Block(NamedTuple):
-    """Settings on one team, and the label of those that they are compared with there.
+    """Settings whose rows are shown of one team, by at most so many seeds, and the label of their reference.
 
-    Attributes:
-        scenario: Name of the scenario.
-        num_robots: Size of the team.
-        settings: Settings whose rows are shown.
-        reference: Label of what they are compared with, theirs or another block's of the scenario.
-        seeds: Most seeds.
-        model: Model of the robots; the scenario's own by default.
+    The reference may be of another block of the scenario. The model is the scenario's own by default.
     """
 
     scenario: str
@@ -64,15 +61,14 @@ class Block(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What is compared, and its table.
+    """A comparison, and its table.
 
     Attributes:
         about: A description for ``--help``.
         column: Head of the column of labels.
-        blocks: ``budget -> blocks``, rows of which follow each other; the budget is one of ``budgets``.
-        budgets: Denoising steps of a trial, where settings depend on it, and in the quick version.
+        blocks: Makes the blocks, whose rows follow each other.
         quick: Settings of the quick version.
-        quick_robots: Its team size; ``None`` is one block as it is.
+        quick_robots: Its team size; ``None`` is that of the first block, which is all there is.
         first_seed: Of every row; no default was chosen by seeds from ``FIRST_SEED`` on.
         team: Format of the name of a team, of a trial's attributes.
         rows: Makes the rows of a block.
@@ -82,8 +78,7 @@ class Comparison(NamedTuple):
 
     about: str
     column: str
-    blocks: Callable[[int], Sequence[Block]]
-    budgets: tuple[int, int] = (0, 0)
+    blocks: Callable[[], Sequence[Block]]
     quick: dict[str, Any] = {"max_iterations": 1, "num_steps": 20}  # noqa: RUF012 - never changed
     quick_robots: int | None = 2
     first_seed: int = FIRST_SEED
@@ -94,21 +89,19 @@ class Comparison(NamedTuple):
 
     def blocks_of(self, quick: bool) -> list[Block]:
         """The blocks, or those of the quick version."""
-        blocks = list(self.blocks(self.budgets[quick]))
+        blocks = list(self.blocks())
         if not quick:
             return blocks
-        if self.quick_robots is None:
-            return [blocks[0]._replace(seeds=1)]
-        changed = {"num_robots": self.quick_robots, "seeds": 1}
         small: list[Block] = []
-        for block in blocks:
+        for block in blocks if self.quick_robots else blocks[:1]:
             settings = {label: own | self.quick for label, own in block.settings.items()}
-            if (less := block._replace(settings=settings, **changed)) not in small:  # teams may have differed in size
+            less = block._replace(settings=settings, num_robots=self.quick_robots or block.num_robots, seeds=1)
+            if less not in small:  # teams may have differed in size
                 small.append(less)
         return small
 
 
-def credits_and_penalties(budget: int) -> list[Block]:
+def credits_and_penalties() -> list[Block]:
     """Four teams of 16, D4orm's defaults but for ``credit`` and ``penalty``, at most 20 iterations."""
     penalties = {"team": (1.0,), "robot": (1.0, 2.0), "alternate": (1.0, 2.0), "group": (1.0, 2.0, 3.0)}
     settings = {
@@ -126,7 +119,7 @@ def d4orm(policy: str = "d4orm", max_iterations: int = 20, **settings: Any) -> d
     return {"policy": policy, "engine": "cpu", "max_iterations": max_iterations, **settings}
 
 
-def differences(budget: int) -> list[Block]:
+def differences() -> list[Block]:
     """The preset with one setting of the defaults in turn, and the defaults with one of the preset's."""
     groups = {"credit": "group", "penalty": 2.0}
     preset = {
@@ -152,7 +145,7 @@ def differences(budget: int) -> list[Block]:
     ]
 
 
-def presets_head_to_head(budget: int) -> list[Block]:
+def presets_head_to_head() -> list[Block]:
     """D4orm and D4orm-D by their presets and defaults; and what one difference, or a higher penalty, does."""
     by_preset = {
         name: {f"{name}, authors": d4orm(name, **AUTHORS), f"{name}, paper": d4orm(name, **PAPER),
@@ -179,7 +172,7 @@ def presets_head_to_head(budget: int) -> list[Block]:
     ]
 
 
-def tuned_rivals(budget: int) -> list[Block]:
+def tuned_rivals() -> list[Block]:
     """Every preset by its label, with as many iterations as the budget has room for."""
     chosen: dict[str, dict[str, Any]] = {"d4orm, defaults": {"policy": "d4orm"}}
     for method, tuned in TUNED.items():
@@ -188,14 +181,14 @@ def tuned_rivals(budget: int) -> list[Block]:
                 chosen[f"{method}, {preset}"] = {"policy": method, "preset": preset}
     for settings in chosen.values():
         name, own = settings["policy"], {key: value for key, value in settings.items() if key != "policy"}
-        num_steps = min(make_planner(name, **own).config.num_steps, budget)
-        iterations = 1 if name == "mbd" else budget // num_steps
+        num_steps = min(make_planner(name, **own).config.num_steps, BUDGET)
+        iterations = 1 if name == "mbd" else BUDGET // num_steps
         settings |= {"engine": "cpu", "num_steps": num_steps, "max_iterations": iterations}
     teams = (*TUNED_ON, ("paper_circle", 16))
     return [Block(scenario, num_robots, chosen, "d4orm, tuned") for scenario, num_robots in teams]
 
 
-def steps_and_samples(budget: int) -> list[Block]:
+def steps_and_samples() -> list[Block]:
     """8 and 16 robots on the circle, at most 8 iterations of so many steps and samples."""
     alike = {"late_samples": 1.0}
     chosen: Settings = {
@@ -229,7 +222,7 @@ def samples_needed(team: str, column: str, groups: dict[str, list[Trial]], refer
         rows.append(
             {"robots": team, column: label, **solved_columns(trials), "1000 samples": f"{quartiles[1]:.0f}",
              "quartiles": f"{quartiles[0]:.0f}-{quartiles[2]:.0f}",
-             "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
+             "travel time [s]": mean_text(travel),
              "p (samples)": f"{paired(trials, groups[reference], samples).cost_p:.2g}"}
         )  # fmt: skip
     return rows
@@ -239,14 +232,12 @@ def with_iterations(team: str, column: str, groups: dict[str, list[Trial]], refe
     """:func:`first_solutions`, and the mean number of iterations of the successes."""
     rows = []
     for row in first_solutions(team, column, groups, reference):
-        solved = [
-            trial.iterations for trial in groups[row[column]] if is_solved(trial) and trial.iterations is not None
-        ]
-        rows.append(dict(list(row.items())[:4]) | {"iterations": f"{np.mean(solved):.1f}" if solved else "-"} | row)
+        solved = [trial.iterations for trial in groups[row[column]] if is_solved(trial)]
+        rows.append(dict(list(row.items())[:4]) | {"iterations": mean_text(solved, ".1f")} | row)
     return rows
 
 
-def limited_jerk(budget: int) -> list[Block]:
+def limited_jerk() -> list[Block]:
     """4 and 8 double integrators on the circle, and the same with limits on their jerk (paper, section VIII-C)."""
     settings = {"d4orm": d4orm(**PAPER)}
     models = ("holonomic2d", "holonomic2d_jerk")
@@ -257,7 +248,7 @@ def with_jerk(team: str, column: str, groups: dict[str, list[Trial]], reference:
     """:func:`first_solutions` without the tests, and the mean squared norm of the solutions' jerk."""
     jerks = [trial.mean_squared_jerk for trial in groups[reference] if is_solved(trial)]
     shown = list(first_solutions(team, column, groups, reference)[0].items())[:-2]
-    return [dict(shown) | {"jerk [m²/s⁶]": f"{np.mean(jerks):.3g}" if jerks else "-"}]
+    return [dict(shown) | {"jerk [m²/s⁶]": mean_text(jerks, ".3g")}]
 
 
 COMPARISONS: Mapping[str, Comparison] = {
@@ -282,7 +273,7 @@ COMPARISONS: Mapping[str, Comparison] = {
         "D4orm and its rivals as the paper has them and tuned with the same effort, on seeds that no tuning has seen. "
         "A trial has 2000 denoising steps, of 1024 samples but for the defaults, which draw 256 and later 128; MBD has "
         "its one run, of as many steps as it was tuned with.",
-        "method", tuned_rivals, budgets=(2000, 20), quick_robots=None, first_seed=0,
+        "method", tuned_rivals, quick_robots=None, first_seed=0,
     ),
     "fewer_samples": Comparison(
         "Samples until D4orm's first solution with fewer steps, fewer samples, or fewer while the noise is small: "

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -18,7 +18,10 @@ from PIL import Image
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+from d4orm_env import Problem
 from d4orm_env.core.files import replaced_when_done
+from d4orm_env.envs.joint_state import JointState
+from d4orm_env.render import FrameRenderer
 from d4orm_planners.base.machine import commit, describe_machine
 from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.evaluate import run_study
@@ -26,6 +29,8 @@ from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import mean_interval, wilson_interval
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
+
+Row = TypeVar("Row", bound=Mapping[str, Any])
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""
@@ -55,12 +60,7 @@ def argument_parser(description: str | None) -> argparse.ArgumentParser:
 
 
 def study_parser(description: str | None, seeds: int | None = None) -> argparse.ArgumentParser:
-    """A parser for a study: what every script has, and where rows or trials come from.
-
-    Args:
-        description: Docstring of the script.
-        seeds: Default of ``--seeds``; without it there is no such argument.
-    """
+    """A parser for a study: what every script has, where rows or trials come from, and seeds where it has a default."""
     parser = argument_parser(description)
     parser.add_argument("--trials", type=existing_file, help="run nothing; a Parquet file that the study wrote")
     if seeds is not None:
@@ -158,7 +158,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:
-    """How many trials are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
+    """Number of trials that are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
     solved = sum(map(counts, trials))
     lower, upper = wilson_interval(solved, len(trials))
     return {"solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}"}
@@ -170,6 +170,19 @@ def success_of_seeds(successes: Sequence[float], column: str = "success") -> dic
     interval = "" if lower is None or upper is None else f"{max(lower, 0):.0f}% to {min(upper, 100):.0f}%"
     ends = f"{min(successes):.0f}%, {max(successes):.0f}%"
     return {column: f"{mean:.0f}%", "95% interval": interval, "least, most": ends}
+
+
+def grouped(rows: Iterable[Row], *columns: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by what they have in some columns, in order of appearance."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[column] for column in columns), []).append(row)
+    return groups
+
+
+def mean_text(values: Sequence[float], form: str = ".2f", none: str = "-") -> str:
+    """The mean of some values as text, or what stands for it where there are none."""
+    return f"{np.mean(values):{form}}" if values else none
 
 
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
@@ -185,7 +198,7 @@ def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], refe
         rows.append(
             {"team": team, column: label, **solved_columns(trials),
              "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
-             "travel time [s]": f"{np.mean(travel):.2f}" if travel else "-",
+             "travel time [s]": mean_text(travel),
              "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
         )  # fmt: skip
     return rows
@@ -237,6 +250,19 @@ def save_figure(figure: Any, path: Path) -> None:
         figure.savefig(temporary)
     plt.close(figure)
     print(f"wrote {path}")
+
+
+def film(
+    problem: Problem, joints: Sequence[JointState], faded: Sequence[Any], collided: Sequence[Any],
+    captions: Sequence[str], view: Any = None,
+) -> list[Any]:  # fmt: skip
+    """Images of joint states with trails; of each ``(K,)`` robots that are pale and those in contact."""
+    renderer, frames = FrameRenderer(problem, (520, 540), view), []
+    for step, (joint, pale, touching, caption) in enumerate(zip(joints, faded, collided, captions, strict=True)):
+        trail = np.stack([past.states[:, :2] for past in joints[max(step - 30, 0) : step + 1]])
+        frames.append(renderer.draw(joint.states, pale, touching, joint.goals, trail, caption=caption))
+    renderer.close()
+    return frames
 
 
 def save_gif(frames: Sequence[Any], path: Path, interval: float) -> None:
