@@ -12,10 +12,14 @@ from d4orm_env.core.team import Team
 
 
 def scenario_cases(num_robots: int) -> list[dict[str, Any]]:
-    """Arguments of every scenario with every model that it takes."""
-    cases: list[dict[str, Any]] = []
+    """Arguments of every scenario; where there is a choice of models they take turns, so that all are met."""
+    models: dict[str, list[str | None]] = {}
     for scenario, model in scenario_models():
+        models.setdefault(scenario, []).append(model)
+    cases: list[dict[str, Any]] = []
+    for number, (scenario, choice) in enumerate(models.items()):
         size = {} if scenario.startswith("amswarm") else {"num_robots": num_robots}
+        model = choice[number % len(choice)]
         cases.append({"scenario": scenario, **size, **({} if model is None else {"model": model}), **needed(scenario)})
     return cases
 

@@ -1,4 +1,4 @@
-"""The test suites of PettingZoo and Gymnasium, on every scenario and model, with warnings as errors."""
+"""The test suites of PettingZoo and Gymnasium, on every scenario, with models in turn, with warnings as errors."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, ge
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 
-def boxes(num_robots: int = 4, model: str = "differential_drive", **changes: object) -> Problem:
-    problem = make_problem("circle", num_robots=num_robots, model=model, num_obstacles=1, seed=2)
+def boxes(num_robots: int = 4, **changes: object) -> Problem:
+    problem = make_problem("circle", num_robots=num_robots, model="differential_drive", num_obstacles=1, seed=2)
     return problem.replace(team=problem.team.replace(footprint=Box(0.36, 0.24)), **changes)
 
 
@@ -56,13 +56,14 @@ def test_planners_solve_teams_of_boxes_with_goal_headings(name: str) -> None:
 
 def test_boxes_pass_where_discs_round_them_do_not() -> None:
     """Two long robots side by side in a lane, closer than the discs round them."""
-    problem = boxes(2, "unicycle")
-    team = problem.team.replace(footprint=Box(0.8, 0.1))
-    lane = Problem(team, [[0, 0, 0], [0, 0.2, 0]], [[3, 0], [3, 0.2]], goal_heading=0.0, goal_heading_tolerance=0.05)
+    team = boxes(2).team.replace(footprint=Box(0.8, 0.1))
+    start, goal = [[0, 0, 0, 0], [0, 0.2, 0, 0]], [[3, 0], [3, 0.2]]
+    lane = Problem(team, start, goal, goal_heading=0.0, goal_heading_tolerance=0.05)
     plan = make_planner("d4orm").solve(lane, seed=0, time_limit=60)
     assert plan.solved
 
 
+@pytest.mark.slow
 def test_ellipsoids_fly_over_each_other_with_room() -> None:
     problem = make_problem("sphere", num_robots=4)
     problem = problem.replace(team=problem.team.replace(footprint=Ellipsoid(0.12, 0.12, 0.3)))
@@ -71,6 +72,7 @@ def test_ellipsoids_fly_over_each_other_with_room() -> None:
     assert plan.verified
 
 
+@pytest.mark.slow
 def test_c2f_executes_them() -> None:
     problem = boxes(horizon=150, goal_heading=0.0)
     episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("d4orm-c2f", refine="sync"), seed=0)

@@ -109,6 +109,7 @@ def trailers(start: Any, goal: Any, boxes: Any = (), **arguments: Any) -> Proble
     return Problem(team, start, goals[:, :2], world, goal_heading=goals[:, 2], **usual | arguments)
 
 
+@pytest.mark.slow
 def test_cars_with_trailers_swap() -> None:
     start = [[1.0, 2.5, 0.0, 0.2], [4.0, 2.5, np.pi, 0.0]]
     plan = solved(trailers(start, [[4.0, 2.5, 0.0], [1.0, 2.5, np.pi]]))

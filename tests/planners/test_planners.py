@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,12 @@ def assert_same_plan(a: Plan, b: Plan) -> None:
     # Who waits how long for whom is a matter of time, not of the seed.
     assert {**a.metrics, "waiting_share": 0} == {**b.metrics, "waiting_share": 0}
     assert [record.reward for record in a.history] == [record.reward for record in b.history]
+
+
+@cache
+def circle_plan(name: str, seed: int) -> Plan:
+    """A cheap plan of four robots, which several tests look at."""
+    return cheap_planner(name).solve(make_problem("circle", num_robots=4), seed=seed)
 
 
 # The plan.
@@ -101,9 +108,8 @@ def test_the_history_tells_of_every_iteration(name: str) -> None:
 
 @ALL
 def test_the_controls_lead_to_the_trajectory(name: str) -> None:
-    problem = make_problem("circle", num_robots=4)
-    plan = cheap_planner(name).solve(problem, seed=1)
-    again = get_sampling_engine("cpu").rollout(problem, plan.controls)
+    plan = circle_plan(name, 0)
+    again = get_sampling_engine("cpu").rollout(plan.problem, plan.controls)
     np.testing.assert_allclose(again.states, plan.trajectory.states, atol=1e-5)
     np.testing.assert_array_equal(plan.controls, plan.trajectory.controls)
 
@@ -135,11 +141,9 @@ def test_controls_are_zero_after_docking(name: str) -> None:
 
 @ALL
 def test_the_same_seed_gives_the_same_plan(name: str) -> None:
-    problem = make_problem("circle", num_robots=4)
-    planner = cheap_planner(name)
-    first = planner.solve(problem, seed=5)
-    assert_same_plan(first, planner.solve(problem, seed=5))
-    assert_same_plan(first, cheap_planner(name).solve(problem, seed=5))
+    first, planner = circle_plan(name, 0), cheap_planner(name)
+    for _ in range(2):
+        assert_same_plan(first, planner.solve(first.problem, seed=0))
 
 
 @ALL
@@ -157,11 +161,9 @@ def test_threads_do_not_change_the_plan(name: str, monkeypatch: pytest.MonkeyPat
 
 @ALL
 def test_another_seed_gives_another_plan(name: str) -> None:
-    problem = make_problem("circle", num_robots=4)
-    planner = cheap_planner(name)
     # Path finding knows some dozen plans for four robots, so that two seeds may well lead to the same one.
     seeds = (0, 1, 2) if name == "mapf" else (0, 1, 2**40)
-    plans = [planner.solve(problem, seed=seed).controls for seed in seeds]
+    plans = [circle_plan(name, seed).controls for seed in seeds]
     assert not np.allclose(plans[0], plans[1], atol=1e-3)
     assert not np.allclose(plans[0], plans[2], atol=1e-3)
 
@@ -181,17 +183,16 @@ def test_every_iteration_draws_its_own_numbers(name: str) -> None:
 
 @ALL
 def test_the_iteration_limit_ends_an_unsolvable_problem(name: str) -> None:
-    plan = cheap_planner(name).solve(walled_in_problem(), max_iterations=3)
+    """The configured one, unless the call says otherwise; and the callback sees every iteration once."""
+    planner, recorder = cheap_planner(name, max_iterations=1), Recorder()
+    assert planner.solve(walled_in_problem()).iterations == 1
+    plan = planner.solve(walled_in_problem(), max_iterations=3, callback=recorder)
     assert plan.status == "iteration_limit"
     assert not plan.solved
     assert plan.iterations == len(plan.history) == 3
     assert plan.metrics["success"] == 0
-
-
-@ALL
-def test_the_configured_iteration_limit_holds_unless_the_call_says_otherwise(name: str) -> None:
-    assert cheap_planner(name, max_iterations=2).solve(walled_in_problem()).iterations == 2
-    assert cheap_planner(name, max_iterations=2).solve(walled_in_problem(), max_iterations=1).iterations == 1
+    assert all(isinstance(record, IterationRecord) for record in recorder.records)
+    assert tuple(recorder.records) == plan.history
 
 
 @ALL
@@ -200,14 +201,6 @@ def test_the_time_limit_ends_an_unsolvable_problem(name: str) -> None:
     assert plan.status == "time_limit"
     assert not plan.solved
     assert plan.iterations == len(plan.history)
-
-
-@ALL
-def test_the_callback_sees_every_iteration_once(name: str) -> None:
-    recorder = Recorder()
-    plan = cheap_planner(name).solve(walled_in_problem(), max_iterations=3, callback=recorder)
-    assert all(isinstance(record, IterationRecord) for record in recorder.records)
-    assert tuple(recorder.records) == plan.history
 
 
 @ALL

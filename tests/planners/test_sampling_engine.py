@@ -241,8 +241,13 @@ def test_so_it_is_for_robots_that_stand_in_all_samples(engine: str) -> None:
     step_by_step(ENGINES[engine], task, sigma=(0.1, 0.05))
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("scenario", list_scenarios())
+WORLDS = ("circle", "sphere", "heterogeneous", "four_obstacles", "amswarm_2", "rooms", "map")
+"""Scenarios of every kind of team and of world; JAX compiles for minutes for all, and rolls out in all elsewhere."""
+
+
+@pytest.mark.parametrize(
+    ("scenario", "engine"), [*((name, "cpu") for name in list_scenarios()), *((name, "jax") for name in WORLDS)]
+)
 @pytest.mark.slow
 def test_so_it_is_in_every_scenario(scenario: str, engine: str) -> None:
     size = {} if scenario.startswith("amswarm") else {"num_robots": 4}

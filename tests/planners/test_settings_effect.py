@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from contextlib import closing
+from functools import cache
 from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
@@ -164,8 +165,18 @@ def outcomes(name: str, settings: dict[str, Any]) -> Generator[Any]:
     yield pool, search.plan("stopped").metrics.get("messages")
 
 
+@cache
+def first_outcome(name: str, settings: tuple[tuple[str, Any], ...]) -> Any:
+    """What the first iteration gives: most settings change that, and most of them beside the same others."""
+    with closing(outcomes(name, dict(settings))) as those:
+        return next(those)
+
+
 def differ(name: str, settings: dict[str, Any], others: dict[str, Any]) -> bool:
     """Whether two solves differ; they end where they do."""
+    one, other = (first_outcome(name, tuple(sorted(each.items()))) for each in (settings, others))
+    if one != other:
+        return True
     with closing(outcomes(name, settings)) as one, closing(outcomes(name, others)) as other:
         return any(first != second for first, second in zip_longest(one, other))
 
@@ -196,7 +207,7 @@ def test_the_same_settings_have_the_same_outcome() -> None:
         if name != "ipopt":
             base = base_settings(name, "num_samples")
             assert not differ(name, base, base)
-    assert executed("d4orm-c2f", CONTROLLER) == executed("d4orm-c2f", CONTROLLER)
+    assert executed("d4orm-c2f", CONTROLLER) == unchanged("d4orm-c2f")
 
 
 def lone() -> Problem:
@@ -299,6 +310,12 @@ def executed(name: str, settings: dict[str, Any]) -> bytes:
     ).trajectory.controls.tobytes()
 
 
+@cache
+def unchanged(name: str) -> bytes:
+    """What most settings are compared with."""
+    return executed(name, CONTROLLER if name == "d4orm-c2f" else {})
+
+
 @pytest.mark.parametrize(("name", "setting"), policy_settings())
 @pytest.mark.slow
 def test_every_setting_of_a_policy_changes_something(
@@ -324,4 +341,4 @@ def test_every_setting_of_a_policy_changes_something(
     else:
         value, beside = POLICY_CHANGES[name][setting]
         base = {**(CONTROLLER if name == "d4orm-c2f" else {}), **beside}
-        assert executed(name, base | {setting: value}) != executed(name, base)
+        assert executed(name, base | {setting: value}) != (executed(name, base) if beside else unchanged(name))

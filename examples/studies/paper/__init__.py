@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 from examples.common import count, study_trials, trials_parser
 from examples.studies.paper.figure import Figure, grouped
-from examples.studies.paper.figure_report import markdown, write_figure
+from examples.studies.paper.figure_report import write_figure
 from examples.studies.paper.paper_figures import FIGURES
 
 from d4orm_planners.cli.warmup import warm_up
@@ -33,7 +33,8 @@ def measure(figure: Figure, arguments: Namespace) -> None:
     groups = grouped(figure, study_trials(arguments, figure.name, studies))
     arguments.out.mkdir(parents=True, exist_ok=True)
     written = write_figure(arguments.out, figure, groups)
-    print(markdown(figure, groups), *(f"wrote {path}" for path in written), sep="\n")
+    page = next(path for path in written if path.suffix == ".md")
+    print(page.read_text(encoding="utf-8"), *(f"wrote {path}" for path in written), sep="\n")
 
 
 def main(given: Sequence[str] | None = None) -> int:
