@@ -91,7 +91,8 @@ class PathIndex:
 
         def count(part: IntArray) -> None:
             met = np.empty((paths.shape[1], self.table.positions.shape[1]), np.bool_)
-            _count_meetings(self.table, index, paths, last, part, met, counts, when)
+            apart = np.empty(paths.shape[1], np.int64)
+            _count_meetings(self.table, index, paths, last, part, met, apart, counts, when)
 
         self._threads.over(len(index), count)
         return counts, when
@@ -166,25 +167,51 @@ def _count_meetings(
     until: IntArray,
     robot_range: IntArray,
     met: BoolArray,
+    apart: IntArray,
     counts: Ints,
     when: Ints,
 ) -> None:
-    """See :meth:`PathIndex.count_meetings`; ``met`` ``(V, K)`` is overwritten."""
+    """See :meth:`PathIndex.count_meetings`; ``met`` ``(V, K)`` and ``apart`` ``(V,)`` are overwritten.
+
+    Mostly paths are the same up to some step: what they meet until there is found for the first one only.
+    """
     table = borrow(table)
     num_paths, num_blocks = paths.shape[1], table.first.shape[0]
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
-        met[:], met[:, robot] = False, True
-        counts[r], when[r] = 0, paths.shape[2]
+        met[0, :], met[0, robot] = False, True
+        counts[r, 0], when[r, 0], apart[0], end = 0, paths.shape[2], 0, 1
+        for v in range(1, num_paths):
+            apart[v] = _first_difference(paths[r, 0], paths[r, v])
         # Time in the outer loop: paths of one robot look into the same cells.
         for block in range(min(num_blocks, until[r] // BLOCK + 1)):
             first, last = steps_of(table, block)
-            for v in range(num_paths):
+            end = last
+            for v in range(num_paths - 1, -1, -1):
+                if last <= apart[v]:
+                    continue
+                if first <= apart[v]:
+                    counts[r, v], when[r, v] = counts[r, 0], when[r, 0]
+                    for other in range(met.shape[1]):
+                        met[v, other] = met[0, other]
                 middle, spread = enclose(paths[r, v], table.positions.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
                     continue  # Nothing is other than it was in the block before.
                 count, soonest = _mark_near(table, robot, paths[r, v], middle, spread, block, met[v])
                 counts[r, v], when[r, v] = counts[r, v] + count, min(when[r, v], soonest)
+        for v in range(num_paths):
+            if end <= apart[v]:
+                counts[r, v], when[r, v] = counts[r, 0], when[r, 0]
+
+
+@inlined
+def _first_difference(path: FloatArray, other: FloatArray) -> Whole:
+    """The first step after the start at which two paths are not at the same place, ``H+1`` if there is none."""
+    for t in range(1, path.shape[0]):
+        for axis in range(path.shape[1]):
+            if path[t, axis] != other[t, axis]:
+                return t
+    return path.shape[0]
 
 
 _DOUBT, _ROUNDING = 1 / 750, 64 * 2.0**-23
