@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -27,12 +28,12 @@ def planners(
         print_table(name, [*settings, *presets] or [("no settings", "")])
         return
     for title, table in (("Planners", PLANNERS), ("Policies", POLICIES)):
-        print_table(title, [(name, _or_error(name)) for name in table])
+        print_table(title, [(name, _or_error(describe_policy, name)) for name in table])
 
 
-def _or_error(name: str) -> str:
+def _or_error(describe: Callable[[str], str], name: str) -> str:
     """A description, or why there is none: what another package brings may be broken."""
     try:
-        return describe_policy(name)
+        return describe(name)
     except ValueError as error:
         return f"unusable: {error}"

@@ -87,7 +87,8 @@ class PathIndex:
 
         def count(part: IntArray) -> None:
             met = np.empty((paths.shape[1], self.table.positions.shape[1]), np.bool_)
-            _count_meetings(self.table, index, paths, part, met, counts, when)
+            apart = np.empty(paths.shape[1], np.int64)
+            _count_meetings(self.table, index, paths, part, met, apart, counts, when)
 
         self._threads.over(len(index), count)
         return counts, when
@@ -156,24 +157,49 @@ def _pairs(table: PathTable, robot_range: IntArray) -> IntArray:
 
 @cached_kernel(**WITHOUT_ARRAYS)
 def _count_meetings(
-    table: PathTable, robots: IntArray, paths: FloatArray, robot_range: IntArray, met: BoolArray, counts: Ints,
-    when: Ints,
+    table: PathTable, robots: IntArray, paths: FloatArray, robot_range: IntArray, met: BoolArray, apart: IntArray,
+    counts: Ints, when: Ints,
 ) -> None:  # fmt: skip
-    """See :meth:`PathIndex.count_meetings`; ``met`` ``(V, K)`` is overwritten."""
+    """See :meth:`PathIndex.count_meetings`; ``met`` ``(V, K)`` and ``apart`` ``(V,)`` are overwritten.
+
+    Mostly paths are the same up to some step: what they meet until there is found for the first one only.
+    """
     table = borrow(table)
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
-        met[:], met[:, robot] = False, True
-        counts[r], when[r] = 0, paths.shape[2]
+        met[0, :], met[0, robot] = False, True
+        counts[r, 0], when[r, 0], apart[0] = 0, paths.shape[2], 0
+        for v in range(1, paths.shape[1]):
+            apart[v] = _first_difference(paths[r, 0], paths[r, v])
         # Time in the outer loop: paths of one robot look into the same cells.
         for block in range(table.first.shape[0]):
             first, last = steps_of(table, block)
-            for v in range(paths.shape[1]):
+            for v in range(paths.shape[1] - 1, -1, -1):
+                if last <= apart[v]:
+                    continue
+                if first <= apart[v]:
+                    counts[r, v], when[r, v] = counts[r, 0], when[r, 0]
+                    for other in range(met.shape[1]):
+                        met[v, other] = met[0, other]
                 middle, spread = enclose(paths[r, v], table.positions.shape[2], first, last)
                 if spread == 0.0 and block > table.moving[0] + 1:
                     continue  # Nothing has moved since the block before.
                 count, soonest = _mark_near(table, robot, paths[r, v], middle, spread, block, met[v])
                 counts[r, v], when[r, v] = counts[r, v] + count, min(when[r, v], soonest)
+        end = steps_of(table, table.first.shape[0] - 1)[1]
+        for v in range(paths.shape[1]):
+            if end <= apart[v]:
+                counts[r, v], when[r, v] = counts[r, 0], when[r, 0]
+
+
+@inlined
+def _first_difference(path: FloatArray, other: FloatArray) -> Whole:
+    """The first step after the start at which two paths are not at the same position, ``H+1`` if there is none."""
+    for t in range(1, path.shape[0]):
+        for axis in range(path.shape[1]):
+            if path[t, axis] != other[t, axis]:
+                return t
+    return path.shape[0]
 
 
 _DOUBT, _ROUNDING = 1 / 750, 64 * 2.0**-23

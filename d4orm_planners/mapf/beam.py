@@ -104,7 +104,8 @@ class BeamSpace(NamedTuple):
         numbers: ``(width,)`` their numbers among all ever kept.
         new: Those that go on from there, and room for one more.
         heap: ``(N,)`` numbers of these that may still be kept, the most promising first.
-        counted: ``(N,)`` bool, those of which it is known whom they meet in the last block.
+        counted: ``(N, 2)`` bool, those of which it is known what they do wrong by themselves in the last block, and
+            whom they meet there.
         ever: All ever kept.
         did: ``(B,)`` the moves of the path found, the last first.
         lanes: Workspace of :mod:`~d4orm_planners.mapf.block_drives`.
@@ -133,7 +134,7 @@ def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, 
     most = width * num_moves
     return BeamSpace(
         _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, block),
-        np.empty(most, np.int64), np.empty(most, np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
+        np.empty(most, np.int64), np.empty((most, 2), np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
         np.empty(num_blocks, np.int64), np.zeros(lanes, np.float32),
     )  # fmt: skip
 

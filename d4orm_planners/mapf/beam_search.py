@@ -34,7 +34,7 @@ from d4orm_planners.mapf.beam import (
     sink,
     trace_back,
 )
-from d4orm_planners.mapf.block_drives import block_driver, count_faults, path_reader
+from d4orm_planners.mapf.block_drives import block_driver, count_faults, end_of, path_reader, read_positions
 from d4orm_planners.mapf.motion_primitives import Moves, aiming, frame_at
 from d4orm_planners.tracking.tracker import tracker
 
@@ -76,6 +76,7 @@ def _keep_best(
     count: Whole,
     best: float,
     rules: BeamRules,
+    arrays: ProblemArrays,
     table: PathTable,
     queries: Queries,
     r: int,
@@ -83,28 +84,34 @@ def _keep_best(
 ) -> Whole:
     """Keep the most promising of ``count`` paths, of those that are alike the better one; return how many.
 
-    Most are worse than those kept whomever they meet. So that is counted of one only when its turn comes, which then
-    comes again.
+    Most are worse than those kept whatever they touch or meet. So that is counted of one only when its turn comes,
+    which then comes again.
     """
     new, heap, counted, numbers = space.new, space.heap, space.counted, space.numbers
+    robot, (begin, end) = queries.robots[r], steps_of(table, block)
     dedup2 = rules.dedup_distance * rules.dedup_distance
     root = size = np.int64(0)  # literals would compile what they are passed to once more
     for node in range(count):
-        heap[node], counted[node] = node, False
+        heap[node], counted[node, 0], counted[node, 1] = node, False, False
     for position in range(count // 2 - 1, -1, -1):
         sink(new.bounds, heap, position, count)
     while size < numbers.shape[0] and count > 0 and new.bounds[heap[0]] < best:
         node = heap[0]
         alike = is_like_another(new, node, space.beam, size, dedup2)
-        if alike or counted[node]:
+        if alike or counted[node, 1]:
             count -= 1
             heap[0] = heap[count]
             if not alike:
                 keep(new, node, space.beam, size, numbers, space.ever)
                 size += 1
         else:
-            new.faults[node] += _count_met(table, queries, r, new.paths[node], block)
-            new.bounds[node], counted[node] = rules.contact * new.faults[node] + new.costs[node], True
+            faults = 0.0
+            if not counted[node, 0]:
+                faults, counted[node, 0] = count_faults(arrays, robot, end - begin, end, new.paths[node]), True
+            if faults == 0.0:
+                faults, counted[node, 1] = float(_count_met(table, queries, r, new.paths[node], block)), True
+            new.faults[node] += faults
+            new.bounds[node] = rules.contact * new.faults[node] + new.costs[node]
         sink(new.bounds, heap, root, count)
     return size
 
@@ -175,11 +182,12 @@ def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
                 state, velocity, at_goal, cost = read_path(arrays, robot, lane, begin, lanes)
                 if rules.contact * beam.faults[node] + cost >= best:
                     continue
-                path = new.paths[count]
-                faults = beam.faults[node] + count_faults(arrays, robot, lane, end - begin, lanes, path)
-                if rules.contact * faults + cost >= best:
-                    continue
+                path, faults = new.paths[count], beam.faults[node]
+                read_positions(lane, end - begin, lanes, path)
                 if at_goal:
+                    faults += count_faults(arrays, robot, end - begin, end_of(lane, lanes), path)
+                    if rules.contact * faults + cost >= best:
+                        continue
                     # It stays there: whoever comes by later counts too.
                     faults += _count_met(table, queries, r, path, block)
                     faults += _count_passing(table, robot, queries.others, r, path, block, last_busy)
@@ -232,7 +240,7 @@ def search_kernel(name: str) -> Search:
             ending = (queries.limits[r], zero - 1, zero - 1)
             for block in range(queries.blocks[r], table.first.shape[0]):
                 count, ending = grow_paths(arrays, table, moves, rules, queries, r, space, size, block, ending)
-                size = _keep_best(space, count, ending[0], rules, table, queries, r, block)
+                size = _keep_best(space, count, ending[0], rules, arrays, table, queries, r, block)
                 if size == 0:
                     break
             _, number, move = ending

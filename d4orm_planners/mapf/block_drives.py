@@ -130,14 +130,29 @@ def path_reader(model: Model) -> PathReader:
 
 
 @compiled
-def count_faults(arrays: ProblemArrays, robot: Whole, s: Whole, steps: Whole, w: FloatArray, path: FloatArray) -> float:
-    """Count in robots met what a path does wrong by itself in a block; ``path`` ``(BLOCK, d)`` is output."""
-    goal, safety_distance, faults = arrays.goal[robot], arrays.radius[robot] + arrays.margin, 0.0
-    closed, d = is_closed(arrays), arrays.goal.shape[1]
+def read_positions(s: Whole, steps: Whole, w: FloatArray, path: FloatArray) -> None:
+    """Read where a path was at every step of a block; ``path`` ``(BLOCK, d)`` is output."""
+    d = path.shape[1]
     for t in range(steps):
         for axis in range(d):
             path[t, axis] = w[(_POSITIONS + t * d + axis) * TILE + s]
-        if t <= w[_END * TILE + s] and is_unsure(arrays, path[t], goal):
+
+
+@inlined
+def end_of(s: Whole, w: FloatArray) -> Whole:
+    """The last step of a block in which a path moves."""
+    return np.int64(w[_END * TILE + s])
+
+
+@compiled
+def count_faults(arrays: ProblemArrays, robot: Whole, steps: Whole, end: Whole, path: FloatArray) -> float:
+    """Count in robots met what a path ``(BLOCK, d)`` does wrong by itself in a block of so many steps, in which it
+    moves until ``end``.
+    """
+    goal, safety_distance, faults = arrays.goal[robot], arrays.radius[robot] + arrays.margin, 0.0
+    closed = is_closed(arrays)
+    for t in range(steps):
+        if t <= end and is_unsure(arrays, path[t], goal):
             faults += 1.0
         if closed and touches_static(arrays, safety_distance, path[t]):
             faults += _TOUCH

@@ -28,10 +28,10 @@ class Others(NamedTuple):
     """Motions of all robots around one.
 
     Attributes:
-        positions: ``(T + 1, K, 3)`` float64; afterwards they stay where they are [m].
+        positions: ``(K, T + 1, 3)`` float64; afterwards they stay where they are [m].
         need: ``(K,)`` how far the robot that is replanned keeps from each [m]; zero from whom it does not mind, and
             from itself.
-        boxes: ``(B, 6, K)`` the lowest and the highest positions in every block of steps [m].
+        boxes: ``(B, K, 6)`` the lowest and the highest positions in every block of steps [m].
         visits: ``(K, V, 3)`` int32 nodes that each comes so near to, the first step and the one after the last.
         counts: ``(K,)`` int64 the number of visits of each.
     """
@@ -54,52 +54,51 @@ class Occupancy:
     def __init__(self, cells: Cells, positions: Floats) -> None:
         rows, num_robots, _ = positions.shape
         self._cells, self.positions = cells, positions
-        self._boxes = np.empty((-(-rows // BLOCK), 6, num_robots))
+        # Searches look at a robot at many steps in turn.
+        self._paths = np.ascontiguousarray(positions.swapaxes(0, 1))
+        self._boxes = np.empty((-(-rows // BLOCK), num_robots, 6))
         self._visits, self._counts = np.empty((num_robots, 64, 3), np.int32), np.zeros(num_robots, np.int64)
         self._known = np.zeros(num_robots)
 
     def put(self, robots: IntArray | BoolArray | int, positions: Floats | float) -> None:
         """Let robots, by number or mask, move otherwise: ``(T + 1, 3)`` or ``(T + 1, R, 3)`` positions [m]."""
         self.positions[:, robots] = positions
+        self._paths[robots] = self.positions[:, robots].swapaxes(0, -2)
         self._known[robots] = 0.0
 
     def around(self, need: Floats) -> Others:
         """Return the motions around a robot that keeps so far ``(K,)`` from each [m]."""
         waiting = np.flatnonzero((need > 0) & (need != self._known))
         while True:
-            done = note_motions(self._cells, self.positions, waiting, need, self._boxes, self._visits, self._counts)
+            done = note_motions(self._cells, self._paths, waiting, need, self._boxes, self._visits, self._counts)
             self._known[waiting[:done]] = need[waiting[:done]]
             if done == len(waiting):
-                return Others(self.positions, need, self._boxes, self._visits, self._counts)
+                return Others(self._paths, need, self._boxes, self._visits, self._counts)
             waiting = waiting[done:]
             self._visits = np.concatenate([self._visits, np.empty_like(self._visits)], axis=1)
 
 
 @compiled
-def _fill_boxes(positions: Floats, i: Whole, boxes: Floats) -> None:
+def _fill_boxes(path: Floats, boxes: Floats) -> None:
     for block in range(boxes.shape[0]):
         for axis in range(3):
             low, high = np.inf, -np.inf
-            for step in range(block * BLOCK, min((block + 1) * BLOCK, positions.shape[0])):
-                position = positions[step, i, axis]
+            for step in range(block * BLOCK, min((block + 1) * BLOCK, path.shape[0])):
+                position = path[step, axis]
                 low, high = min(low, position), max(high, position)
-            boxes[block, axis, i], boxes[block, axis + 3, i] = low, high
+            boxes[block, axis], boxes[block, axis + 3] = low, high
 
 
 @compiled
-def _fill_visits(
-    cells: Cells, positions: Floats, i: Whole, need: float, visits: NDArray[np.int32], last: NDArray[np.int32]
-) -> int:
+def _fill_visits(cells: Cells, path: Floats, need: float, visits: NDArray[np.int32], last: NDArray[np.int32]) -> int:
     """Number of a robot's visits; as many as there is room for are written. ``last`` ``(N,)`` is -1, and is again."""
-    nodes, rows, used, step = cells.points, positions.shape[0], 0, 0
+    nodes, rows, used, step = cells.points, path.shape[0], 0, 0
     while step < rows:
-        position = positions[step, i]
+        position = path[step]
         # Who stands still is looked at once.
         end = step + 1
         while end < rows and (
-            positions[end, i, 0] == position[0]
-            and positions[end, i, 1] == position[1]
-            and positions[end, i, 2] == position[2]
+            path[end, 0] == position[0] and path[end, 1] == position[1] and path[end, 2] == position[2]
         ):
             end += 1
         (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, position, position, need)
@@ -137,10 +136,10 @@ def note_motions(
     last = np.full(cells.points.shape[0], -1, np.int32)
     for number in range(robots.shape[0]):
         i = robots[number]
-        counts[i] = _fill_visits(cells, positions, i, need[i], visits[i], last)
+        counts[i] = _fill_visits(cells, positions[i], need[i], visits[i], last)
         if counts[i] > visits.shape[1]:
             return number
-        _fill_boxes(positions, i, boxes)
+        _fill_boxes(positions[i], boxes[:, i])
     return robots.shape[0]
 
 
@@ -155,12 +154,12 @@ def find_near_boxes(
         near[count] = i
         count += (
             (need > 0)
-            & (boxes[0, i] - need <= high[0])
-            & (boxes[3, i] + need >= low[0])
-            & (boxes[1, i] - need <= high[1])
-            & (boxes[4, i] + need >= low[1])
-            & (boxes[2, i] - need <= high[2])
-            & (boxes[5, i] + need >= low[2])
+            & (boxes[i, 0] - need <= high[0])
+            & (boxes[i, 3] + need >= low[0])
+            & (boxes[i, 1] - need <= high[1])
+            & (boxes[i, 4] + need >= low[1])
+            & (boxes[i, 2] - need <= high[2])
+            & (boxes[i, 5] + need >= low[2])
         )
     return count
 
@@ -179,11 +178,8 @@ def find_meetings(others: Others, positions: Floats, met: BoolArray) -> None:
         ):
             i = near[number]
             for step in range(first, last):
-                dx, dy = (
-                    others.positions[step, i, 0] - positions[step, 0],
-                    others.positions[step, i, 1] - positions[step, 1],
-                )
-                dz = others.positions[step, i, 2] - positions[step, 2]
+                other = others.positions[i, step]
+                dx, dy, dz = other[0] - positions[step, 0], other[1] - positions[step, 1], other[2] - positions[step, 2]
                 if dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
                     met[i] = True
                     break
@@ -231,8 +227,8 @@ def sort_boxes(others: Others, points: Floats, half: float, num_blocks: int) -> 
             for i in range(others.need.shape[0]):
                 if others.need[i] <= 0:
                     continue
-                low_i, high_i = _range_of(x, width, size[0], boxes[block, 0, i] - spread, boxes[block, 3, i] + spread)
-                low_j, high_j = _range_of(y, width, size[1], boxes[block, 1, i] - spread, boxes[block, 4, i] + spread)
+                low_i, high_i = _range_of(x, width, size[0], boxes[block, i, 0] - spread, boxes[block, i, 3] + spread)
+                low_j, high_j = _range_of(y, width, size[1], boxes[block, i, 1] - spread, boxes[block, i, 4] + spread)
                 for ci in range(low_i, high_i):
                     for cj in range(low_j, high_j):
                         cell = block * count + ci * size[1] + cj
@@ -256,19 +252,11 @@ def bucket_of(buckets: Buckets, block: Whole, x: float, y: float) -> Whole:
 
 
 @compiled
-def last_passage(others: Others, position: Floats, near: IntArray) -> Whole:
-    """The last step at which another comes too near to a place, -1 if none does; ``near`` ``(K + 1,)`` is scratch."""
-    point = (position[0], position[1], position[2])
-    for block in range(others.boxes.shape[0] - 1, -1, -1):
-        first, last = block * BLOCK, min((block + 1) * BLOCK, others.positions.shape[0])
-        latest = np.int64(-1)
-        for number in range(find_near_boxes(others, block, point, point, near)):
-            i = near[number]
-            for step in range(first, last):
-                dx, dy = others.positions[step, i, 0] - position[0], others.positions[step, i, 1] - position[1]
-                dz = others.positions[step, i, 2] - position[2]
-                if dx * dx + dy * dy + dz * dz < others.need[i] * others.need[i]:
-                    latest = max(latest, np.int64(step))
-        if latest >= 0:
-            return latest
-    return np.int64(-1)
+def last_visit(others: Others, node: Whole) -> Whole:
+    """The last step at which another comes too near to a node; -1 if none does."""
+    latest = np.int64(-1)
+    for i in range(others.need.shape[0]):
+        for number in range(others.counts[i] if others.need[i] > 0 else 0):
+            if others.visits[i, number, 0] == node:
+                latest = max(latest, np.int64(others.visits[i, number, 2]) - 1)
+    return latest

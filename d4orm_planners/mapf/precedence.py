@@ -130,8 +130,9 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
         if problem.world.num_obstacles:
             reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK * size
             arcs = _arcs(bends, radius, ARC_CHECKS)[..., : problem.dimension]
-            room = problem.world.clearance(arcs.reshape(-1, problem.dimension)).reshape(len(inner), ARC_CHECKS)
-            fits = room.min(axis=1) > reach
+            for distance in np.unique(reach).tolist():
+                alike = reach == distance
+                fits[alike] = problem.world.is_clear(arcs[alike], distance).all(axis=1)
         rounded = fits & (radius > SHARPEST * size)
         radii[inner[rounded]] = radius[rounded]
         inner = inner[~fits]

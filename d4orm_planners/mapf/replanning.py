@@ -12,10 +12,9 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.beam import sink
-from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, last_passage, sort_boxes
 from d4orm_planners.mapf.roadmap import Footprints, Roadmap
-from d4orm_planners.mapf.safe_intervals import Intervals, free_intervals, interval_at
-from d4orm_planners.mapf.straightening import is_edge_free
+from d4orm_planners.mapf.safe_intervals import Intervals, Traffic, interval_at
+from d4orm_planners.mapf.straightening import first_meeting, meeting
 
 
 class Trip(NamedTuple):
@@ -68,18 +67,14 @@ class _Search(NamedTuple):
     """The search for one robot's path.
 
     Attributes:
-        others: Motions of the others.
-        buckets: The same by where edges near to them have their middles.
-        safe: The safe intervals.
-        came: Entry of the tree that comes first to each of them; -1 for none.
-        dock: Step until which the robot must not come to its goal for good; -1 for none.
+        traffic: All others.
+        came: Entry of the tree that comes first to each safe interval; -1 for none.
+        soonest: No step before it can be that at which the robot comes to its goal for good.
     """
 
-    others: Others
-    buckets: Buckets
-    safe: Intervals
+    traffic: Traffic
     came: Ints
-    dock: Whole
+    soonest: Whole
 
 
 @compiled
@@ -93,6 +88,7 @@ def _departure(
     trip: Trip,
     dock: Whole,
     depart: Whole,
+    arrival: Whole,
 ) -> tuple[Whole, Whole, Whole]:
     """The next departure from an entry of the tree that comes to a safe interval before all others.
 
@@ -106,17 +102,19 @@ def _departure(
         trip: The motion; the dwell of goals only.
         dock: Step until which it must not arrive.
         depart: Earliest departure.
+        arrival: Safe interval of the node that it comes to no sooner than.
 
     Returns:
         Departure, arrival and interval, or -1 for the interval if there is none.
     """
-    safe = search.safe
+    safe = search.traffic.safe
     while depart < safe.ends[tree[entry, 4]]:
         lost = trip.launch if depart > tree[entry, 2] or tree[entry, 3] < 0 else 0
         until = depart + steps + lost
         if until + left > trip.latest:
             break
-        arrival = interval_at(safe, head, until)
+        while arrival < safe.first[head + 1] and safe.ends[arrival] <= until:
+            arrival += 1
         if arrival == safe.first[head + 1]:
             break
         before = search.came[arrival]
@@ -125,7 +123,7 @@ def _departure(
         elif before >= 0 and tree[before, 2] <= until:
             depart += safe.ends[arrival] - until
         elif until <= dock:
-            depart += 1
+            depart = max(depart, dock - steps - trip.launch) + 1
         elif safe.ends[arrival] < min(until + trip.dwell, trip.latest):
             depart += 1 + safe.ends[arrival] - until
         else:
@@ -152,15 +150,20 @@ def _follow_edge(
     search: _Search, roadmap: Roadmap, e: Whole, left: float, trip: Trip, dock: Whole, tree: _Tree, entry: Whole
 ) -> None:
     """Enter whatever is come to from an entry by an edge, see :func:`_departure`."""
-    nodes, entries = roadmap.nodes, tree.entries
-    node, head, depart = entries[entry, 0], np.int64(roadmap.heads[e]), entries[entry, 2]
-    steps, failures = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0
+    traffic, entries, head, depart = search.traffic, tree.entries, np.int64(roadmap.heads[e]), tree.entries[entry, 2]
+    tail, to = roadmap.nodes[entries[entry, 0]], roadmap.nodes[head]
+    steps, failures, robot = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0, np.int64(-1)
+    arrival = interval_at(traffic.safe, head, depart + steps)
+    met: Whole = np.int64(0)
     while True:
-        depart, until, arrival = _departure(search, entries, entry, head, steps, left, trip, dock, depart)
+        depart, until, arrival = _departure(search, entries, entry, head, steps, left, trip, dock, depart, arrival)
         if arrival < 0:
             return
-        if not is_edge_free(search.others, search.buckets, nodes[node], nodes[head], depart, until):
-            # Whoever stands in the way often does so for long.
+        # Whoever stands in the way often does so for long, and where it was met before.
+        if robot < 0 or meeting(traffic.others, robot, tail, to, depart, until, depart + met, depart + met + 1) < 0:
+            robot, met = first_meeting(traffic.others, traffic.buckets, tail, to, depart, until)
+            met -= depart
+        if robot >= 0:
             failures += 1
             depart += 1 + failures // 4
             continue
@@ -180,14 +183,19 @@ def _is_way(roadmap: Roadmap, bodies: Footprints, k: Whole, node: Whole, e: Whol
     return not (docks and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside)
 
 
-@register_jitable(nogil=True, **OPTIONS)
-def _begin(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> _Search:
-    goal = roadmap.nodes[bodies.goals[k]]
-    # Nobody may come near its goal once it stands there for good.
-    dock = np.int64(-1) if trip.dwell >= 0 else last_passage(others, goal, np.empty(len(others.need) + 1, np.int64))
-    buckets = sort_boxes(others, roadmap.nodes, roadmap.lengths.max() / 2, trip.latest // BLOCK + 1)
-    safe = free_intervals(others, roadmap.starts[k], roadmap.nodes.shape[0], trip.latest + 1)
-    return _Search(others, buckets, safe, np.full(safe.begins.shape[0], -1, np.int32), dock)
+@compiled
+def _soonest(roadmap: Roadmap, bodies: Footprints, traffic: Traffic, k: Whole, trip: Trip) -> Whole:
+    """The first step at which some edge to the goal is free for a robot that comes to stay; none if beyond the last."""
+    others, buckets, goal, until = traffic.others, traffic.buckets, bodies.goals[k], traffic.dock + 1
+    while until <= trip.latest:
+        for e in range(roadmap.first[goal], roadmap.first[goal + 1]):
+            tail, head = roadmap.nodes[np.int64(roadmap.heads[e])], roadmap.nodes[goal]
+            steps = np.int64(np.ceil(roadmap.lengths[e] / trip.stride))
+            for depart in (until - steps, until - steps - trip.launch):
+                if depart >= 0 and first_meeting(others, buckets, tail, head, depart, until)[0] < 0:
+                    return until
+        until += 1
+    return until
 
 
 @compiled
@@ -208,14 +216,14 @@ def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip:
     while sizes[1] > 0:
         entry = heap[0]
         node = entries[entry, 0]
-        if sizes[0] + _room_needed(roadmap, search.safe, node) > entries.shape[0]:
+        if sizes[0] + _room_needed(roadmap, search.traffic.safe, node) > entries.shape[0]:
             return np.int64(-2)
         sizes[1] -= 1
         heap[0] = heap[sizes[1]]
         sink(tree.costs, heap, root, sizes[1])
         if search.came[entries[entry, 4]] != entry:
             continue
-        if node == goal and entries[entry, 2] > search.dock:
+        if node == goal and entries[entry, 2] > search.traffic.dock:
             return entry
         if node == goal and bodies.docks:
             continue
@@ -223,8 +231,15 @@ def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip:
             if _is_way(roadmap, bodies, k, node, e):
                 head = np.int64(roadmap.heads[e])
                 motion = trip if head == goal else passing
-                dock, left = search.dock if head == goal and bodies.docks else np.int64(-1), costs[head] / trip.stride
+                dock, left = (
+                    search.traffic.dock if head == goal and bodies.docks else np.int64(-1),
+                    costs[head] / trip.stride,
+                )
                 _follow_edge(search, roadmap, e, left, motion, dock, tree, entry)
+                if head == goal:
+                    last = np.int64(search.came[search.traffic.safe.first[goal + 1] - 1])
+                    if last >= 0 and entries[last, 2] == search.soonest:
+                        return last
     return np.int64(-1)
 
 
@@ -241,7 +256,7 @@ def _with_room(tree: _Tree, room: Whole) -> _Tree:
 
 
 @cached_kernel(variant="path", **OPTIONS)
-def find_path(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, trip: Trip) -> IntArray:
+def find_path(roadmap: Roadmap, bodies: Footprints, traffic: Traffic, k: Whole, trip: Trip) -> IntArray:
     """The soonest path of a robot to its goal among all others: safe interval path planning.
 
     After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).
@@ -249,16 +264,19 @@ def find_path(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, tr
     Args:
         roadmap: The roadmap.
         bodies: The robots.
-        others: Their motions, no shorter than it may take.
+        traffic: All others, for as long as it may take.
         k: The robot.
         trip: Its motion.
 
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no path.
     """
-    start, search = np.int64(roadmap.starts[k]), _begin(roadmap, bodies, others, k, trip)
+    start, soonest = np.int64(roadmap.starts[k]), _soonest(roadmap, bodies, traffic, k, trip)
+    if soonest > trip.latest and start != bodies.goals[k]:
+        return np.empty((0, 3), np.int64)
+    search = _Search(traffic, np.full(traffic.safe.begins.shape[0], -1, np.int32), soonest)
     tree = _Tree(np.empty((1024, 5), np.int64), np.empty(1024), np.empty(1024, np.int64), np.zeros(2, np.int64))
-    zero, interval = np.int64(0), search.safe.first[start]  # a literal would compile what it is passed to once more
+    zero, interval = np.int64(0), traffic.safe.first[start]  # a literal would compile what it is passed to once more
     search.came[interval] = 0
     _add_entry(tree, start, zero, zero, zero - 1, interval, float(bodies.costs[k, start]) / trip.stride)
     while True:

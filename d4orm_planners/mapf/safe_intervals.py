@@ -1,4 +1,4 @@
-"""Safe intervals of a roadmap's nodes, compiled with numba; kept only where robots come by."""
+"""What a search for one robot's path knows of all others, compiled with numba: safe intervals of a roadmap's nodes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import IntArray, Ints, Whole
+from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_planners.mapf.occupancy import Others
+from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, last_visit, sort_boxes
+from d4orm_planners.mapf.roadmap import Footprints, Roadmap
 
 
 class Intervals(NamedTuple):
@@ -90,3 +92,30 @@ def interval_at(safe: Intervals, n: Whole, step: Whole) -> Whole:
         else:
             high = middle
     return low
+
+
+class Traffic(NamedTuple):
+    """What searches for one robot's path need to know of all others.
+
+    Attributes:
+        others: Their motions.
+        buckets: The same by where edges near to them have their middles.
+        safe: The safe intervals.
+        dock: Step until which the robot must not come to its goal for good; -1 for none.
+    """
+
+    others: Others
+    buckets: Buckets
+    safe: Intervals
+    dock: Whole
+
+
+@cached_kernel(variant="traffic", **OPTIONS)
+def survey(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, latest: int, stays: bool) -> Traffic:
+    """What is to be known of the others for paths of a robot that end by a step, at a goal where it stays or not."""
+    goal = bodies.goals[k]
+    # Nobody may come near its goal once it stands there for good.
+    dock = last_visit(others, goal) if stays else np.int64(-1)
+    buckets = sort_boxes(others, roadmap.nodes, roadmap.lengths.max() / 2, latest // BLOCK + 1)
+    safe = free_intervals(others, roadmap.starts[k], roadmap.nodes.shape[0], latest + 1)
+    return Traffic(others, buckets, safe, dock)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from d4orm_env.core.arrays import Floats, IntArray, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
@@ -12,48 +14,58 @@ from d4orm_planners.mapf.roadmap import Footprints, Roadmap
 
 
 @compiled
-def _meets(others: Others, i: Whole, block: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """Check whether a robot that drives straight from one position to another is near robot ``i`` in a block."""
-    boxes, need = others.boxes[block], others.need[i]
+def meeting(
+    others: Others, i: Whole, tail: Floats, head: Floats, depart: Whole, arrive: Whole, first: Whole, last: Whole
+) -> Whole:
+    """The first of some steps of one block, ``last`` not among them, at which a robot that drives straight from one
+    position to another is near robot ``i``; -1 if it is at none.
+    """
+    box, need = others.boxes[first // BLOCK, i], others.need[i]
     if (
         need <= 0.0
-        or boxes[0, i] - need > max(tail[0], head[0])
-        or boxes[3, i] + need < min(tail[0], head[0])
-        or boxes[1, i] - need > max(tail[1], head[1])
-        or boxes[4, i] + need < min(tail[1], head[1])
-        or boxes[2, i] - need > max(tail[2], head[2])
-        or boxes[5, i] + need < min(tail[2], head[2])
+        or box[0] - need > max(tail[0], head[0])
+        or box[3] + need < min(tail[0], head[0])
+        or box[1] - need > max(tail[1], head[1])
+        or box[4] + need < min(tail[1], head[1])
+        or box[2] - need > max(tail[2], head[2])
+        or box[5] + need < min(tail[2], head[2])
     ):
-        return False
-    for step in range(max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)):
-        share, position = (step - depart) / (arrive - depart), others.positions[step, i]
+        return np.int64(-1)
+    for step in range(first, last):
+        share, position = (step - depart) / (arrive - depart), others.positions[i, step]
         dx = tail[0] + share * (head[0] - tail[0]) - position[0]
         dy = tail[1] + share * (head[1] - tail[1]) - position[1]
         dz = tail[2] + share * (head[2] - tail[2]) - position[2]
         if dx * dx + dy * dy + dz * dz < need * need:
-            return True
-    return False
+            return np.int64(step)
+    return np.int64(-1)
 
 
 @compiled
 def _is_line_free(others: Others, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
     """Check whether none is near a robot that drives straight from one position to another between two steps."""
     for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
+        first, last = max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)
         for i in range(others.need.shape[0]):
-            if _meets(others, i, block, tail, head, depart, arrive):
+            if meeting(others, i, tail, head, depart, arrive, first, last) >= 0:
                 return False
     return True
 
 
 @compiled
-def is_edge_free(others: Others, buckets: Buckets, tail: Floats, head: Floats, depart: Whole, arrive: Whole) -> bool:
-    """The same of a short line."""
+def first_meeting(
+    others: Others, buckets: Buckets, tail: Floats, head: Floats, depart: Whole, arrive: Whole
+) -> tuple[Whole, Whole]:
+    """Somebody who is near a robot that drives along a short line between two steps, and when; -1 where nobody is."""
     for block in range((depart + 1) // BLOCK, arrive // BLOCK + 1):
+        first, last = max(depart + 1, block * BLOCK), min(arrive + 1, (block + 1) * BLOCK)
         bucket = bucket_of(buckets, block, (tail[0] + head[0]) / 2, (tail[1] + head[1]) / 2)
         for number in range(buckets.first[bucket], buckets.first[bucket + 1]):
-            if _meets(others, buckets.items[number], block, tail, head, depart, arrive):
-                return False
-    return True
+            i = np.int64(buckets.items[number])
+            step = meeting(others, i, tail, head, depart, arrive, first, last)
+            if step >= 0:
+                return i, step
+    return np.int64(-1), np.int64(-1)
 
 
 @cached_kernel(variant="straighten", **OPTIONS)
