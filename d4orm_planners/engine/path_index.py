@@ -180,7 +180,8 @@ def _count_meetings(
     for r in range(robot_range[0], robot_range[1]):
         robot = robots[r]
         met[0, :], met[0, robot] = False, True
-        counts[r, 0], when[r, 0], apart[0], end = 0, paths.shape[2], 0, 1
+        counts[r, 0], when[r, 0], apart[0] = 0, paths.shape[2], 0
+        end: Whole = 1
         for v in range(1, num_paths):
             apart[v] = _first_difference(paths[r, 0], paths[r, v])
         # Time in the outer loop: paths of one robot look into the same cells.
