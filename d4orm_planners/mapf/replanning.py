@@ -152,8 +152,9 @@ def _follow_edge(
     """Enter whatever is come to from an entry by an edge, see :func:`_departure`."""
     traffic, entries, head, depart = search.traffic, tree.entries, np.int64(roadmap.heads[e]), tree.entries[entry, 2]
     tail, to = roadmap.nodes[entries[entry, 0]], roadmap.nodes[head]
-    steps, failures, robot = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0, np.int64(-1)
+    steps, failures = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0
     arrival = interval_at(traffic.safe, head, depart + steps)
+    robot: Whole = np.int64(-1)
     met: Whole = np.int64(0)
     while True:
         depart, until, arrival = _departure(search, entries, entry, head, steps, left, trip, dock, depart, arrival)
