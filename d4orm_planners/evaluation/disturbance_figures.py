@@ -136,11 +136,11 @@ def draw_noise(groups: Mapping[str, Sequence[SuccessRate]]) -> Figure:
 def draw_lines(rates: Sequence[SuccessRate]) -> Figure:
     """Success against the level of every disturbance: a panel each, a line with confidence intervals per policy.
 
-    Without a title, as figures in a paper are. One or two panels are as wide as a column, four as a page.
+    Without a title, as figures in a paper are. One or two panels are as wide as a column, more as a page of two.
     """
     names, labels = (list(dict.fromkeys(all_of)) for all_of in zip(*((one.disturbance, one.label) for one in rates)))
     across = min(4, len(names))
-    width = PAGE * across / 4 if across > 2 else COLUMN
+    width = PAGE if across > 2 else COLUMN
     figure, axes = _grid(len(names), across, lambda rows: (width, 0.3 + 1.45 * rows), sharey=True)
     for number, (ax, name) in enumerate(zip(axes, names)):
         _draw_panel(ax, name, labels, [rate for rate in rates if rate.disturbance == name])

@@ -288,7 +288,7 @@ def test_labels_of_the_map_do_not_overlap_and_fit(labels: list[str], levels: tup
 def test_figures_for_a_paper_have_no_title_and_fit_its_columns() -> None:
     names = ("delay", "push.speed", "state_noise", "stall")
     figures = [draw_lines(rates_of(["a", "b"], dict.fromkeys(names[:count], (0, 1)))) for count in range(1, 5)]
-    assert [figure.get_figwidth() for figure in figures] == pytest.approx([3.5, 3.5, 5.37, 7.16])
+    assert [figure.get_figwidth() for figure in figures] == pytest.approx([3.5, 3.5, 7.16, 7.16])
     assert not any(figure.get_suptitle() for figure in figures)
     noisy = draw_map(rates_of(["a"], {"delay": (0, 1)}, noise=0.1))
     assert "noise 0.1 alone" in [text.get_text() for text in noisy.axes[0].texts]
