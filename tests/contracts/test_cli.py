@@ -287,7 +287,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_warning_is_one_line_without_a_position_in_the_program(d4orm, tmp_path: Path) -> None:
+def test_a_warning_is_one_line_without_a_line_of_the_program(d4orm, tmp_path: Path) -> None:
     robots = "  - {model: velocity2d, start: [%g, 0], goal: [%g, 1]}\n"
     (tmp_path / "tight.yaml").write_text("version: 1\nname: x\nrobots:\n" + robots * 2 % (0, 0, 0.34, 2))
     outcome = d4orm("run", "--scenario", "tight.yaml", "--policy", "go-to-goal", "--quiet")
@@ -403,7 +403,7 @@ def test_what_becomes_of_the_output_decides_on_nothing(shell: str, status: str, 
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a shell")
-def test_without_a_position_for_complaints_the_status_says_it() -> None:
+def test_without_a_stream_for_complaints_the_status_says_it() -> None:
     assert command_line("planners", "nobody", shell='"$@" 2>&-').returncode == 2
     assert command_line("planners", "nobody", shell='"$@" <&- >&- 2>&-').returncode == 2
 

@@ -46,7 +46,7 @@ def test_a_missing_extra_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         open_env(swap(), "crazyflow")
 
 
-def test_another_physics_in_the_position_of_an_environments_own() -> None:
+def test_another_physics_in_place_of_an_environments_own() -> None:
     env = navigation_v0.parallel_env("random", num_robots=2, seed=3, max_cycles=5)
     own, other = run_episode(env, "go-to-goal", seed=4), run_episode(env, "go-to-goal", seed=4, physics="mujoco")
     assert own.problem == other.problem

@@ -446,7 +446,7 @@ def test_scenarios_take_footprints_and_goal_headings(footprint: Any) -> None:
     assert problem.goal_heading_tolerance.tolist() == [np.float32(0.2)] * 3
 
 
-def test_a_footprint_takes_the_position_of_a_scenarios_own_radius() -> None:
+def test_a_footprint_replaces_a_scenarios_own_radius() -> None:
     problem = make_problem("amswarm_2", footprint=Ellipsoid(0.1, 0.1, 0.25))
     assert problem.team.radius.tolist() == [0.25] * 10
 

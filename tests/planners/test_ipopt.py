@@ -175,7 +175,7 @@ def test_ctrl_c_stops_ipopt(monkeypatch: pytest.MonkeyPatch) -> None:
     assert plan.status == "interrupted"
 
 
-def test_initial_controls_take_the_position_of_the_warm_start() -> None:
+def test_initial_controls_replace_the_warm_start() -> None:
     problem = swap_problem()
     given = assert_solves(problem)
     middle = given.trajectory.positions[20, :, 1]

@@ -163,7 +163,7 @@ def test_a_missing_folder_is_reported_and_not_made(plan: Plan, tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_in_position_of_the_folder_is_reported_and_left_alone(plan: Plan, tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_folder_is_reported_and_left_alone(plan: Plan, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OSError, match="file"):
         plan.save(tmp_path / "file" / "plan.npz")

@@ -517,7 +517,7 @@ main()
     "options", [("--port", "70000"), ("--host", "203.0.113.1"), ("--host", "\xe4" * 70), ("--host", "")]
 )
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
-def test_a_position_where_one_cannot_listen_is_said(d4orm, options: tuple[str, str]) -> None:
+def test_an_address_where_one_cannot_listen_is_said(d4orm, options: tuple[str, str]) -> None:
     pytest.importorskip("viser")
     outcome = d4orm("play", "-k", "2", "-p", "go-to-goal", *options)
     assert outcome.status == 2

@@ -229,7 +229,7 @@ def test_coarser_guidance_and_other_schedules_solve_as_well(tmp_path: Path) -> N
     assert all(4.5 < row.travel_time <= row.makespan < 10 for row in rows)  # type: ignore[operator]
 
 
-def test_a_limit_takes_the_position_of_the_panels_own() -> None:
+def test_a_limit_replaces_the_panels_own() -> None:
     limits = {name: [section.time_limit for section in FIGURES[name].limited(1800).sections] for name in FIGURES}
     assert limits["ipopt"] == [1800]
     assert limits["coarseness"] == [None], "its controllers have none"
