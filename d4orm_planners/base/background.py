@@ -32,11 +32,16 @@ class Background(Generic[Result]):
         self._job = self._pool.submit(work)
         return self._job
 
+    @property
+    def is_busy(self) -> bool:
+        """True if a job is under way."""
+        return self._job is not None and not self._job.done()
+
     def result(self) -> tuple[bool, Result | None]:
         """True if no job is under way, and the result of the last one, which is given once."""
         if self._job is None:
             return True, None
-        if not self._job.done():
+        if self.is_busy:
             return False, None
         job, self._job = self._job, None
         return True, job.result()

@@ -256,7 +256,7 @@ class Controller:
 
     def _actions(self) -> Actions | None:
         """Return the policy's actions; ``None`` if they do not come in time, or the episode is over."""
-        if self.over:
+        if self.over or self._background.is_busy:  # robots brake at once while an answer is late
             return None
         acting = {agent: self._observations[agent] for agent in self._env.agents}
         return self._background.run(partial(self.policy.act, acting, self._env.state()), self.timeout)

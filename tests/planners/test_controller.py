@@ -259,7 +259,9 @@ def test_who_does_not_answer_in_time_is_not_waited_for(model: str) -> None:
         moving = [controller.step(problem.start, step * problem.dt) for step in range(4)]
         assert not any(s.held for s in moving)
         slow.allowed.clear()
-        held = [controller.step(problem.start, step * problem.dt) for step in range(4, 24)]
+        held = [controller.step(problem.start, 4 * problem.dt)]
+        controller.timeout = 1000.0  # for another answer: this one is late
+        held += [controller.step(problem.start, step * problem.dt) for step in range(5, 24)]
         assert all(s.held for s in held)
         assert slow.calls == 5, "it is not asked again while it thinks"
         np.testing.assert_allclose(held[-1].velocity, 0, atol=1e-5)
