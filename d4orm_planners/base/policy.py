@@ -24,9 +24,8 @@ from d4orm_planners.tracking.steering import drive_to_goal, limit_controls
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
-Observations = dict[str, FloatArray]
-Actions = dict[str, FloatArray]
-"""Actions by agent."""
+Observations = dict[str, FloatArray]  #: By agent
+Actions = dict[str, FloatArray]  #: By agent
 
 
 class Policy(ABC):
@@ -278,11 +277,11 @@ def as_policy(thing: Any, owner: str) -> Policy:
     count = required_parameters(thing) if callable(thing) and not isinstance(thing, type) else 0
     if count not in (1, 2):
         remedy = (
-            "give it as from_torch(module), from d4orm_planners.base.adapters"
-            if hasattr(thing, "forward")
-            else "it must have reset and act, or be a function of (observations, state) or of one robot's observation, "
+            "it must have reset and act, or be a function of (observations, state) or of one robot's observation, "
             "distinguished by their required positional parameters"
         )
+        if hasattr(thing, "forward"):
+            remedy = "give it as from_torch(module), from d4orm_planners.base.adapters"
         raise ValueError(f"{owner} is {short_repr(thing)}, which does not act; {remedy}")
     return TeamFunction(thing) if count == 2 else RobotFunction(thing)
 

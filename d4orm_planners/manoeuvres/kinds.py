@@ -1,4 +1,4 @@
-"""What motion primitives depend on, and what they are before they are put in tables."""
+"""Kinds of robots, on which motion primitives depend, and the primitives before they are put in tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OPS = PYTHON_OPS._replace(
 )
 
 Mode = tuple[float, ...]
-"""What of a state is neither position nor heading: speeds, steering and hitch angles."""
+"""Components of a state beside position and heading: speeds, steering and hitch angles."""
 Move = tuple[Mode, Mode, FloatArray]
 """Mode before, mode after, and ``(n, m)`` controls."""
 State = tuple[float, ...]
@@ -30,7 +30,7 @@ State = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Kind:
-    """What primitives depend on.
+    """Model, limits and time step, on which primitives depend.
 
     Attributes:
         name: The model's name.

@@ -125,14 +125,14 @@ def hitch_of(pose: Pose, trailer: int) -> float:
 
 @compiled
 def placed_first(body: RobotBody, robot: Whole, heading: float, x: np.float32, y: np.float32) -> Placed:
-    """Where a robot's own body is."""
+    """Pose of a robot's own body."""
     c, s = direction(body, robot, heading)
     return c, s, x, y
 
 
 @compiled
 def placed_next(body: RobotBody, i: Whole, before: Placed, hitch: float) -> Placed:
-    """Where the trailer that follows body ``i`` is; the same if there is none."""
+    """Pose of the trailer that follows body ``i``; the same if there is none."""
     j = body.footprints.following[i]
     if j < 0:
         return before

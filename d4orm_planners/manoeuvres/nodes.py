@@ -74,7 +74,7 @@ class Nodes(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What to look for.
+    """Query of a search.
 
     Attributes:
         body: The robot.

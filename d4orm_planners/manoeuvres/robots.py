@@ -29,7 +29,7 @@ CLEARANCE = 0.15
 """Distance kept from everything beyond the margin, in what the fastest robot drives in a step: what is between the
 poses that are checked is near to these."""
 CUTTING = 0.7
-"""How far a corner may get into another between two poses that are checked, in what the fastest robot drives."""
+"""Depth to which a corner may get into another between two checked poses, as a share of the fastest stride."""
 MAX_PARTS = 8
 """Most poses that are looked at in a step."""
 CERTAIN = 0.98
@@ -37,7 +37,7 @@ CERTAIN = 0.98
 
 
 class ManoeuvreScene(NamedTuple):
-    """What all robots of a team share.
+    """Data that all robots of a team share.
 
     Attributes:
         problem: The problem.
@@ -66,7 +66,7 @@ class ManoeuvreScene(NamedTuple):
 
 
 def scene_of(problem: Problem) -> ManoeuvreScene:
-    """What all robots of a team share."""
+    """The data that all robots of a team share."""
     team, bent = problem.team, must_bend(problem)
     extra = distance_kept(problem, bent)
     index = problem.world.index(float(team.radius.max()) + extra, within=float(team.radius.max()) + extra)
@@ -160,7 +160,7 @@ def _room(problem: Problem, states: FloatArray, enough: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """What the search knows of a robot.
+    """A robot, as the search reads it.
 
     Attributes:
         number: Its number.

@@ -19,7 +19,7 @@ NEAR = 1e-3
 
 
 class Limits(NamedTuple):
-    """What a robot can do.
+    """Abilities of a robot.
 
     Attributes:
         way: One of :data:`NOWHERE`, :data:`TURNING`, :data:`SIDEWAYS` and :data:`TOWING`.

@@ -1,4 +1,4 @@
-"""Where the other robots are and when, and until when a pose is safe from them."""
+"""Poses of the other robots over time, and the time until which a pose is safe from them."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.beam import sink
 from d4orm_planners.mapf.roadmap import Footprints, Roadmap
-from d4orm_planners.mapf.safe_intervals import Intervals, Traffic, interval_at
+from d4orm_planners.mapf.safe_intervals import Intervals, Reservations, interval_at
 from d4orm_planners.mapf.straightening import first_meeting, meeting
 
 
@@ -67,12 +67,12 @@ class _Search(NamedTuple):
     """The search for one robot's path.
 
     Attributes:
-        traffic: All others.
+        reservations: All others.
         came: Entry of the tree that comes first to each safe interval; -1 for none.
         soonest: No step before it can be that at which the robot comes to its goal for good.
     """
 
-    traffic: Traffic
+    reservations: Reservations
     came: Ints
     soonest: Whole
 
@@ -107,7 +107,7 @@ def _departure(
     Returns:
         Departure, arrival and interval, or -1 for the interval if there is none.
     """
-    safe = search.traffic.safe
+    safe = search.reservations.safe
     while depart < safe.ends[tree[entry, 4]]:
         lost = trip.launch if depart > tree[entry, 2] or tree[entry, 3] < 0 else 0
         until = depart + steps + lost
@@ -150,10 +150,15 @@ def _follow_edge(
     search: _Search, roadmap: Roadmap, e: Whole, left: float, trip: Trip, dock: Whole, tree: _Tree, entry: Whole
 ) -> None:
     """Enter whatever is come to from an entry by an edge, see :func:`_departure`."""
-    traffic, entries, head, depart = search.traffic, tree.entries, np.int64(roadmap.heads[e]), tree.entries[entry, 2]
+    reservations, entries, head, depart = (
+        search.reservations,
+        tree.entries,
+        np.int64(roadmap.heads[e]),
+        tree.entries[entry, 2],
+    )
     tail, to = roadmap.nodes[entries[entry, 0]], roadmap.nodes[head]
     steps, failures = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0
-    arrival = interval_at(traffic.safe, head, depart + steps)
+    arrival = interval_at(reservations.safe, head, depart + steps)
     robot: Whole = np.int64(-1)
     met: Whole = np.int64(0)
     while True:
@@ -161,8 +166,11 @@ def _follow_edge(
         if arrival < 0:
             return
         # Whoever stands in the way often does so for long, and where it was met before.
-        if robot < 0 or meeting(traffic.others, robot, tail, to, depart, until, depart + met, depart + met + 1) < 0:
-            robot, met = first_meeting(traffic.others, traffic.buckets, tail, to, depart, until)
+        if (
+            robot < 0
+            or meeting(reservations.others, robot, tail, to, depart, until, depart + met, depart + met + 1) < 0
+        ):
+            robot, met = first_meeting(reservations.others, reservations.buckets, tail, to, depart, until)
             met -= depart
         if robot >= 0:
             failures += 1
@@ -185,9 +193,9 @@ def _is_way(roadmap: Roadmap, bodies: Footprints, k: Whole, node: Whole, e: Whol
 
 
 @compiled
-def _soonest(roadmap: Roadmap, bodies: Footprints, traffic: Traffic, k: Whole, trip: Trip) -> Whole:
+def _soonest(roadmap: Roadmap, bodies: Footprints, reservations: Reservations, k: Whole, trip: Trip) -> Whole:
     """The first step at which some edge to the goal is free for a robot that comes to stay; none if beyond the last."""
-    others, buckets, goal, until = traffic.others, traffic.buckets, bodies.goals[k], traffic.dock + 1
+    others, buckets, goal, until = reservations.others, reservations.buckets, bodies.goals[k], reservations.dock + 1
     while until <= trip.latest:
         for e in range(roadmap.first[goal], roadmap.first[goal + 1]):
             tail, head = roadmap.nodes[np.int64(roadmap.heads[e])], roadmap.nodes[goal]
@@ -217,14 +225,14 @@ def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip:
     while sizes[1] > 0:
         entry = heap[0]
         node = entries[entry, 0]
-        if sizes[0] + _room_needed(roadmap, search.traffic.safe, node) > entries.shape[0]:
+        if sizes[0] + _room_needed(roadmap, search.reservations.safe, node) > entries.shape[0]:
             return np.int64(-2)
         sizes[1] -= 1
         heap[0] = heap[sizes[1]]
         sink(tree.costs, heap, root, sizes[1])
         if search.came[entries[entry, 4]] != entry:
             continue
-        if node == goal and entries[entry, 2] > search.traffic.dock:
+        if node == goal and entries[entry, 2] > search.reservations.dock:
             return entry
         if node == goal and bodies.docks:
             continue
@@ -233,12 +241,12 @@ def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip:
                 head = np.int64(roadmap.heads[e])
                 motion = trip if head == goal else passing
                 dock, left = (
-                    search.traffic.dock if head == goal and bodies.docks else np.int64(-1),
+                    search.reservations.dock if head == goal and bodies.docks else np.int64(-1),
                     costs[head] / trip.stride,
                 )
                 _follow_edge(search, roadmap, e, left, motion, dock, tree, entry)
                 if head == goal:
-                    last = np.int64(search.came[search.traffic.safe.first[goal + 1] - 1])
+                    last = np.int64(search.came[search.reservations.safe.first[goal + 1] - 1])
                     if last >= 0 and entries[last, 2] == search.soonest:
                         return last
     return np.int64(-1)
@@ -257,7 +265,7 @@ def _with_room(tree: _Tree, room: Whole) -> _Tree:
 
 
 @cached_kernel(variant="path", **OPTIONS)
-def find_path(roadmap: Roadmap, bodies: Footprints, traffic: Traffic, k: Whole, trip: Trip) -> IntArray:
+def find_path(roadmap: Roadmap, bodies: Footprints, reservations: Reservations, k: Whole, trip: Trip) -> IntArray:
     """The soonest path of a robot to its goal among all others: safe interval path planning.
 
     After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).
@@ -265,19 +273,22 @@ def find_path(roadmap: Roadmap, bodies: Footprints, traffic: Traffic, k: Whole, 
     Args:
         roadmap: The roadmap.
         bodies: The robots.
-        traffic: All others, for as long as it may take.
+        reservations: All others, for as long as it may take.
         k: The robot.
         trip: Its motion.
 
     Returns:
         ``(n, 3)`` int64 nodes, the steps at which it sets out for each and comes to each; none where there is no path.
     """
-    start, soonest = np.int64(roadmap.starts[k]), _soonest(roadmap, bodies, traffic, k, trip)
+    start, soonest = np.int64(roadmap.starts[k]), _soonest(roadmap, bodies, reservations, k, trip)
     if soonest > trip.latest and start != bodies.goals[k]:
         return np.empty((0, 3), np.int64)
-    search = _Search(traffic, np.full(traffic.safe.begins.shape[0], -1, np.int32), soonest)
+    search = _Search(reservations, np.full(reservations.safe.begins.shape[0], -1, np.int32), soonest)
     tree = _Tree(np.empty((1024, 5), np.int64), np.empty(1024), np.empty(1024, np.int64), np.zeros(2, np.int64))
-    zero, interval = np.int64(0), traffic.safe.first[start]  # a literal would compile what it is passed to once more
+    zero, interval = (
+        np.int64(0),
+        reservations.safe.first[start],
+    )  # a literal would compile what it is passed to once more
     search.came[interval] = 0
     _add_entry(tree, start, zero, zero, zero - 1, interval, float(bodies.costs[k, start]) / trip.stride)
     while True:

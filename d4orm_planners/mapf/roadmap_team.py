@@ -20,7 +20,7 @@ from d4orm_planners.mapf.occupancy import Occupancy, Others, find_meetings
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
-from d4orm_planners.mapf.safe_intervals import Traffic, survey
+from d4orm_planners.mapf.safe_intervals import Reservations, make_reservations
 from d4orm_planners.mapf.straightening import straighten
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
@@ -213,10 +213,10 @@ class Replanning:
         haste, others = 1 - random.random() * LEISURE, occupancy.around(self.separation(robot, KEEP))
         if minded is not None:
             others = others._replace(need=np.where(minded, others.need, 0.0))
-        traffic = survey(self.roadmap, self.bodies, others, robot, latest, self.dwell is None)
+        reservations = make_reservations(self.roadmap, self.bodies, others, robot, latest, self.dwell is None)
         close, usual = None, min(TOUCH * self.size, float(self.own_room[robot] - self.bodies.safety_distance[robot]))
         for cruise, cut in SPEED_PROFILES:
-            for drive in self.drives(traffic, robot, latest, cruise * haste, cut):
+            for drive in self.drives(reservations, robot, latest, cruise * haste, cut):
                 room = self.room_at_walls(others, robot, drive, latest)
                 if room > usual:
                     self.take(driven, occupancy, robot, drive)
@@ -234,20 +234,20 @@ class Replanning:
             positions[self.leaves(drive[2]) :] = FAR
         occupancy.put(robot, positions)
 
-    def drives(self, traffic: Traffic, robot: int, latest: int, cruise: float, cut: float) -> Iterator[Drive]:
+    def drives(self, reservations: Reservations, robot: int, latest: int, cruise: float, cut: float) -> Iterator[Drive]:
         """Rollouts of a robot along its path, if it has one, in one of the :data:`SPEED_PROFILES`."""
-        roadmap, bodies, steps = self.roadmap, self.bodies, traffic.others.positions.shape[1] - 1
+        roadmap, bodies, steps = self.roadmap, self.bodies, reservations.others.positions.shape[1] - 1
         dwell = -1 if self.dwell is None else self.dwell
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
             trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell)
-            path = find_path(roadmap, bodies, traffic, robot, trip)
+            path = find_path(roadmap, bodies, reservations, robot, trip)
             if len(path):
                 break
         else:
             return
         safety_distance = bodies.safety_distance[robot] * (1 + WALL_SLACK * 2 / 3)
-        left = straighten(roadmap, bodies, self.space, traffic.others, robot, safety_distance, path)
+        left = straighten(roadmap, bodies, self.space, reservations.others, robot, safety_distance, path)
         nodes, departs, arrives = path[:left].T
         stops = Corners(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]

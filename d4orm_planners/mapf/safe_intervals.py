@@ -1,4 +1,4 @@
-"""What a search for one robot's path knows of all others, compiled with numba: safe intervals of a roadmap's nodes."""
+"""Reservations of all other robots for one robot's searches, compiled: safe intervals of a roadmap's nodes."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ def interval_at(safe: Intervals, n: Whole, step: Whole) -> Whole:
     return low
 
 
-class Traffic(NamedTuple):
-    """What searches for one robot's path need to know of all others.
+class Reservations(NamedTuple):
+    """Reservations of all other robots, as searches for one robot's path read them.
 
     Attributes:
         others: Their motions.
@@ -110,12 +110,14 @@ class Traffic(NamedTuple):
     dock: Whole
 
 
-@cached_kernel(variant="traffic", **OPTIONS)
-def survey(roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, latest: int, stays: bool) -> Traffic:
-    """What is to be known of the others for paths of a robot that end by a step, at a goal where it stays or not."""
+@cached_kernel(variant="reservations", **OPTIONS)
+def make_reservations(
+    roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, latest: int, stays: bool
+) -> Reservations:
+    """The reservations for paths of a robot that end by a step, at a goal where it stays or not."""
     goal = bodies.goals[k]
     # Nobody may come near its goal once it stands there for good.
     dock = last_visit(others, goal) if stays else np.int64(-1)
     buckets = sort_boxes(others, roadmap.nodes, roadmap.lengths.max() / 2, latest // BLOCK + 1)
     safe = free_intervals(others, roadmap.starts[k], roadmap.nodes.shape[0], latest + 1)
-    return Traffic(others, buckets, safe, dock)
+    return Reservations(others, buckets, safe, dock)

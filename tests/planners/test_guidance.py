@@ -24,7 +24,7 @@ from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import Trip, find_path
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
-from d4orm_planners.mapf.safe_intervals import survey
+from d4orm_planners.mapf.safe_intervals import make_reservations
 from d4orm_planners.tracking.path_drives import Corners
 from d4orm_planners.tracking.pursuit import gear_towards
 from d4orm_planners.tracking.timed_path import drive_by_clock
@@ -276,8 +276,8 @@ def test_a_path_in_space_and_time_lets_others_pass(fault: str) -> None:
         positions[200:, 1] = [3, 3, 0]
     others = Occupancy(replanning.cells, positions).around(np.array([0.0, 0.41]))
     bodies = replanning.bodies
-    traffic = survey(roadmap, bodies, others, 0, 400, True)
-    path = find_path(roadmap, bodies, traffic, 0, Trip(0.09, 4, 400, -1))
+    reservations = make_reservations(roadmap, bodies, others, 0, 400, True)
+    path = find_path(roadmap, bodies, reservations, 0, Trip(0.09, 4, 400, -1))
     assert path[0].tolist() == [roadmap.starts[0], 0, 0]
     assert path[-1, 0] == roadmap.goals[0]
     assert (path[1:, 1] >= path[:-1, 2]).all()
