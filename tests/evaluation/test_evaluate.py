@@ -578,7 +578,7 @@ BAD = [
     (("-p", "orca:speed=1"), "'speed' is no setting of policy 'orca'"),
     (("-p", "orca:time_horizon"), "--policy 'time_horizon' is not of the form name=value"),
     (("-p", "orca:policy=goal"), "'policy' is no setting"),
-    (("-p", "orca,orca:time_horizon=5"), "policy 'orca,orca' is unknown"),
+    (("-p", "orca,orca:time_horizon=5"), "settings stand behind one policy"),
     (("-s", "square"), "scenario 'square' is unknown"),
     (("-s", "missing.yaml"), "missing.yaml"),
     (("-s", "good.yaml", "-k", "3"), "num_robots, model and scenario_settings do not go with scenario files"),

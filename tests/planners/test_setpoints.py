@@ -305,7 +305,7 @@ def test_files_are_written_again_and_others_stay(plans: dict[str, Plan], tmp_pat
     ("format", "arguments", "message"),
     [
         ("cvs", {}, "format 'cvs' is unknown; choose one of csv, crazyswarm2, rosbag2, mcap"),
-        ("crazyswarm2", {}, "height is 0 m; a team that moves in the plane flies at a height above 0"),
+        ("crazyswarm2", {}, "height is 0 m; a team that moves in the plane flies above 0: give height="),
         ("csv", {"height": np.nan}, "height is nan; it must be finite"),
     ],
 )
