@@ -61,10 +61,10 @@ class Background(Generic[Result]):
         return self.result()[1]
 
     def forget(self) -> None:
-        """Wait for what is under way and throw it away."""
-        if self._job is not None:
-            self._job.exception()
-            self._job = None
+        """Wait for what is under way and throw its result away; an error of it is raised."""
+        job, self._job = self._job, None
+        if job is not None:
+            job.result()
 
     def close(self) -> None:
         """End the thread as soon as its job is done."""

@@ -78,8 +78,8 @@ class Controller:
             feedback, in mode ``"nominal"`` or with a tracker. By default 0.5 with a tracker, which has its robot tilt
             or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
-            meanwhile, and its late answer is not used. ``None`` waits. A policy that is named and
-            has a ``deadline``, as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
+            meanwhile, and its late answer is not used. ``None`` waits. A policy that is named and has a ``deadline``,
+            as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints

@@ -10,13 +10,11 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.arrays import LARGEST_WHOLE, short_repr
 from d4orm_planners.evaluation.sqlite_file import SqliteFile
 
 STORE = "trials.sqlite"
 """Name of the file in a folder of results."""
-LARGEST_NUMBER = 2**63 - 1
-"""Largest whole number in it, seeds among them."""
 
 
 class TrialKey(NamedTuple):
@@ -242,7 +240,7 @@ class TrialStore(SqliteFile):
                 added = connection.executemany(_ADD, [astuple(trial) for trial in trials]).rowcount
             except OverflowError as error:
                 largest = max(trial.seed for trial in trials)
-                raise ValueError(f"seed is {largest}; a store has room for seeds up to {LARGEST_NUMBER}") from error
+                raise ValueError(f"seed is {largest}; a store has room for seeds up to {LARGEST_WHOLE}") from error
             connection.execute("COMMIT")
         return int(added)
 

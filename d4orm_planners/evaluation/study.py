@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-from d4orm_env.core.arrays import duration, positive_number, short_repr, whole_number
+from d4orm_env.core.arrays import LARGEST_WHOLE, duration, positive_number, short_repr, whole_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances import Disturbance
@@ -21,7 +21,6 @@ from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import check_physics
 from d4orm_planners.base.planner_registry import PolicyLike, is_brought, list_policies, make_policy, origin
-from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Condition, Configuration, Job
 
 T = TypeVar("T")
@@ -213,8 +212,8 @@ def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0) for seed in seeds))
     if not checked:
         raise ValueError("seeds is empty; give at least one")
-    if (largest := max(checked)) > LARGEST_NUMBER:
-        raise ValueError(f"seed is {largest}; a store of trials has room for seeds up to {LARGEST_NUMBER}")
+    if (largest := max(checked)) > LARGEST_WHOLE:
+        raise ValueError(f"seed is {largest}; a store of trials has room for seeds up to {LARGEST_WHOLE}")
     return checked
 
 

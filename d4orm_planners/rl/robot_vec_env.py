@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -47,8 +48,8 @@ class SharedVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[FloatArray, FloatArray, BoolArray, list[Info]]:
         begin = time.perf_counter()
-        frames, limits = (np.concatenate([getattr(part, name) for part in self.parts]) for name in ("frames", "limits"))
-        controls = self.parts[0].features.decode(self._actions, frames, limits)
+        frames = np.concatenate([part.frames for part in self.parts])
+        controls = self.parts[0].features.decode(self._actions, frames, self._all_limits)
         split = np.split(controls, np.cumsum([part.num_envs for part in self.parts])[:-1])
         encoded = self._encoded([part.drive(own) for part, own in zip(self.parts, split, strict=True)])
         outcomes = (part.conclude(*own) for part, own in zip(self.parts, encoded, strict=True))
@@ -56,6 +57,10 @@ class SharedVecEnv(VecEnv):
         self.seconds += time.perf_counter() - begin
         flat = [info for listed in infos for info in listed]
         return np.concatenate(features), np.concatenate(rewards), np.concatenate(dones), flat
+
+    @cached_property
+    def _all_limits(self) -> FloatArray:
+        return np.concatenate([part.limits for part in self.parts])
 
     def _encoded(self, seen: list[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
         """Features and frames of what the robots of each part see: all at once, for each call takes its time."""

@@ -11,8 +11,18 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, load_map, load_problem, make_problem, navigation_v0, verify
-from d4orm_planners import make_policy
-from d4orm_planners.base.adapters import from_sb3
+from d4orm_planners import make_policy, run_episode
+from d4orm_planners.base.adapters import SharedPolicy, from_sb3
+
+
+class Module:
+    """Called as a torch module is, with anything."""
+
+    forward = None
+
+    def __call__(self, *given: object) -> object:
+        raise RuntimeError("shapes cannot be multiplied")
+
 
 DRIVE = Team(("differential_drive",))
 PROBLEM = make_problem("circle", num_robots=2)
@@ -29,6 +39,11 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: make_problem("circle", model="bicycle"), "did you mean 'car'"),
         (lambda: make_policy(SimpleNamespace(act=print)), "has act and lacks reset; define it, or subclass"),
         (lambda: make_policy(SimpleNamespace(reset=print)), "has reset and lacks act; define it, or subclass"),
+        (lambda: make_policy(Module()), r"give it as from_torch\(module\)"),
+        (
+            lambda: run_episode(navigation_v0.parallel_env(problem=PROBLEM), SharedPolicy(Module(), None)),
+            r"fails on observations of shape \(2, .*cannot be multiplied",
+        ),
         (lambda: from_sb3("joint.zip"), "give a model of Stable-Baselines3, as PPO.load"),
         (lambda: verify(PROBLEM, SimpleNamespace(controls=0)), "not SimpleNamespace; give its controls"),
         (lambda: verify(PROBLEM, np.zeros((7, 2, 2))), r"problem.replace\(horizon=7\)"),
@@ -82,3 +97,9 @@ def test_what_the_command_line_says(d4orm: Callable[..., Any], arguments: tuple[
     outcome = d4orm(*arguments)
     assert outcome.status == 2
     assert message in outcome.err
+
+
+def test_a_run_says_why_its_plan_is_no_solution(d4orm: Callable[..., Any]) -> None:
+    outcome = d4orm("run", "--policy", "d4orm:max_iterations=1,num_samples=2,num_steps=1", "-k", "16")
+    assert outcome.status == 1
+    assert "no solution found (iteration limit after 1 iterations)" in outcome.err

@@ -340,6 +340,10 @@ def test_an_error_of_late_work_is_raised_once() -> None:
     with pytest.raises(ValueError, match="broken"):
         background.run(lambda: None, 60)
     assert background.run(lambda: 1, 60) == 1
+    background.start(broken)
+    with pytest.raises(ValueError, match="broken"):
+        background.forget()
+    background.forget()
 
 
 def test_the_control_loop_is_compiled_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env import __version__, navigation_v0
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, short_repr, whole_number
+from d4orm_env.core.arrays import LARGEST_WHOLE, BoolArray, FloatArray, as_float32, short_repr, whole_number
 from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import source_digest
@@ -26,7 +26,6 @@ from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, origin, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
-from d4orm_planners.evaluation.store import LARGEST_NUMBER
 from d4orm_planners.evaluation.trials import Condition
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ class Demonstrations:
             raise ValueError(f"agents is {short_repr(self.agents)}; choose 'team' or 'robot'")
         if not isinstance(self.seeds, Iterable):
             raise ValueError(f"seeds is {short_repr(self.seeds)}; give the seeds themselves, as range(100)")
-        seeds = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_NUMBER) for seed in self.seeds))
+        seeds = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_WHOLE) for seed in self.seeds))
         if not seeds:
             raise ValueError("seeds is empty; give at least one")
         object.__setattr__(self, "seeds", seeds)
