@@ -71,8 +71,8 @@ class RoadmapPaths:
 
 FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
 """Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
-TURNS = 30
-"""Paths that are planned per robot before path finding for all at once is tried."""
+FEW_PATHS, MOST_PATHS = 4, 30
+"""Paths that are planned per robot before turns on the spot are counted, and before all robots are planned at once."""
 MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
 DETOUR_RATIO = 1.25
@@ -195,7 +195,12 @@ def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
             if reason is not None:
                 return reason
             continue
-        driven = replanning.one_by_one(random, search.should_stop, TURNS * problem.num_robots)
+        turns = any(turn > 0 for turn, _ in replanning.turns_on_the_spot)
+        most = (FEW_PATHS if turns else MOST_PATHS) * problem.num_robots
+        driven = replanning.one_by_one(random, search.should_stop, most)
+        if driven is None and turns:
+            replanning.counts_turns = True
+            driven = replanning.one_by_one(random, search.should_stop, MOST_PATHS * problem.num_robots)
         if driven is not None:
             return RoadmapSolution(roadmap, replanning, driven)
         if search.should_stop():
@@ -237,7 +242,7 @@ def compile_path_finding(problem: Problem) -> None:
         found = find_moves(alone, roadmap, 0, lambda: False, STEPS)
         if found is not None:
             drive_moves(alone, roadmap, found.moves)
-            Replanning(alone, roadmap).one_by_one(np.random.default_rng(0), lambda: False, TURNS)
+            Replanning(alone, roadmap).one_by_one(np.random.default_rng(0), lambda: False, MOST_PATHS)
 
 
 def _small_problem(problem: Problem, robot: int) -> Problem:

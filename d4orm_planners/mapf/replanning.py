@@ -15,22 +15,7 @@ from d4orm_planners.mapf.beam import sink
 from d4orm_planners.mapf.roadmap import Footprints, Roadmap
 from d4orm_planners.mapf.safe_intervals import Intervals, Reservations, interval_at
 from d4orm_planners.mapf.straightening import first_meeting, meeting
-
-
-class Trip(NamedTuple):
-    """Motion that a robot is taken to make when its path is planned.
-
-    Attributes:
-        stride: Distance that it drives in a step [m].
-        launch: Steps that it loses whenever it sets out.
-        latest: Step by which it must have arrived.
-        dwell: Steps for which it stays at its goal; negative for ever.
-    """
-
-    stride: float
-    launch: Whole
-    latest: int
-    dwell: Whole
+from d4orm_planners.mapf.trips import Trip, steps_to_turn
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -88,6 +73,7 @@ def _departure(
     trip: Trip,
     dock: Whole,
     depart: Whole,
+    turn: Whole,
     arrival: Whole,
 ) -> tuple[Whole, Whole, Whole]:
     """The next departure from an entry of the tree that comes to a safe interval before all others.
@@ -102,15 +88,17 @@ def _departure(
         trip: The motion; the dwell of goals only.
         dock: Step until which it must not arrive.
         depart: Earliest departure.
+        turn: Steps that it loses by turning before it drives.
         arrival: Safe interval of the node that it comes to no sooner than.
 
     Returns:
         Departure, arrival and interval, or -1 for the interval if there is none.
     """
     safe = search.reservations.safe
-    while depart < safe.ends[tree[entry, 4]]:
+    # At its start a robot may turn even where it is too near to somebody to stay.
+    while depart + (turn if tree[entry, 3] >= 0 else 0) < safe.ends[tree[entry, 4]]:
         lost = trip.launch if depart > tree[entry, 2] or tree[entry, 3] < 0 else 0
-        until = depart + steps + lost
+        until = depart + turn + steps + lost
         if until + left > trip.latest:
             break
         while arrival < safe.first[head + 1] and safe.ends[arrival] <= until:
@@ -150,28 +138,25 @@ def _follow_edge(
     search: _Search, roadmap: Roadmap, e: Whole, left: float, trip: Trip, dock: Whole, tree: _Tree, entry: Whole
 ) -> None:
     """Enter whatever is come to from an entry by an edge, see :func:`_departure`."""
-    reservations, entries, head, depart = (
-        search.reservations,
-        tree.entries,
-        np.int64(roadmap.heads[e]),
-        tree.entries[entry, 2],
-    )
-    tail, to = roadmap.nodes[entries[entry, 0]], roadmap.nodes[head]
-    steps, failures = np.int64(np.ceil(roadmap.lengths[e] / trip.stride)), 0
-    arrival = interval_at(reservations.safe, head, depart + steps)
+    reservations, entries, head, failures = search.reservations, tree.entries, np.int64(roadmap.heads[e]), 0
+    node, depart, above = entries[entry, 0], entries[entry, 2], entries[entry, 3]
+    tail, to = roadmap.nodes[node], roadmap.nodes[head]
+    steps = np.int64(np.ceil(roadmap.lengths[e] / trip.stride))
+    turn = steps_to_turn(roadmap.nodes, trip, entries[above, 0] if above >= 0 else above, node, head)
+    arrival = interval_at(reservations.safe, head, depart + turn + steps)
     robot: Whole = np.int64(-1)
     met: Whole = np.int64(0)
     while True:
-        depart, until, arrival = _departure(search, entries, entry, head, steps, left, trip, dock, depart, arrival)
+        depart, until, arrival = _departure(
+            search, entries, entry, head, steps, left, trip, dock, depart, turn, arrival
+        )
         if arrival < 0:
             return
+        first = depart + turn
         # Whoever stands in the way often does so for long, and where it was met before.
-        if (
-            robot < 0
-            or meeting(reservations.others, robot, tail, to, depart, until, depart + met, depart + met + 1) < 0
-        ):
-            robot, met = first_meeting(reservations.others, reservations.buckets, tail, to, depart, until)
-            met -= depart
+        if robot < 0 or meeting(reservations.others, robot, tail, to, first, until, first + met, first + met + 1) < 0:
+            robot, met = first_meeting(reservations.others, reservations.buckets, tail, to, first, until)
+            met -= first
         if robot >= 0:
             failures += 1
             depart += 1 + failures // 4
@@ -220,7 +205,8 @@ def _room_needed(roadmap: Roadmap, safe: Intervals, node: Whole) -> Whole:
 @compiled
 def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip: Trip, tree: _Tree) -> Whole:
     """Search until an entry is at the goal for good, which is returned; -1 if there is none, -2 if room is short."""
-    goal, costs, passing = bodies.goals[k], bodies.costs[k], Trip(trip.stride, trip.launch, trip.latest, np.int64(-1))
+    goal, costs = bodies.goals[k], bodies.costs[k]
+    passing = Trip(trip.stride, trip.launch, trip.latest, np.int64(-1), trip.turn, trip.facing)
     root, entries, heap, sizes = np.int64(0), tree.entries, tree.heap, tree.sizes
     while sizes[1] > 0:
         entry = heap[0]

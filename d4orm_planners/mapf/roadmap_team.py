@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numba import types
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
@@ -18,10 +19,11 @@ from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.occupancy import Occupancy, Others, find_meetings
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
-from d4orm_planners.mapf.replanning import Trip, find_path
+from d4orm_planners.mapf.replanning import find_path
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.mapf.safe_intervals import Reservations, make_reservations
 from d4orm_planners.mapf.straightening import straighten
+from d4orm_planners.mapf.trips import Trip
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
@@ -102,11 +104,12 @@ class Replanning:
             goal; ``None`` if it stays.
 
     Attributes:
+        counts_turns: Whether plans allow for the steps that turns on the spot take; not at first.
         alone: ``(K,)`` about how many steps each robot takes by itself.
     """
 
     def __init__(self, problem: Problem, roadmap: Roadmap, dwell: int | None = None) -> None:
-        self.problem, self.roadmap, self.dwell = problem, roadmap, dwell
+        self.problem, self.roadmap, self.dwell, self.counts_turns = problem, roadmap, dwell, False
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
         self.bodies, self.size = TeamOnRoadmap(problem, roadmap).bodies, problem.team.largest_radius
@@ -118,6 +121,7 @@ class Replanning:
         self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.goal_radius) - ROUNDING * self.size
         # Who turns in place need not back up.
         self.turns = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
+        self.turns_on_the_spot = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
         d = problem.dimension
         ends = np.stack([problem.world.clearance(position[:, :d]) for position in positions])
         self.own_room = ends.min(axis=0) - TOUCH * self.size
@@ -237,17 +241,18 @@ class Replanning:
     def drives(self, reservations: Reservations, robot: int, latest: int, cruise: float, cut: float) -> Iterator[Drive]:
         """Rollouts of a robot along its path, if it has one, in one of the :data:`SPEED_PROFILES`."""
         roadmap, bodies, steps = self.roadmap, self.bodies, reservations.others.positions.shape[1] - 1
-        dwell = -1 if self.dwell is None else self.dwell
+        dwell, (turn, facing) = -1 if self.dwell is None else self.dwell, self.turns_on_the_spot[robot]
+        turn = turn if self.counts_turns else 0.0
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
-            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell)
+            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell, turn, facing)
             path = find_path(roadmap, bodies, reservations, robot, trip)
             if len(path):
                 break
         else:
             return
         safety_distance = bodies.safety_distance[robot] * (1 + WALL_SLACK * 2 / 3)
-        left = straighten(roadmap, bodies, self.space, reservations.others, robot, safety_distance, path)
+        left = straighten(roadmap, bodies, self.space, reservations.others, robot, safety_distance, trip, path)
         nodes, departs, arrives = path[:left].T
         stops = Corners(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
@@ -268,6 +273,15 @@ class Replanning:
             return np.inf
         room = self.problem.world.clearance(positions[1 : arrival + 1, : self.problem.dimension])
         return float(room.min() - self.bodies.safety_distance[robot])
+
+
+def turn_on_the_spot(problem: Problem, robot: int) -> tuple[float, tuple[float, float]]:
+    """Steps in which a robot turns by a radian, zero if it need not or cannot, and where it faces at its start."""
+    model = problem.team.robot_models[robot]
+    if model.heading_index is None or not model.turns_in_place or model.dimension != 2:
+        return 0.0, (1.0, 0.0)
+    sine, cosine = portable.sin_cos_of(float(problem.start[robot, model.heading_index]))
+    return 1 / (problem.dt * model.turn_rate(problem.team.limits[robot])), (float(cosine), float(sine))
 
 
 def is_compiled(problem: Problem) -> bool:

@@ -11,6 +11,7 @@ from d4orm_env.paths.spaces import Space, is_free_line
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, bucket_of
 from d4orm_planners.mapf.roadmap import Footprints, Roadmap
+from d4orm_planners.mapf.trips import Trip, steps_to_turn
 
 
 @compiled
@@ -76,6 +77,7 @@ def straighten(
     others: Others,
     k: Whole,
     safety_distance: float,
+    trip: Trip,
     path: IntArray,
 ) -> int:
     """Leave out nodes of a path where the straight line is free of obstacles and of others.
@@ -87,6 +89,7 @@ def straighten(
         others: Their motions.
         k: The robot.
         safety_distance: Distance that it keeps from obstacles [m].
+        trip: Its motion.
         path: ``(n, 3)`` of :func:`~d4orm_planners.mapf.replanning.find_path`, changed in place.
 
     Returns:
@@ -96,6 +99,7 @@ def straighten(
     while i + 1 < path.shape[0]:
         j = i + 1
         depart, tail = path[j, 1], nodes[path[i, 0]]
+        before = path[count - 2, 0] if count > 1 else np.int64(-1)
         while j + 1 < path.shape[0]:
             head = nodes[path[j + 1, 0]]
             near = near_neighbours.squared_gap(nodes, goal, nodes, path[i, 0], nodes, path[j + 1, 0])
@@ -105,7 +109,8 @@ def straighten(
             if space is not None:  # noqa: SIM102
                 if not is_free_line(space, safety_distance, tail, head):
                     break
-            if not _is_line_free(others, tail, head, depart, path[j + 1, 2]):
+            first = depart + steps_to_turn(nodes, trip, before, path[i, 0], path[j + 1, 0])
+            if first >= path[j + 1, 2] or not _is_line_free(others, tail, head, first, path[j + 1, 2]):
                 break
             j += 1
         path[count, 0], path[count, 1], path[count, 2] = path[j, 0], depart, path[j, 2]

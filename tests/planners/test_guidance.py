@@ -21,10 +21,11 @@ from d4orm_planners.mapf.lns import search_neighbourhoods
 from d4orm_planners.mapf.occupancy import Occupancy
 from d4orm_planners.mapf.planner import RoadmapPaths, needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
-from d4orm_planners.mapf.replanning import Trip, find_path
+from d4orm_planners.mapf.replanning import find_path
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
 from d4orm_planners.mapf.safe_intervals import make_reservations
+from d4orm_planners.mapf.trips import Trip, steps_to_turn
 from d4orm_planners.tracking.path_drives import Corners
 from d4orm_planners.tracking.pursuit import gear_towards
 from d4orm_planners.tracking.timed_path import drive_by_clock
@@ -287,6 +288,25 @@ def test_a_path_in_space_and_time_lets_others_pass(fault: str) -> None:
             share = (step - depart) / (arrive - depart)
             position = roadmap.nodes[tail] * (1 - share) + roadmap.nodes[head] * share
             assert np.linalg.norm(position - positions[step, 1]) >= 0.41 - 1e-9
+
+
+def test_turns_on_the_spot_take_steps() -> None:
+    """Ten steps a radian, less what is turned while driving; four to brake where the robot does not set out."""
+    nodes = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [3.0, 0.5, 0.0]])
+    trip = Trip(0.1, 4, 400, -1, 10.0, (0.0, 1.0))
+    moves = {"aside": (0, 1, 2), "back": (0, 1, 0), "slightly aside": (0, 1, 3), "from its start": (-1, 0, 1)}
+    steps = {move: steps_to_turn.py_func(nodes, trip, *map(np.int64, nodes_of)) for move, nodes_of in moves.items()}
+    assert steps == {"aside": 16, "back": 29, "slightly aside": 0, "from its start": 12}
+    assert steps_to_turn.py_func(nodes, trip._replace(turn=0.0), np.int64(0), np.int64(1), np.int64(2)) == 0
+
+
+@pytest.mark.slow
+def test_a_crowd_of_robots_that_turn_on_the_spot_is_planned() -> None:
+    """Not without counting their turns: they come too late everywhere, and meet each other."""
+    problem = make_problem("warehouse", num_robots=24, seed=2, model="differential_drive", shelves=(1, 3))
+    plan = make_planner("mapf").solve(problem, seed=0, max_iterations=1)
+    assert plan.solved
+    assert verify(problem, plan.controls).ok
 
 
 def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
