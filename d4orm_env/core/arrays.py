@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Self, TypeVar
 
@@ -61,9 +61,16 @@ def _detached(value: Any) -> Any:
 
 
 def frozen_array(
-    value: ArrayLike, name: str, shape: tuple[int | None, ...], *, largest: float = float("inf")
+    value: ArrayLike,
+    name: str,
+    shape: tuple[int | None, ...],
+    *,
+    largest: float = float("inf"),
+    columns: Collection[str] = (),
 ) -> FloatArray:
     """``value`` as a read-only, finite float32 array of a shape, in which ``None`` matches any length.
+
+    ``columns`` are what its columns mean, for the message.
 
     Raises:
         ValueError: If it cannot be read, has another shape, or holds a value that is not finite or beyond ``largest``.
@@ -77,7 +84,8 @@ def frozen_array(
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name} has shape {array.shape}; expected ({wanted})")
+        meaning = ": " * bool(columns) + ", ".join(columns)
+        raise ValueError(f"{name} has shape {array.shape}; expected ({wanted}){meaning}")
     too_large = np.abs(array) > largest, f"magnitudes must be at most {largest:g}"
     for wrong, remedy in ((~np.isfinite(array), "every value must be finite"), too_large):
         if wrong.any():

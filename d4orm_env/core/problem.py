@@ -116,7 +116,9 @@ class Problem(Frozen):
         self._set(
             **numbers,
             team=team,
-            start=frozen_array(start, "start", (team.num_robots, team.state_size), largest=LARGEST),
+            start=frozen_array(
+                start, "start", (team.num_robots, team.state_size), largest=LARGEST, columns=team.state_names
+            ),
             goal=frozen_array(goal, "goal", (team.num_robots, team.dimension), largest=LARGEST),
             world=world,
             goal_speed=checks.goal_speeds(team, numbers["dt"], goal_speed),
@@ -272,7 +274,7 @@ class Problem(Frozen):
             **changes: Other attributes that differ, of the right type.
         """
         return self._unchecked(
-            start=frozen_array(start, "start", self.start.shape),
+            start=frozen_array(start, "start", self.start.shape, columns=self.team.state_names),
             goal=frozen_array(goal, "goal", self.goal.shape),
             **changes,
         )

@@ -208,6 +208,12 @@ class Team(Frozen):
         """``n``: the largest state size of the team; smaller states are padded with zeros."""
         return max(model.state_size for model in self.robot_models)
 
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the state's components; none for a team in which they differ."""
+        first, *others = {model.state_names for model in self.robot_models}
+        return () if others else first
+
     @cached_property
     def control_size(self) -> int:
         """``m``: the largest control size of the team; smaller controls are padded with zeros."""

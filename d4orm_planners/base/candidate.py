@@ -93,6 +93,10 @@ def _missed_goal(problem: Problem, trajectory: Trajectory, robot: int, unreachab
         turns = (problem.team.headings(trajectory.states[-1]) - problem.goal_heading)[robot] / (2 * np.pi)
         missed = 2 * np.pi * abs(turns - np.round(turns))
         yield f"ends {gap:.2g} m from its goal" + (f", {missed:.2g} rad off" if missed > 0 else "")
+        way = np.linalg.norm(problem.goal[robot] - problem.start[robot, : problem.dimension]) - problem.goal_radius
+        steps = int(np.ceil(way / (problem.team.max_speed[robot] * problem.dt)))
+        if steps > problem.horizon:
+            yield f"needs {steps} steps at full speed, where the horizon is {problem.horizon}; give a longer horizon"
     if unreachable:
         safety_distance = problem.team.radius[robot] + problem.margin
         yield f"has no path from start to goal that is {safety_distance:.4g} m clear of obstacles"

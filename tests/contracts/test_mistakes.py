@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, load_map, load_problem, make_problem, navigation_v0, verify
-from d4orm_planners import make_policy, run_episode
+from d4orm_planners import make_planner, make_policy, run_episode
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3
 
 
@@ -32,6 +32,7 @@ PROBLEM = make_problem("circle", num_robots=2)
     ("call", "message"),
     [
         (lambda: Problem(DRIVE, [[0, 0, 180, 0]], [[2, 0]]), "180 rad; .* convert degrees by numpy.deg2rad"),
+        (lambda: Problem(DRIVE, [[0, 0]], [[2, 0]]), r"expected \(1, 4\): px, py, heading, speed"),
         (lambda: navigation_v0.parallel_env(lifelong="yes"), "lifelong is 'yes'; it must be True or False"),
         (lambda: navigation_v0.parallel_env(ray_range=3.0), "these robots have none; give observed_rays"),
         (lambda: navigation_v0.parallel_env(max_steps=9), "did you mean 'max_cycles'"),
@@ -52,6 +53,12 @@ PROBLEM = make_problem("circle", num_robots=2)
 def test_what_python_says(call: Callable[[], object], message: str) -> None:
     with pytest.raises((ValueError, TypeError), match=message):
         call()
+
+
+def test_a_goal_too_far_for_the_horizon_is_told() -> None:
+    problem = make_problem("circle", num_robots=2).replace(horizon=9)
+    plan = make_planner("d4orm", max_iterations=1, num_samples=8).solve(problem)
+    assert "needs 50 steps at full speed, where the horizon is 9; give a longer horizon" in plan.failures["robot_0"]
 
 
 @pytest.mark.parametrize(
