@@ -32,7 +32,7 @@ def train(num_robots: int, worlds: int, steps: int, path: Path) -> PPO:
     envs = supersuit.concat_vec_envs_v1(vector, worlds, num_cpus=0, base_class="stable_baselines3")
     set_random_seed(0)  # PPO(seed=...) would ask for a method that the vector of SuperSuit lacks
     model = PPO(
-        "MlpPolicy", envs, n_steps=64, batch_size=512, n_epochs=6, gamma=0.98, learning_rate=1e-3,
+        "MlpPolicy", envs, n_steps=64, batch_size=512, n_epochs=6, gamma=0.98, learning_rate=lambda left: 1e-3 * left,
         policy_kwargs={"log_std_init": -0.5}, device="cpu",
     )  # fmt: skip
     model.learn(steps)
@@ -44,7 +44,7 @@ def train(num_robots: int, worlds: int, steps: int, path: Path) -> PPO:
 
 def main() -> None:
     """Train, and drive with what was learned."""
-    arguments = recipe_arguments(__doc__, "--steps", 2_000_000, "robot-steps to train")
+    arguments = recipe_arguments(__doc__, "--steps", 600_000, "robot-steps to train")
     torch.set_num_threads(1)  # the layers are too small to be shared
     path = arguments.out / "supersuit_ppo.zip"
     model = train(arguments.num_robots, 2 if arguments.quick else 16, 512 if arguments.quick else arguments.steps, path)
