@@ -73,7 +73,7 @@ def as_policy(module: Any, num_robots: int) -> SharedPolicy:
 
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    arguments = recipe_arguments(__doc__, "--iterations", 200, "of 8192 steps of teams each")
+    arguments = recipe_arguments(__doc__, "--iterations", 80, "of 8192 steps of teams each")
     iterations, parts = (60, 3) if arguments.quick else (arguments.iterations, 10)
     torch.set_num_threads(1)  # the layers are too small to be shared
     own = {"num_robots": arguments.num_robots, "num_instances": 512, **WORLD}

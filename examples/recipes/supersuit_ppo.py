@@ -32,7 +32,7 @@ def train(num_robots: int, worlds: int, steps: int, path: Path) -> PPO:
     envs = supersuit.concat_vec_envs_v1(vector, worlds, num_cpus=0, base_class="stable_baselines3")
     set_random_seed(0)  # PPO(seed=...) would ask for a method that the vector of SuperSuit lacks
     model = PPO(
-        "MlpPolicy", envs, n_steps=64, batch_size=512, n_epochs=6, gamma=0.98, learning_rate=lambda left: 1e-3 * left,
+        "MlpPolicy", envs, n_steps=64, batch_size=512, n_epochs=6, gamma=0.98, learning_rate=1e-3,
         policy_kwargs={"log_std_init": -0.5}, device="cpu",
     )  # fmt: skip
     model.learn(steps)
