@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from examples.common import require, save_table
-from examples.recipes.task import WORLD, recipe_arguments
+from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "torchrl")
 try:
@@ -23,8 +23,11 @@ except ImportError as error:
 import torch
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from d4orm_env.integrations.benchmarl import NavigationTask
+from d4orm_planners.base.adapters import SharedPolicy
 
 WORLDS, HORIZON = 256, 32
 
@@ -55,9 +58,22 @@ class Successes(Callback):
         self.counts.append((len(success), int(success.sum())))
 
 
+def as_policy(module: Any, num_robots: int) -> SharedPolicy:
+    """The policy of an experiment, which wants a row for each robot, for those that have yet to arrive."""
+
+    def predict(seen: np.ndarray) -> np.ndarray:
+        rows = torch.zeros(num_robots, seen.shape[1])
+        rows[: len(seen)] = torch.as_tensor(seen)
+        asked = TensorDict({"robots": TensorDict({"observation": rows}, [num_robots])}, [])
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            return module(asked)["robots", "action"][: len(seen)].numpy()
+
+    return SharedPolicy(predict, module, egocentric=True)
+
+
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    arguments = recipe_arguments(__doc__, "--iterations", 200, "of 8192 steps of teams each")
+    arguments = recipe_arguments(__doc__, "--iterations", 80, "of 8192 steps of teams each")
     iterations, parts = (60, 3) if arguments.quick else (arguments.iterations, 10)
     torch.set_num_threads(1)  # the layers are too small to be shared
     own = {"num_robots": arguments.num_robots, "num_instances": 512, **WORLD}
@@ -65,15 +81,17 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     model = MlpConfig.get_from_yaml()
     model.num_cells, model.activation_class = [64, 64], torch.nn.Tanh
-    Experiment(
+    experiment = Experiment(
         task=NavigationTask("random", own), algorithm_config=MappoConfig.get_from_yaml(), model_config=model,
         critic_model_config=model, seed=0, config=settings(folder, iterations), callbacks=[counted],
-    ).run()  # fmt: skip
+    )  # fmt: skip
+    experiment.run()
     rows = []
     for part in np.array_split(np.arange(iterations), parts):
         ended, succeeded = np.sum([counted.counts[index] for index in part], axis=0)
         steps = (part[-1] + 1) * WORLDS * HORIZON * arguments.num_robots
         rows.append({"robot-steps": steps, "episodes": ended, "success": f"{succeeded / max(ended, 1):.0%}"})
+    print(solved(as_policy(experiment.policy, arguments.num_robots), arguments))
     save_table(rows, arguments.out / "benchmarl_mappo.csv")
 
 

@@ -7,29 +7,16 @@ It knows one size of team only, and every robot is paid for what all do: teams l
 
 from __future__ import annotations
 
-import time
-from typing import Any
-
 from examples.common import require
-from examples.recipes.task import SEEDS, WORLD, recipe_arguments
+from examples.recipes.task import WORLD, recipe_arguments, solved
 
 require("rl", "stable_baselines3")
-import gymnasium
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
 from d4orm_env.envs.joint_env import ENV_ID, register_environments
-
-
-def succeeds(model: PPO, env: gymnasium.Env[Any, Any], seed: int) -> bool:
-    """Check whether all arrive without a contact, in the instance of a seed."""
-    observation, info = env.reset(seed=seed)
-    over = False
-    while not over:
-        observation, _, terminated, truncated, info = env.step(model.predict(observation, deterministic=True)[0])
-        over = terminated or truncated
-    return bool(info["is_success"])
+from d4orm_planners.base.adapters import from_sb3
 
 
 def main() -> None:
@@ -43,11 +30,9 @@ def main() -> None:
         gamma=0.98, learning_rate=5e-4, policy_kwargs={"log_std_init": -0.5, "net_arch": [128, 128]}, device="cpu",
     )  # fmt: skip
     model.learn(2048 if arguments.quick else arguments.steps)
-    minutes, seeds = time.process_time() / 60, SEEDS[:5] if arguments.quick else SEEDS
     arguments.out.mkdir(parents=True, exist_ok=True)
     model.save(arguments.out / "sb3_joint_ppo.zip")
-    successes = sum(succeeds(model, gymnasium.make(ENV_ID, **world), seed) for seed in seeds)
-    print(f"solves {successes} of {len(seeds)} unseen instances, after {minutes:.1f} minutes of a processor")
+    print(solved(from_sb3(model, egocentric=True), arguments))
 
 
 if __name__ == "__main__":

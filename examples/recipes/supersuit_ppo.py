@@ -44,7 +44,7 @@ def train(num_robots: int, worlds: int, steps: int, path: Path) -> PPO:
 
 def main() -> None:
     """Train, and drive with what was learned."""
-    arguments = recipe_arguments(__doc__, "--steps", 2_000_000, "robot-steps to train")
+    arguments = recipe_arguments(__doc__, "--steps", 500_000, "robot-steps to train")
     torch.set_num_threads(1)  # the layers are too small to be shared
     path = arguments.out / "supersuit_ppo.zip"
     model = train(arguments.num_robots, 2 if arguments.quick else 16, 512 if arguments.quick else arguments.steps, path)

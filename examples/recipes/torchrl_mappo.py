@@ -21,7 +21,7 @@ require("rl", "torchrl")
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.envs.utils import set_exploration_type
-from torchrl.modules import MLP, MultiAgentMLP, ProbabilisticActor, TanhNormal
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -33,13 +33,20 @@ GAMMA, LAMBDA, CLIP, EPOCHS, MINIBATCHES, LEARNING_RATE = 0.98, 0.95, 0.2, 4, 4,
 SEEN, ACTION, REWARD, VALUE = (("robots", name) for name in ("observation", "action", "reward", "state_value"))
 
 
+class OwnAndAll(torch.nn.Module):
+    """What each sees, and after it what all see: of that alone, a shared critic gives all robots one value."""
+
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        """``(..., K, D)`` to ``(..., K, D + K * D)``."""
+        everything = seen.flatten(-2).unsqueeze(-2).expand(*seen.shape[:-1], -1)
+        return torch.cat([seen, everything], -1)
+
+
 def make_critic(env: TorchRLNavigation) -> TensorDictModule:
-    """Return the robots' critic, one network for all of what all see."""
-    network = MultiAgentMLP(
-        n_agent_inputs=env.observation_spec[SEEN].shape[-1], n_agent_outputs=1, n_agents=len(env.group_map["robots"]),
-        centralised=True, share_params=True, depth=2, num_cells=64, activation_class=torch.nn.Tanh,
-    )  # fmt: skip
-    return TensorDictModule(network, [SEEN], [VALUE])
+    """Return the robots' critic, one network."""
+    robots, size = env.observation_spec[SEEN].shape[-2:]
+    network = MLP((1 + robots) * size, 1, depth=2, num_cells=64, activation_class=torch.nn.Tanh)
+    return TensorDictModule(torch.nn.Sequential(OwnAndAll(), network), [SEEN], [VALUE])
 
 
 def make_actor(env: TorchRLNavigation) -> ProbabilisticActor:
@@ -82,7 +89,7 @@ def with_advantages(data: Any, advantages: GAE) -> Any:
 
 def main() -> None:
     """Train, and print how many episodes succeeded on the way."""
-    arguments = recipe_arguments(__doc__, "--updates", 200, "of 8192 steps of teams each")
+    arguments = recipe_arguments(__doc__, "--updates", 100, "of 8192 steps of teams each")
     updates, parts = (60, 3) if arguments.quick else (arguments.updates, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the layers are too small to be shared
@@ -90,7 +97,7 @@ def main() -> None:
     state = env.reset()
     actor = make_actor(env)
     critic = make_critic(env)
-    loss = ClipPPOLoss(actor, critic, clip_epsilon=CLIP, entropy_coeff=1e-3, normalize_advantage=False)
+    loss = ClipPPOLoss(actor, critic, clip_epsilon=CLIP, entropy_coeff=1e-3, loss_critic_type="l2")
     names = {"done": ("robots", "done"), "terminated": ("robots", "terminated")}
     loss.set_keys(action=ACTION, reward=REWARD, value=VALUE, sample_log_prob=("robots", "log_density"), **names)
     advantages = GAE(gamma=GAMMA, lmbda=LAMBDA, value_network=critic)
