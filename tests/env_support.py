@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from scenario_support import needed, scenario_models
 
 from d4orm_env.core.problem import Problem
@@ -24,8 +25,20 @@ def scenario_cases(num_robots: int) -> list[dict[str, Any]]:
     return cases
 
 
-def case_name(case: dict[str, Any]) -> str:
-    return "-".join(str(value) for key, value in case.items() if key in ("scenario", "model"))
+QUICK = ("circle", "swap", "random", "sphere", "heterogeneous", "warehouse", "four_obstacles")
+"""One scenario of every kind of team and of world; the others are slow where what is tested hardly depends on it."""
+
+
+def scenario_params(num_robots: int) -> list[Any]:
+    """``scenario_cases`` by their names, as parameters of a test."""
+    return [
+        pytest.param(
+            case,
+            id="-".join(str(value) for key, value in case.items() if key in ("scenario", "model")),
+            marks=() if case["scenario"] in QUICK else pytest.mark.slow,
+        )
+        for case in scenario_cases(num_robots)
+    ]
 
 
 def line_problem(distances: list[float], model: str = "velocity2d", **changes: Any) -> Problem:

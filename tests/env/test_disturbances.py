@@ -95,8 +95,17 @@ def joint_worlds(count: int, case: dict[str, Any]) -> list[JointNavigationEnv]:
     return [JointNavigationEnv(**case) for _ in range(count)]
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=lambda mode: mode.value)
-@pytest.mark.parametrize("disturbances", [*([case] for case in CASES.values()), TOGETHER], ids=[*CASES, "together"])
+@pytest.mark.parametrize(
+    ("disturbances", "mode"),
+    [
+        *(pytest.param([case], AutoresetMode.NEXT_STEP, id=name) for name, case in CASES.items()),
+        *(
+            pytest.param(TOGETHER, mode, id=f"together-{mode.value}")
+            for mode in AutoresetMode
+            if mode.value != "Disabled"
+        ),
+    ],
+)
 def test_batched_worlds_are_the_joint_env_to_the_bit(disturbances: list[Any], mode: AutoresetMode) -> None:
     case = {"scenario": "random", "num_robots": 4, "max_cycles": 14, "disturbances": disturbances, "observed_rays": 3}
     batch, singles, random = NavigationVectorEnv(3, autoreset_mode=mode, **case), joint_worlds(3, case), None

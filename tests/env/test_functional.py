@@ -137,7 +137,14 @@ def total_reward(problem: Problem, controls: Any) -> Any:
 GRADIENT = jax.jit(jax.grad(total_reward, argnums=1))
 
 
-@pytest.mark.parametrize("model", MODEL_NAMES)
+@pytest.mark.parametrize(
+    "model",
+    [
+        "holonomic3d",
+        "differential_drive",
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("holonomic2d", "velocity2d")),
+    ],
+)
 def test_gradients_are_finite_and_point_to_the_goal(model: str) -> None:
     team = Team((model,))
     goal = np.eye(team.dimension)[:1] * 3

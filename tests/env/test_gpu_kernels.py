@@ -88,7 +88,13 @@ def test_the_kernel_counts_those_who_are_near(name: str) -> None:
     assert counts.any()
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param(model, marks=pytest.mark.slow if model in ("car_with_1_trailer", "car_with_2_trailers") else ())
+        for model in MODELS
+    ],
+)
 def test_a_denoising_run_is_one_loop_of_few_kernels_on_a_gpu(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     lowered: list[str] = []
 

@@ -282,7 +282,7 @@ def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion(name:
     assert (found.bend <= 2 * acceleration + 0.1).all()
 
 
-@pytest.mark.parametrize("scale", [0.3, 30.0])
+@pytest.mark.parametrize("scale", [pytest.param(0.3, marks=pytest.mark.slow), 30.0])
 @pytest.mark.parametrize("name", MODELS)
 def test_the_judge_integrates_all_steps_at_once_as_one_after_another(
     name: str, scale: float, monkeypatch: pytest.MonkeyPatch

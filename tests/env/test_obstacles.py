@@ -67,7 +67,7 @@ worlds = given(
 
 
 @worlds
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int, radius: float) -> None:
     world = random_world(seed, dimension, count)
     points = np.random.default_rng(seed).uniform(-7, 7, (200, dimension))
@@ -80,7 +80,7 @@ def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int,
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_crowded_cells_keep_only_who_can_be_nearest(dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    shapes, points = random_world(5, dimension, 400).shapes, np.random.default_rng(5).uniform(-5, 5, (20000, dimension))
+    shapes, points = random_world(5, dimension, 400).shapes, np.random.default_rng(5).uniform(-5, 5, (4000, dimension))
     short = build_index(shapes, 0.25, 1.0)
     monkeypatch.setattr("d4orm_env.geometry.grid_refinement.CROWDED", 10**6)
     long = build_index(shapes, 0.25, 1.0)
@@ -91,7 +91,7 @@ def test_crowded_cells_keep_only_who_can_be_nearest(dimension: int, monkeypatch:
 
 @pytest.mark.parametrize("nearest", [3, FEW + 3])
 @worlds
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_index_finds_several_of_the_nearest(nearest: int, seed: int, dimension: int, count: int, radius: float) -> None:
     world = random_world(seed, dimension, count)
     index, random = world.index(radius, nearest=nearest), np.random.default_rng(seed)

@@ -88,7 +88,7 @@ def one_after_another(problem: Problem, order: Any) -> tuple[Problem, Any]:
 
 
 @pytest.mark.parametrize("name", WALLED)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_one_after_another_everybody_arrives_in_any_order(name: str, seed: int) -> None:
     problem = make_problem(name, 4, seed, model="velocity2d", **needed(name))
     order = np.random.default_rng(seed).permutation(4)

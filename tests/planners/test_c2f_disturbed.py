@@ -452,8 +452,22 @@ def test_a_robot_that_has_stalled_is_driven_around() -> None:
     np.testing.assert_array_equal(executed.trajectory.arrived[-1], ~policy._deviation.stall.robots)
 
 
-@pytest.mark.parametrize("lifelong", [False, True], ids=["once", "lifelong"])
-@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "velocity2d"])
+@pytest.mark.parametrize(
+    ("model", "lifelong"),
+    [
+        ("holonomic2d", False),
+        ("velocity2d", True),
+        *(
+            pytest.param(model, lifelong, marks=pytest.mark.slow)
+            for model, lifelong in [
+                ("velocity2d", False),
+                ("holonomic2d", True),
+                ("differential_drive", False),
+                ("differential_drive", True),
+            ]
+        ),
+    ],
+)
 def test_finding_out_changes_nothing_while_all_is_as_believed(model: str, lifelong: bool) -> None:
     problem = make_problem("circle", num_robots=4, model=model)
     options: dict[str, Any] = {"problem": problem, "lifelong": lifelong, "max_cycles": 120 if lifelong else None}

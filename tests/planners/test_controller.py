@@ -41,8 +41,13 @@ def driven(controller: Controller, problem: Problem, disturbances: Any = (), see
     return plant, said
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("mode", ["nominal", "measured"])
+@pytest.mark.parametrize(
+    ("mode", "model"),
+    [
+        *(("nominal", model) for model in MODELS),
+        *(pytest.param("measured", model, marks=pytest.mark.slow if model != "velocity2d" else ()) for model in MODELS),
+    ],
+)
 def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> None:
     problem = team(model)
     policy, same = ("d4orm", {}) if model == "unicycle" else ("d4orm-c2f", {"refine": "sync"})

@@ -46,7 +46,7 @@ def assert_solves(case: dict[str, Any], seed: int, name: str = "d4orm-d", **conf
     assert report.ok, report.violations
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("name", ["d4orm-d", "hybrid"])
 def test_default_settings_solve(name: str, case: dict[str, Any], seed: int) -> None:

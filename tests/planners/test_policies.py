@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_support import case_name, scenario_cases
+from env_support import scenario_params
 from planner_support import CHEAP, cheap_planner, hop_problem
 
 from d4orm_env import mujoco, navigation_v0
@@ -47,9 +47,9 @@ def rigid(**arguments: Any) -> Any:
     return mujoco.parallel_env(control_noise_std=0.3, **arguments)
 
 
-ENVIRONMENTS = pytest.mark.parametrize(
-    "make_env", [pytest.param(navigation_v0.parallel_env, id="plain"), noisy, wrapped, rigid]
-)
+PLAIN = pytest.param(navigation_v0.parallel_env, id="plain")
+OTHERS = (noisy, wrapped, rigid)
+ENVIRONMENTS = pytest.mark.parametrize("make_env", [PLAIN, *OTHERS])
 
 
 # All of them.
@@ -134,7 +134,7 @@ def test_the_environment_says_what_is_wrong_with_the_answer_of_a_function(bad: A
 
 
 @ALL
-@ENVIRONMENTS
+@pytest.mark.parametrize("make_env", [PLAIN, *(pytest.param(other, marks=pytest.mark.slow) for other in OTHERS)])
 def test_an_episode_runs_to_its_end(name: str, make_env: Any) -> None:
     env = make_env(scenario="circle", num_robots=4)
     episode = run_episode(env, cheap_policy(name), seed=1)
@@ -233,7 +233,7 @@ def test_a_bad_name_or_setting_is_refused(name: str, config: dict[str, Any], mes
 # Open loop.
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=case_name(case)) for case in scenario_cases(4)])
+@pytest.mark.parametrize("case", scenario_params(4))
 def test_open_loop_reproduces_the_plan(case: dict[str, Any]) -> None:
     problem = make_problem(**case)
     plan = cheap_planner("d4orm").solve(problem, seed=0, max_iterations=1)

@@ -204,32 +204,42 @@ def assert_rewards(task: SamplingTask, controls: np.ndarray, rewards: np.ndarray
 ENGINES = {"cpu": CPU, "jax": JAX}
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize(
-    ("name", "credit"),
-    [
-        *((name, credit) for name in ("holonomic2d", "differential_drive", "mixed") for credit in CREDITS),
-        ("velocity2d", "robot"),
-        ("holonomic3d", "team"),
-        ("alone", "team"),
-        ("obstacles", "team"),
-        ("space", "robot"),
-        ("docking", "robot"),
-        ("docking in space", "team"),
-        ("docking drives", "robot"),
-        ("no collisions", "robot"),
-        ("moving", "team"),
-        ("moving, no collisions", "team"),
-        ("moving in space", "robot"),
-        ("harder", "team"),
-        ("harder", "robot"),
-        ("harder, obstacles", "team"),
-        ("arrived", "robot"),
-        ("docked, moving", "team"),
-        ("all docked", "team"),
-        ("all docked, moving", "robot"),
-    ],
-)
+def on_both(cases: list[tuple[Any, ...]], quick_on_jax: tuple[int, ...]) -> Any:
+    """Cases for each engine. JAX compiles every one of them, and most are slow there; those named by number are not."""
+    dear = [() if number in quick_on_jax else pytest.mark.slow for number in range(len(cases))]
+    return [
+        *(pytest.param(*case, "cpu") for case in cases),
+        *(pytest.param(*case, "jax", marks=marks) for case, marks in zip(cases, dear, strict=True)),
+    ]
+
+
+STEPPED = [
+    ("mixed", "robot"),
+    ("harder", "team"),
+    ("harder, obstacles", "team"),
+    ("docking in space", "team"),
+    ("arrived", "robot"),
+    ("mixed", "team"),
+    *((name, credit) for name in ("holonomic2d", "differential_drive") for credit in CREDITS),
+    ("velocity2d", "robot"),
+    ("holonomic3d", "team"),
+    ("alone", "team"),
+    ("obstacles", "team"),
+    ("space", "robot"),
+    ("docking", "robot"),
+    ("docking drives", "robot"),
+    ("no collisions", "robot"),
+    ("moving", "team"),
+    ("moving, no collisions", "team"),
+    ("moving in space", "robot"),
+    ("harder", "robot"),
+    ("docked, moving", "team"),
+    ("all docked", "team"),
+    ("all docked, moving", "robot"),
+]
+
+
+@pytest.mark.parametrize(("name", "credit", "engine"), on_both(STEPPED, quick_on_jax=(0, 1, 2, 3, 4)))
 def test_every_step_is_that_of_the_reference(name: str, credit: str, engine: str) -> None:
     step_by_step(ENGINES[engine], replace(TASKS[name](), credit=credit))
 
@@ -256,20 +266,17 @@ def test_so_it_is_in_every_scenario(scenario: str, engine: str) -> None:
     step_by_step(ENGINES[engine], task, sigma=(0.6, 0.2))
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("num_samples", [2, 65])
+@pytest.mark.parametrize(("num_samples", "engine"), on_both([(2,), (65,)], quick_on_jax=(1,)))
 def test_so_it_is_with_any_number_of_samples(num_samples: int, engine: str) -> None:
     step_by_step(ENGINES[engine], TASKS["alone"](), num_samples=num_samples)
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
+@pytest.mark.parametrize(("credit", "engine"), on_both([("robot",), ("team",)], quick_on_jax=(0,)))
 def test_so_it_is_with_importance(credit: str, engine: str) -> None:
     step_by_step(ENGINES[engine], replace(TASKS["holonomic2d"](), credit=credit), SOFTMAX._replace(importance=0.05))
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
+@pytest.mark.parametrize(("credit", "engine"), on_both([("robot",), ("team",)], quick_on_jax=(1,)))
 def test_so_it_is_where_the_noise_follows_the_spread_of_the_samples(credit: str, engine: str) -> None:
     rules = SamplingRules(EliteWeights(0.1), Spread(0.05))
     step_by_step(ENGINES[engine], replace(TASKS["holonomic2d"](), credit=credit), rules)
@@ -379,9 +386,9 @@ class Spread:
         return xp.sqrt(xp.maximum(deviation2, 0)) + self.floor
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
-@pytest.mark.parametrize("name", ["holonomic2d", "holonomic3d"])
+@pytest.mark.parametrize(
+    ("name", "credit", "engine"), on_both([("holonomic2d", "team"), ("holonomic3d", "robot")], quick_on_jax=(1,))
+)
 def test_importance_weighs_by_how_likely_a_sample_is_around_zero(name: str, credit: str, engine: str) -> None:
     """The term is the logarithm of a ratio of densities, written out here from the samples themselves."""
     task = replace(TASKS[name](), credit=credit)
@@ -468,8 +475,7 @@ def bursting_controls(task: SamplingTask, burst: Burst) -> Any:
     return sampled_controls(task, mean, burst(0, np), 4, 1)
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
+@pytest.mark.parametrize(("credit", "engine"), on_both([("robot",), ("team",)], quick_on_jax=(0,)))
 def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credit: str, engine: str) -> None:
     """A quarter of the samples in each tile gets a control whose square is infinite: its robot is nowhere."""
     task = replace(TASKS["obstacles"](), credit=credit)

@@ -178,7 +178,7 @@ def until(condition: Callable[[], bool], seconds: float = 300.0) -> None:
         time.sleep(0.005)
 
 
-@pytest.mark.parametrize("poses", [False, True])
+@pytest.mark.parametrize("poses", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_robots_arrive_though_messages_are_lost_and_get_new_goals(endpoint: str, poses: bool) -> None:
     with served(endpoint) as server:
         fleet = Fleet(endpoint, problem().start[:, :2].astype(float), loss=0.2, poses=poses)

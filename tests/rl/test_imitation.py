@@ -115,7 +115,7 @@ def test_it_begins_with_a_dataset(agents: str, tmp_path: Path) -> None:
     environment: dict[str, Any] = {"scenario": "random", "num_robots": 2, "size": 2.5}
     demonstrations = Demonstrations(policy="go-to-goal", environment=environment, seeds=range(6), agents=agents)
     write_dataset(demonstrations, tmp_path / "data set", workers=1)
-    settings = replace(TINY, dataset=tmp_path / "data set", rounds=2, episodes=4)
+    settings = replace(TINY, dataset=tmp_path / "data set", rounds=2, episodes=4, epochs=2, validation_worlds=2)
     result = imitate(settings, tmp_path / "out")
     env = navigation_v0.parallel_env(**environment)
     counts = [len(record_samples(env, make_policy("go-to-goal"), seed)) for seed in range(6)]
@@ -172,7 +172,7 @@ def test_samples_come_back_from_their_file(tmp_path: Path) -> None:
 def test_ppo_goes_on_from_what_was_imitated(imitated: Path, tmp_path: Path) -> None:
     path = imitated / "policy.safetensors"
     settings = TrainingSettings(
-        num_robots=2, steps=1, num_envs=16, stages=1, validation_worlds=20, seed=5,
+        num_robots=2, steps=1, num_envs=16, stages=1, validation_worlds=2, seed=5,
         scenario_settings={"size": 2.5}, start_from=path,
     )  # fmt: skip
     learned = train(settings, tmp_path / "on").network
@@ -200,9 +200,11 @@ def test_an_expert_is_told_that_another_drives() -> None:
 
 
 def test_what_is_trained_on_along_with_a_scenario_has_robots_like_its_own(tmp_path: Path) -> None:
-    spatial = replace(TINY, scenario="sphere", scenario_settings={}, episodes=4, rounds=2, epochs=1)
+    spatial = replace(
+        TINY, scenario="sphere", scenario_settings={}, episodes=2, rounds=1, epochs=1, validation_worlds=2
+    )
     assert imitate(spatial, tmp_path / "imitation").network.header.model == "holonomic3d"
-    settings = TrainingSettings(scenario="sphere", num_robots=2, steps=1024, num_envs=16, stages=2)
+    settings = TrainingSettings(scenario="sphere", num_robots=2, steps=1, num_envs=16, stages=1, validation_worlds=2)
     assert train(settings, tmp_path / "ppo").network.header.model == "holonomic3d"
 
 
