@@ -243,7 +243,7 @@ def parked_cars(*, beside: float) -> Problem:
     return Problem(Team(("car", "car")), start, np.float32([[0, beside], [0, -1]]), horizon=100, margin=0.05)
 
 
-@pytest.mark.parametrize("beside", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("beside", [0.1, pytest.param(0.3, marks=pytest.mark.slow), 0.6])
 def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> None:
     """Within its turning circle there is no path home that does not lead away first."""
     problem, arrived = parked_cars(beside=beside), np.array([False, True])
@@ -429,7 +429,7 @@ def test_an_episode_tells_how_late_commands_are(disturbance: Any, late: int) -> 
     assert policy._deviation.latency.steps == late
 
 
-@pytest.mark.parametrize("scenario", ["circle", "random"])
+@pytest.mark.parametrize("scenario", ["random", pytest.param("circle", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "disturbance", [Push(0.4, 0.3), LimitMismatch(0.7), Bias(0.15)], ids=lambda one: type(one).__name__
 )

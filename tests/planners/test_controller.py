@@ -88,8 +88,13 @@ def test_any_policy_is_within_each_robots_limits(policy: Any) -> None:
 @pytest.mark.parametrize(
     ("mode", "disturbances"),
     [
-        ("measured", [Bias(0.25)]), ("measured", [ControlNoise(0.2)]), ("measured", [Gain(0.1)]),
-        ("measured", [StateNoise(0.01, 0.02)]), ("nominal", [ControlNoise(0.2)]), ("nominal", [StateNoise(0.01, 0.02)]),
+        ("measured", [Bias(0.25)]), ("measured", [StateNoise(0.01, 0.02)]), ("nominal", [ControlNoise(0.2)]),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [
+                ("measured", [ControlNoise(0.2)]), ("measured", [Gain(0.1)]), ("nominal", [StateNoise(0.01, 0.02)]),
+            ]
+        ),
     ],
 )  # fmt: skip
 def test_disturbed_robots_arrive(mode: Any, disturbances: list[Any]) -> None:

@@ -161,16 +161,16 @@ def test_the_same_seed_gives_the_same_episode(name: str) -> None:
 
 
 def noisy_circle() -> Any:
-    return navigation_v0.parallel_env(scenario="circle", num_robots=4, control_noise_std=0.2)
+    return navigation_v0.parallel_env(scenario="circle", num_robots=4, control_noise_std=0.2, max_cycles=25)
 
 
 @ALL
 def test_a_policy_forgets_its_last_episode(name: str) -> None:
     policy = cheap_policy(name)
     small, large = make_problem("circle", num_robots=2), make_problem("circle", num_robots=5)
-    run_episode(navigation_v0.parallel_env(problem=small), policy, seed=0)
-    after = run_episode(navigation_v0.parallel_env(problem=large), policy, seed=0)
-    fresh = run_episode(navigation_v0.parallel_env(problem=large), cheap_policy(name), seed=0)
+    run_episode(navigation_v0.parallel_env(problem=small, max_cycles=25), policy, seed=0)
+    env = navigation_v0.parallel_env(problem=large, max_cycles=25)
+    after, fresh = (run_episode(env, each, seed=0) for each in (policy, cheap_policy(name)))
     np.testing.assert_array_equal(after.trajectory.states, fresh.trajectory.states)
 
 

@@ -80,7 +80,9 @@ class Broken(Exception):
     """Stands for a kill."""
 
 
-def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(imitated: Path, tmp_path: Path) -> None:
+def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(tmp_path: Path) -> None:
+    short, whole, broken = replace(TINY, episodes=6, epochs=3, validation_worlds=4), tmp_path / "a", tmp_path / "b"
+    imitate(short, whole, command="d4orm train imitation ...")
     for share in (0.2, 0.5):
 
         def break_off(what: str, done: int, total: int, share: float = share) -> None:
@@ -88,12 +90,12 @@ def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(imitated: Path
                 raise Broken
 
         with pytest.raises(Broken):
-            imitate(TINY, tmp_path, progress=break_off, command="d4orm train imitation ...")
-    kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "episodes").iterdir()}
+            imitate(short, broken, progress=break_off, command="d4orm train imitation ...")
+    kept = {path.name: path.stat().st_mtime_ns for path in (broken / "episodes").iterdir()}
     assert kept
-    imitate(TINY, tmp_path, command="d4orm train imitation ...")
-    assert {name: (tmp_path / "episodes" / name).stat().st_mtime_ns for name in kept} == kept
-    one, two = (load_network(folder / "policy.safetensors") for folder in (imitated, tmp_path))
+    imitate(short, broken, command="d4orm train imitation ...")
+    assert {name: (broken / "episodes" / name).stat().st_mtime_ns for name in kept} == kept
+    one, two = (load_network(folder / "policy.safetensors") for folder in (whole, broken))
     for name, array in one.arrays.items():
         np.testing.assert_array_equal(array, two.arrays[name])
 

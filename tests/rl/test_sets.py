@@ -189,7 +189,7 @@ def test_robots_learn_to_reach_goals_at_any_speed_unless_something_says_otherwis
     assert TrainTask(lambda seed, num_robots: given, 2, {}).problem(0).goal_speed.tolist() == given.goal_speed.tolist()
 
 
-@pytest.fixture(scope="module", params=sorted(ALGORITHMS))
+@pytest.fixture(scope="module", params=["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def practised(request: pytest.FixtureRequest) -> TrainingSettings:
     return replace(TINY, algorithm=request.param)
 
