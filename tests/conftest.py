@@ -56,32 +56,17 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["FUZZ_EXAMPLES"] = str(examples)
 
 
-def resident() -> int:
-    """Bytes of memory that this process has; zero where the system does not say."""
-    statm = Path("/proc/self/statm")
-    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0
-
-
-@pytest.fixture(scope="session")
-def most_memory() -> list[int]:
-    """The bytes from which on a process is large."""
-    return [2**30]
-
-
 @pytest.fixture(scope="module", autouse=True)
-def memory_is_given_back(most_memory: list[int]) -> Iterator[None]:
-    """What JAX has compiled for a module is dropped once the process is large; the cache on disk has it.
-
-    That takes long, and what stays is the libraries: it is done again once the process has grown by a quarter of that.
-    """
+def memory_is_given_back() -> Iterator[None]:
+    """What JAX has compiled for a module is dropped once the process is large; the cache on disk has it."""
     yield
-    if resident() < most_memory[0]:
+    statm = Path("/proc/self/statm")
+    if not statm.exists() or int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") < 2**31:
         return
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
-    most_memory[0] = max(2**30, resident() + 2**28)
 
 
 @pytest.fixture(autouse=True)

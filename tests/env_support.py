@@ -25,19 +25,21 @@ def scenario_cases(num_robots: int) -> list[dict[str, Any]]:
     return cases
 
 
+def slow(*values: Any, **named: Any) -> Any:
+    """One more case of what quick tests cover, which only ``make test-all`` runs."""
+    return pytest.param(*values, marks=pytest.mark.slow, **named)
+
+
 QUICK = ("circle", "swap", "random", "sphere", "heterogeneous", "warehouse", "four_obstacles")
 """One scenario of every kind of team and of world; the others are slow where what is tested hardly depends on it."""
 
 
 def scenario_params(num_robots: int) -> list[Any]:
     """``scenario_cases`` by their names, as parameters of a test."""
+    names = [[case["scenario"], case.get("model")] for case in scenario_cases(num_robots)]
     return [
-        pytest.param(
-            case,
-            id="-".join(str(value) for key, value in case.items() if key in ("scenario", "model")),
-            marks=() if case["scenario"] in QUICK else pytest.mark.slow,
-        )
-        for case in scenario_cases(num_robots)
+        (pytest.param if name[0] in QUICK else slow)(case, id="-".join(filter(None, name)))
+        for case, name in zip(scenario_cases(num_robots), names, strict=True)
     ]
 
 

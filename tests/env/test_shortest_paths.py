@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from env_support import slow
 from shortest_support import visible_lengths
 
 from d4orm_env import Problem, Team, World, make_problem, rollout
@@ -47,7 +48,7 @@ def scattered_world(random: np.random.Generator) -> World:
     return World(circles=circles[np.minimum(*away) > circles[:, 2] + 0.5], polygons=stars)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 9))])
+@pytest.mark.parametrize("seed", [0, 1, 2, *(slow(seed) for seed in range(3, 9))])
 def test_lengths_are_those_of_visibility_graphs_to_two_percent(seed: int) -> None:
     random = np.random.default_rng(seed)
     world = scattered_world(random) if seed % 3 == 0 else cells_world(random, random.choice([0.15, 0.25, 0.35]))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planner_support import hop_problem
@@ -243,7 +244,7 @@ def parked_cars(*, beside: float) -> Problem:
     return Problem(Team(("car", "car")), start, np.float32([[0, beside], [0, -1]]), horizon=100, margin=0.05)
 
 
-@pytest.mark.parametrize("beside", [0.1, pytest.param(0.3, marks=pytest.mark.slow), 0.6])
+@pytest.mark.parametrize("beside", [0.1, slow(0.3), 0.6])
 def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> None:
     """Within its turning circle there is no path home that does not lead away first."""
     problem, arrived = parked_cars(beside=beside), np.array([False, True])
@@ -429,7 +430,7 @@ def test_an_episode_tells_how_late_commands_are(disturbance: Any, late: int) -> 
     assert policy._deviation.latency.steps == late
 
 
-@pytest.mark.parametrize("scenario", ["random", pytest.param("circle", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scenario", ["random", slow("circle")])
 @pytest.mark.parametrize(
     "disturbance", [Push(0.4, 0.3), LimitMismatch(0.7), Bias(0.15)], ids=lambda one: type(one).__name__
 )
@@ -452,22 +453,8 @@ def test_a_robot_that_has_stalled_is_driven_around() -> None:
     np.testing.assert_array_equal(executed.trajectory.arrived[-1], ~policy._deviation.stall.robots)
 
 
-@pytest.mark.parametrize(
-    ("model", "lifelong"),
-    [
-        ("holonomic2d", False),
-        ("velocity2d", True),
-        *(
-            pytest.param(model, lifelong, marks=pytest.mark.slow)
-            for model, lifelong in [
-                ("velocity2d", False),
-                ("holonomic2d", True),
-                ("differential_drive", False),
-                ("differential_drive", True),
-            ]
-        ),
-    ],
-)
+@pytest.mark.parametrize("lifelong", [False, True], ids=["once", "lifelong"])
+@pytest.mark.parametrize("model", ["velocity2d", slow("holonomic2d"), slow("differential_drive")])
 def test_finding_out_changes_nothing_while_all_is_as_believed(model: str, lifelong: bool) -> None:
     problem = make_problem("circle", num_robots=4, model=model)
     options: dict[str, Any] = {"problem": problem, "lifelong": lifelong, "max_cycles": 120 if lifelong else None}

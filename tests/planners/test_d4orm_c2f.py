@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
@@ -33,9 +34,9 @@ from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [
-    pytest.param({"scenario": "circle", "num_robots": 16, "horizon": 150}, id="circle-16", marks=pytest.mark.slow),
+    slow({"scenario": "circle", "num_robots": 16, "horizon": 150}, id="circle-16"),
     pytest.param({"scenario": "four_obstacles", "num_robots": 12}, id="four-obstacles-12"),
-    pytest.param({"scenario": "random", "num_robots": 16}, id="random-16", marks=pytest.mark.slow),
+    slow({"scenario": "random", "num_robots": 16}, id="random-16"),
     pytest.param({"scenario": "swap", "num_robots": 8}, id="swap-8"),
     pytest.param({"scenario": "circle", "num_robots": 8, "model": "differential_drive"}, id="differential-drive-8"),
     pytest.param({"scenario": "circle", "num_robots": 8, "model": "velocity2d"}, id="velocity2d-8"),
@@ -106,7 +107,7 @@ def test_how_coarse_the_guidance_is_may_be_chosen(config: dict[str, int]) -> Non
 
 
 @pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, slow(1)])
 def test_noise_that_ruins_a_plan_is_made_up_for(model: str, seed: int) -> None:
     problem = circle(8, model=model)
     assert episode(controller(), problem, seed=seed, control_noise_std=0.3).metrics["success"]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 from planner_support import hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
@@ -46,7 +47,7 @@ def assert_solves(case: dict[str, Any], seed: int, name: str = "d4orm-d", **conf
     assert report.ok, report.violations
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, slow(1)])
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("name", ["d4orm-d", "hybrid"])
 def test_default_settings_solve(name: str, case: dict[str, Any], seed: int) -> None:

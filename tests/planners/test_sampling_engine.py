@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, RecordedRules, cpu_rewards, engine_noise, toward_goals
-from env_support import mixed_problem
+from env_support import mixed_problem, slow
 from reference import ROUNDOFF, evaluate, position_error
 from scenario_support import needed
 
@@ -204,15 +204,6 @@ def assert_rewards(task: SamplingTask, controls: np.ndarray, rewards: np.ndarray
 ENGINES = {"cpu": CPU, "jax": JAX}
 
 
-def on_both(cases: list[tuple[Any, ...]], quick_on_jax: tuple[int, ...]) -> Any:
-    """Cases for each engine. JAX compiles every one of them, and most are slow there; those named by number are not."""
-    dear = [() if number in quick_on_jax else pytest.mark.slow for number in range(len(cases))]
-    return [
-        *(pytest.param(*case, "cpu") for case in cases),
-        *(pytest.param(*case, "jax", marks=marks) for case, marks in zip(cases, dear, strict=True)),
-    ]
-
-
 STEPPED = [
     ("mixed", "robot"),
     ("harder", "team"),
@@ -239,7 +230,15 @@ STEPPED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "credit", "engine"), on_both(STEPPED, quick_on_jax=(0, 1, 2, 3, 4)))
+# JAX compiles for seconds for every one of them.
+@pytest.mark.parametrize(
+    ("name", "credit", "engine"),
+    [
+        *((*case, "cpu") for case in STEPPED),
+        *((*case, "jax") for case in STEPPED[:5]),
+        *(slow(*case, "jax") for case in STEPPED[5:]),
+    ],
+)
 def test_every_step_is_that_of_the_reference(name: str, credit: str, engine: str) -> None:
     step_by_step(ENGINES[engine], replace(TASKS[name](), credit=credit))
 
@@ -266,17 +265,20 @@ def test_so_it_is_in_every_scenario(scenario: str, engine: str) -> None:
     step_by_step(ENGINES[engine], task, sigma=(0.6, 0.2))
 
 
-@pytest.mark.parametrize(("num_samples", "engine"), on_both([(2,), (65,)], quick_on_jax=(1,)))
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
+@pytest.mark.parametrize("num_samples", [slow(2), 65])
 def test_so_it_is_with_any_number_of_samples(num_samples: int, engine: str) -> None:
     step_by_step(ENGINES[engine], TASKS["alone"](), num_samples=num_samples)
 
 
-@pytest.mark.parametrize(("credit", "engine"), on_both([("robot",), ("team",)], quick_on_jax=(0,)))
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
+@pytest.mark.parametrize("credit", ["team", slow("robot")])
 def test_so_it_is_with_importance(credit: str, engine: str) -> None:
     step_by_step(ENGINES[engine], replace(TASKS["holonomic2d"](), credit=credit), SOFTMAX._replace(importance=0.05))
 
 
-@pytest.mark.parametrize(("credit", "engine"), on_both([("robot",), ("team",)], quick_on_jax=(1,)))
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
+@pytest.mark.parametrize("credit", ["team", slow("robot")])
 def test_so_it_is_where_the_noise_follows_the_spread_of_the_samples(credit: str, engine: str) -> None:
     rules = SamplingRules(EliteWeights(0.1), Spread(0.05))
     step_by_step(ENGINES[engine], replace(TASKS["holonomic2d"](), credit=credit), rules)
@@ -386,9 +388,8 @@ class Spread:
         return xp.sqrt(xp.maximum(deviation2, 0)) + self.floor
 
 
-@pytest.mark.parametrize(
-    ("name", "credit", "engine"), on_both([("holonomic2d", "team"), ("holonomic3d", "robot")], quick_on_jax=(1,))
-)
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
+@pytest.mark.parametrize(("name", "credit"), [slow("holonomic2d", "team"), ("holonomic3d", "robot")])
 def test_importance_weighs_by_how_likely_a_sample_is_around_zero(name: str, credit: str, engine: str) -> None:
     """The term is the logarithm of a ratio of densities, written out here from the samples themselves."""
     task = replace(TASKS[name](), credit=credit)
@@ -475,7 +476,8 @@ def bursting_controls(task: SamplingTask, burst: Burst) -> Any:
     return sampled_controls(task, mean, burst(0, np), 4, 1)
 
 
-@pytest.mark.parametrize(("credit", "engine"), on_both([("robot",), ("team",)], quick_on_jax=(0,)))
+@pytest.mark.parametrize("engine", ENGINE_NAMES)
+@pytest.mark.parametrize("credit", ["robot", slow("team")])
 def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credit: str, engine: str) -> None:
     """A quarter of the samples in each tile gets a control whose square is infinite: its robot is nowhere."""
     task = replace(TASKS["obstacles"](), credit=credit)
