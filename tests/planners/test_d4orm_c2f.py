@@ -27,6 +27,7 @@ from d4orm_planners.base.background import Background
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
+from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
@@ -408,6 +409,20 @@ def test_robots_within_the_margin_of_each_other_part() -> None:
     problem = Problem(Team(("holonomic2d",) * 2), start, start[:, :2] + [[-1, 0], [1, 0]], horizon=60, margin=0.05)
     executed = episode(controller(), problem)
     assert executed.metrics["success"], executed.metrics
+
+
+def test_who_is_led_to_its_goal_and_has_not_docked_drives_straight_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def recorded(*arguments: Any) -> Any:
+        asked.append(arguments[-2:])
+        return direct_final_approach(*arguments)
+
+    monkeypatch.setattr("d4orm_planners.d4orm_c2f.fine_plan.direct_final_approach", recorded)
+    assert episode(controller(), circle(2)).metrics["success"]
+    assert not asked[0][0].any()
+    assert asked[-1][0].any()
+    assert not any((near & arrived).any() for near, arrived in asked)
 
 
 def test_undisturbed_robots_are_where_they_are_expected() -> None:
