@@ -35,7 +35,7 @@ from d4orm_planners.d4orm_c2f.estimators import (
 )
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.sampling_types import get_sampling_engine
-from d4orm_planners.tracking.steering import track_velocities
+from d4orm_planners.tracking.steering import NEAR_VIA, drives, track_velocities
 
 ALL = np.ones(3, bool)
 
@@ -255,6 +255,22 @@ def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> Non
     assert np.linalg.norm(positions - problem.goal[0], axis=1).max() > beside + 0.05
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=0.2)
     assert run_episode(env, controller(), seed=0).metrics["success"]
+
+
+def test_manoeuvres_lead_by_points_a_quarter_one_and_two_turning_radii_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    window, tried = parked_cars(beside=0.1).replace(horizon=20), []
+
+    def recorded(*arguments: Any) -> Any:
+        tried.append(arguments[-1])
+        return drives(*arguments)
+
+    monkeypatch.setattr("d4orm_planners.d4orm_c2f.direct_final_approach.drives", recorded)
+    nobody, still = np.zeros(2, bool), np.zeros((20, 2, 2), np.float32)
+    direct_final_approach(window, get_sampling_engine("cpu"), still, nobody, np.array([False, True]))
+    away = np.linalg.norm(tried[0][0, :, 0] - window.start[0, :2], axis=1).reshape(-1, 16)
+    beyond = away - NEAR_VIA * window.team.largest_radius
+    expected = np.array([[0.25], [1.0], [2.0]]) * window.team.turning_radius[0]
+    np.testing.assert_allclose(beyond, np.broadcast_to(expected, (3, 16)), rtol=1e-5)
 
 
 def test_no_manoeuvre_leads_through_what_stands() -> None:
