@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from engine_support import random_controls
+from env_support import mixed_problem
 
 from d4orm_env import make_problem
 from d4orm_env.core.problem import Problem
@@ -51,7 +52,7 @@ def every_model(world: World | None = WALLS) -> Problem:
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "models": every_model,
-    "index": lambda: make_problem("circle", num_robots=2, model="velocity2d", horizon=12).replace(world=MANY),
+    "index": lambda: mixed_problem().replace(horizon=12, world=MANY),
     "space": lambda: make_problem("sphere", num_robots=2, horizon=12).replace(world=SPACE),
 }
 RULES = {

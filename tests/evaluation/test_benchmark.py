@@ -292,8 +292,7 @@ def python(folder: Path, *arguments: str, **environment: str) -> str:
 def test_the_process_that_compiles_plans_what_later_ones_plan(tmp_path: Path) -> None:
     # numba tells what it writes.
     settings = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_DEBUG_CACHE": "1"}
-    program = PLAN.replace("heterogeneous", "circle")
-    first, later = (python(tmp_path, "-c", program, **settings).splitlines() for _ in range(2))
+    first, later = (python(tmp_path, "-c", PLAN, **settings).splitlines() for _ in range(2))
     assert "data saved to" in "".join(first[:-1])
     assert "data saved to" not in "".join(later[:-1])
     assert len(first[-1]) == 64

@@ -75,6 +75,6 @@ def test_ellipsoids_fly_over_each_other_with_room() -> None:
 
 @pytest.mark.slow
 def test_c2f_executes_them() -> None:
-    problem = boxes(2, horizon=150, goal_heading=0.0)
+    problem = boxes(horizon=150, goal_heading=0.0)
     episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("d4orm-c2f", refine="sync"), seed=0)
     assert episode.metrics["success"] == 1.0
