@@ -12,19 +12,6 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 
 
-def scenario_cases(num_robots: int) -> list[dict[str, Any]]:
-    """Arguments of every scenario; where there is a choice of models they take turns, so that all are met."""
-    models: dict[str, list[str | None]] = {}
-    for scenario, model in scenario_models():
-        models.setdefault(scenario, []).append(model)
-    cases: list[dict[str, Any]] = []
-    for number, (scenario, choice) in enumerate(models.items()):
-        size = {} if scenario.startswith("amswarm") else {"num_robots": num_robots}
-        model = choice[number % len(choice)]
-        cases.append({"scenario": scenario, **size, **({} if model is None else {"model": model}), **needed(scenario)})
-    return cases
-
-
 def slow(*values: Any, **named: Any) -> Any:
     """One more case of what quick tests cover, which only ``make test-all`` runs."""
     return pytest.param(*values, marks=pytest.mark.slow, **named)
@@ -35,12 +22,17 @@ QUICK = ("circle", "swap", "random", "sphere", "heterogeneous", "warehouse", "fo
 
 
 def scenario_params(num_robots: int) -> list[Any]:
-    """``scenario_cases`` by their names, as parameters of a test."""
-    names = [[case["scenario"], case.get("model")] for case in scenario_cases(num_robots)]
-    return [
-        (pytest.param if name[0] in QUICK else slow)(case, id="-".join(filter(None, name)))
-        for case, name in zip(scenario_cases(num_robots), names, strict=True)
-    ]
+    """Arguments of every scenario; where there is a choice of models they take turns, so that all are met."""
+    models: dict[str, list[str | None]] = {}
+    for scenario, model in scenario_models():
+        models.setdefault(scenario, []).append(model)
+    cases = []
+    for number, (scenario, choice) in enumerate(models.items()):
+        size = {} if scenario.startswith("amswarm") else {"num_robots": num_robots}
+        model = choice[number % len(choice)]
+        case = {"scenario": scenario, **size, **({} if model is None else {"model": model}), **needed(scenario)}
+        cases.append((pytest.param if scenario in QUICK else slow)(case, id="-".join(filter(None, (scenario, model)))))
+    return cases
 
 
 def line_problem(distances: list[float], model: str = "velocity2d", **changes: Any) -> Problem:

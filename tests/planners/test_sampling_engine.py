@@ -205,29 +205,13 @@ ENGINES = {"cpu": CPU, "jax": JAX}
 
 
 STEPPED = [
-    ("mixed", "robot"),
-    ("harder", "team"),
-    ("harder, obstacles", "team"),
-    ("docking in space", "team"),
-    ("arrived", "robot"),
-    ("mixed", "team"),
-    *((name, credit) for name in ("holonomic2d", "differential_drive") for credit in CREDITS),
-    ("velocity2d", "robot"),
-    ("holonomic3d", "team"),
-    ("alone", "team"),
-    ("obstacles", "team"),
-    ("space", "robot"),
-    ("docking", "robot"),
-    ("docking drives", "robot"),
-    ("no collisions", "robot"),
-    ("moving", "team"),
-    ("moving, no collisions", "team"),
-    ("moving in space", "robot"),
-    ("harder", "robot"),
-    ("docked, moving", "team"),
-    ("all docked", "team"),
-    ("all docked, moving", "robot"),
-]
+    ("mixed", "robot"), ("harder", "team"), ("harder, obstacles", "team"), ("docking in space", "team"),
+    ("arrived", "robot"), ("mixed", "team"), ("harder", "robot"), ("velocity2d", "robot"), ("holonomic3d", "team"),
+    *((name, credit) for name in ("holonomic2d", "differential_drive") for credit in CREDITS), ("alone", "team"),
+    ("obstacles", "team"), ("space", "robot"), ("docking", "robot"), ("docking drives", "robot"), ("moving", "team"),
+    ("no collisions", "robot"), ("moving, no collisions", "team"), ("moving in space", "robot"), ("all docked", "team"),
+    ("docked, moving", "team"), ("all docked, moving", "robot"),
+]  # fmt: skip
 
 
 # JAX compiles for seconds for every one of them.
