@@ -411,6 +411,17 @@ def test_robots_within_the_margin_of_each_other_part() -> None:
     assert executed.metrics["success"], executed.metrics
 
 
+def test_who_gets_no_nearer_has_lost_the_guidance() -> None:
+    env, policy = navigation_v0.parallel_env(problem=circle(1)), controller(replan_distance=500.0, stalls=False)
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    for _ in range(50):
+        policy.act(observations, env.state())
+        observations = env.step({"robot_0": np.zeros(2, np.float32)})[0]  # something holds it
+    first, second = np.flatnonzero([loop.replanned for loop in policy.loops])
+    assert 15 <= second - first < 20, "sooner than one is stuck"
+
+
 def test_who_is_led_to_its_goal_and_has_not_docked_drives_straight_in(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
