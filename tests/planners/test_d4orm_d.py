@@ -216,8 +216,8 @@ def test_who_arrives_without_conflict_was_not_repaired_in_vain() -> None:
 
 
 def test_teams_of_more_than_32_are_sampled_half_as_often() -> None:
-    for robots, samples in ((32, 256), (33, 128)):
-        search = search_of(make_problem("random", num_robots=robots, size=12.0), num_samples=256)
+    for robots, given, samples in ((32, 256, 256), (33, 256, 128), (33, 3, 2)):
+        search = search_of(make_problem("random", num_robots=robots, size=12.0), num_samples=given)
         assert isinstance(search.planner, D4ormD)
         assert search.planner.num_samples(search) == samples
 
