@@ -5,27 +5,34 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from scenario_support import needed, scenario_models
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 
 
-def scenario_cases(num_robots: int) -> list[dict[str, Any]]:
+def slow(*values: Any, **named: Any) -> Any:
+    """One more case of what quick tests cover, which only ``make test-all`` runs."""
+    return pytest.param(*values, marks=pytest.mark.slow, **named)
+
+
+QUICK = ("circle", "swap", "random", "sphere", "heterogeneous", "warehouse", "four_obstacles")
+"""One scenario of every kind of team and of world; the others are slow where what is tested hardly depends on it."""
+
+
+def scenario_params(num_robots: int) -> list[Any]:
     """Arguments of every scenario; where there is a choice of models they take turns, so that all are met."""
     models: dict[str, list[str | None]] = {}
     for scenario, model in scenario_models():
         models.setdefault(scenario, []).append(model)
-    cases: list[dict[str, Any]] = []
+    cases = []
     for number, (scenario, choice) in enumerate(models.items()):
         size = {} if scenario.startswith("amswarm") else {"num_robots": num_robots}
         model = choice[number % len(choice)]
-        cases.append({"scenario": scenario, **size, **({} if model is None else {"model": model}), **needed(scenario)})
+        case = {"scenario": scenario, **size, **({} if model is None else {"model": model}), **needed(scenario)}
+        cases.append((pytest.param if scenario in QUICK else slow)(case, id="-".join(filter(None, (scenario, model)))))
     return cases
-
-
-def case_name(case: dict[str, Any]) -> str:
-    return "-".join(str(value) for key, value in case.items() if key in ("scenario", "model"))
 
 
 def line_problem(distances: list[float], model: str = "velocity2d", **changes: Any) -> Problem:

@@ -29,7 +29,7 @@ CHEAP = {
     "repair_steps": 5,
     "refine": "sync",
     "rounds": 2,
-    "solver_iterations": 60,
+    "solver_iterations": 20,
     "alternations": 10,
 }
 """Settings that plan in no time, badly, and the same every time."""

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from env_support import case_name, line_problem, mixed_problem, sampled_actions, scenario_cases
+from env_support import line_problem, mixed_problem, sampled_actions, scenario_params
 from pettingzoo.test import (
     api_test,
     max_cycles_test,
@@ -21,7 +21,7 @@ from pettingzoo.test.state_test import state_test
 from d4orm_env import navigation_v0
 from d4orm_env.envs.wrappers import GaussianControlNoise
 
-SCENARIOS = scenario_cases(num_robots=3)
+SCENARIOS = scenario_params(num_robots=3)
 VARIANTS: list[dict[str, Any]] = [
     {"problem": line_problem([0.3, 0.5, 0.8], "holonomic2d", goal_radius=0.25)},
     {"problem": mixed_problem()},
@@ -33,7 +33,7 @@ VARIANTS: list[dict[str, Any]] = [
 ]
 VARIANT_NAMES = ["early-arrivals", "mixed-team", "one-robot", "lifelong", "noise", "new-instances", "blind"]
 CASES = [
-    *(pytest.param(case, id=case_name(case)) for case in SCENARIOS),
+    *SCENARIOS,
     *(pytest.param(case, id=name) for case, name in zip(VARIANTS, VARIANT_NAMES, strict=True)),
 ]
 
@@ -69,7 +69,7 @@ def test_render(case: dict[str, Any]) -> None:
     render_test(partial(navigation_v0.env, **case))
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=case_name(case)) for case in SCENARIOS])
+@pytest.mark.parametrize("case", SCENARIOS)
 def test_max_cycles(case: dict[str, Any]) -> None:
     module = SimpleNamespace(
         parallel_env=partial(navigation_v0.parallel_env, **case), env=partial(navigation_v0.env, **case)

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 from disturbance_support import CASES, TOGETHER, Wind
-from env_support import line_problem, mixed_problem, sampled_actions, straight_drive
+from env_support import line_problem, mixed_problem, sampled_actions, slow, straight_drive
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
@@ -95,7 +95,7 @@ def joint_worlds(count: int, case: dict[str, Any]) -> list[JointNavigationEnv]:
     return [JointNavigationEnv(**case) for _ in range(count)]
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP], ids=lambda mode: mode.value)
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, slow(AutoresetMode.SAME_STEP)], ids=lambda mode: mode.value)
 @pytest.mark.parametrize("disturbances", [*([case] for case in CASES.values()), TOGETHER], ids=[*CASES, "together"])
 def test_batched_worlds_are_the_joint_env_to_the_bit(disturbances: list[Any], mode: AutoresetMode) -> None:
     case = {"scenario": "random", "num_robots": 4, "max_cycles": 14, "disturbances": disturbances, "observed_rays": 3}

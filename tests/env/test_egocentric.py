@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from env_support import mixed_problem
+from env_support import mixed_problem, slow
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.core.observation_layout import ObservationSlices
@@ -32,7 +32,7 @@ def steer(features: np.ndarray) -> np.ndarray:
     return np.tanh(np.stack([1 + features[:, 0], features[:, 12] - features[:, 9]], axis=1)).astype(np.float32)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", [slow("holonomic2d"), "differential_drive"])
 def test_all_environments_show_and_do_the_same(model: str) -> None:
     problem, random = make_problem("random", num_robots=3, seed=2, model=model), np.random.default_rng(0)
     options: dict[str, Any] = {"problem": problem, "reward": "training", "egocentric": True, "max_cycles": 12}

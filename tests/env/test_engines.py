@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, MODEL_NAMES, NUMPY_OPS, open_problem, random_controls, toward_goals
-from env_support import case_name, mixed_problem, scenario_cases
+from env_support import mixed_problem, scenario_params
 
 from d4orm_env import rollout
 from d4orm_env.core.problem import Problem
@@ -77,7 +77,7 @@ def assert_same_motion(first: Trajectory, second: Trajectory) -> None:
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=case_name(case)) for case in scenario_cases(4)])
+@pytest.mark.parametrize("case", scenario_params(4))
 def test_engines_roll_out_alike(case: dict[str, Any]) -> None:
     problem = make_problem(**case, horizon=HORIZON, dt=0.3)
     # Not at full throttle, under which some stand at exactly the margin of each other.

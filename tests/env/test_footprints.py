@@ -242,7 +242,7 @@ def test_discs_and_balls_round_bodies_hide_no_gap_from_the_judge(
     make: Callable[[], Problem], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, contacts = make(), set()
-    held = np.random.default_rng(0).normal(size=(6, 6, problem.num_robots, problem.control_size))
+    held = np.random.default_rng(0).normal(size=(3, 6, problem.num_robots, problem.control_size))
     plans = np.repeat(held, 10, axis=1)
     reports = [verify(problem, plan) for plan in plans]
     for watch in (TurningPairs, Obstacles, Sides):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from env_support import mixed_problem
+from env_support import mixed_problem, slow
 
 from d4orm_env import make_problem
 from d4orm_env.core.problem import Problem
@@ -88,7 +88,7 @@ def test_the_kernel_counts_those_who_are_near(name: str) -> None:
     assert counts.any()
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", [slow(m) if m.startswith(("car_with_1", "car_with_2")) else m for m in MODELS])
 def test_a_denoising_run_is_one_loop_of_few_kernels_on_a_gpu(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     lowered: list[str] = []
 

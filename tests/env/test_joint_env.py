@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from env_support import case_name, line_problem, mixed_problem, scenario_cases, straight_drive
+from env_support import line_problem, mixed_problem, scenario_params, straight_drive
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
 from d4orm_env import navigation_v0
@@ -30,7 +30,7 @@ def check(**arguments: Any) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=case_name(case)) for case in scenario_cases(3)])
+@pytest.mark.parametrize("case", scenario_params(3))
 def test_gymnasium_accepts_it(case: dict[str, Any]) -> None:
     check(**case)
 

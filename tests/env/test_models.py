@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, PYTHON_OPS, observe_team, random_controls
+from env_support import slow
 from registry_support import forgetting
 
 from d4orm_env import Problem, Team, load_problem, make_problem, register_model, rollout, save_problem, verify
@@ -282,7 +283,7 @@ def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion(name:
     assert (found.bend <= 2 * acceleration + 0.1).all()
 
 
-@pytest.mark.parametrize("scale", [0.3, 30.0])
+@pytest.mark.parametrize("scale", [slow(0.3), 30.0])
 @pytest.mark.parametrize("name", MODELS)
 def test_the_judge_integrates_all_steps_at_once_as_one_after_another(
     name: str, scale: float, monkeypatch: pytest.MonkeyPatch

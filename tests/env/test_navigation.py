@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from env_support import (
     act,
-    case_name,
     line_problem,
     mixed_problem,
     sampled_actions,
-    scenario_cases,
+    scenario_params,
     straight_drive,
 )
 from gymnasium.utils.env_checker import data_equivalence
@@ -40,7 +39,7 @@ def run(env: Any, controls: np.ndarray, seed: int | None = 0) -> list[tuple[Any,
     return log
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=case_name(case)) for case in scenario_cases(5)])
+@pytest.mark.parametrize("case", scenario_params(5))
 def test_stepping_a_plan_gives_its_trajectory(case: dict[str, Any]) -> None:
     env = navigation_v0.parallel_env(**case, randomize_instance=False)
     problem = env.unwrapped.problem

@@ -67,7 +67,7 @@ worlds = given(
 
 
 @worlds
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int, radius: float) -> None:
     world = random_world(seed, dimension, count)
     points = np.random.default_rng(seed).uniform(-7, 7, (200, dimension))
@@ -78,9 +78,15 @@ def test_index_finds_the_nearest_obstacle(seed: int, dimension: int, count: int,
         np.testing.assert_array_equal(world.is_clear(points, distance), all_clearances(world, points) > distance)
 
 
+def test_distances_of_a_size_share_an_index_with_four_cells_for_each_and_one_round_who_observes() -> None:
+    world = random_world(1, 2, 5)
+    assert world.index(0.9) is world.index(0.6)
+    assert (world.index(0.9).scale, world.index(0.9, positions=np.zeros((1, 2))).scale) == (4, 1)
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_crowded_cells_keep_only_who_can_be_nearest(dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    shapes, points = random_world(5, dimension, 400).shapes, np.random.default_rng(5).uniform(-5, 5, (20000, dimension))
+    shapes, points = random_world(5, dimension, 400).shapes, np.random.default_rng(5).uniform(-5, 5, (4000, dimension))
     short = build_index(shapes, 0.25, 1.0)
     monkeypatch.setattr("d4orm_env.geometry.grid_refinement.CROWDED", 10**6)
     long = build_index(shapes, 0.25, 1.0)
@@ -91,7 +97,7 @@ def test_crowded_cells_keep_only_who_can_be_nearest(dimension: int, monkeypatch:
 
 @pytest.mark.parametrize("nearest", [3, FEW + 3])
 @worlds
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_index_finds_several_of_the_nearest(nearest: int, seed: int, dimension: int, count: int, radius: float) -> None:
     world = random_world(seed, dimension, count)
     index, random = world.index(radius, nearest=nearest), np.random.default_rng(seed)

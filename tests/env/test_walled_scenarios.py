@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 from scenario_support import WALLED, needed
 
 from d4orm_env import Problem, verify
@@ -88,7 +89,7 @@ def one_after_another(problem: Problem, order: Any) -> tuple[Problem, Any]:
 
 
 @pytest.mark.parametrize("name", WALLED)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, slow(1)])
 def test_one_after_another_everybody_arrives_in_any_order(name: str, seed: int) -> None:
     problem = make_problem(name, 4, seed, model="velocity2d", **needed(name))
     order = np.random.default_rng(seed).permutation(4)

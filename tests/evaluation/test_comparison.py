@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from examples.common import holm, penalised_steps, steps_to_solution
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from d4orm_planners.evaluation.comparison import paired, survival
@@ -82,6 +82,7 @@ def test_a_curve_never_rises(costs: list[int | None]) -> None:
         assert curve.unsolved[-1] == pytest.approx(costs.count(None) / len(costs))
 
 
+@settings(max_examples=20)
 @given(st.lists(st.tuples(*[st.one_of(st.none(), st.integers(1, 50))] * 2), min_size=1, max_size=60))
 def test_who_is_compared_with_itself_differs_in_nothing(costs: list[tuple[int | None, int | None]]) -> None:
     first, second = (trials(list(column)) for column in zip(*costs, strict=True))

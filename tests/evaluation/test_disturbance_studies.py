@@ -247,9 +247,9 @@ def test_the_files_of_a_study(tmp_path: Path) -> None:
     assert "| own thing | 1 | 1 |" in text
     # The undisturbed trials have one row for each policy.
     assert markdown(success_rates(groups)).count("| - | 3 of 3 (100%)") == 2
-    assert len(write_disturbances(tmp_path, [one for one in groups if one.label == "a"])) == 8
+    assert len(write_disturbances(tmp_path, [one for one in groups[:2] if one.label == "a"])) == 8
     again = [replace(trial, scenario="swap") for trial in groups[0].trials]
-    names = {path.name for path in write_disturbances(tmp_path, [*groups, groups[0]._replace(trials=again)])}
+    names = {path.name for path in write_disturbances(tmp_path, [*groups[:2], groups[0]._replace(trials=again)])}
     assert {"disturbances-1.pdf", "disturbances-2.pdf"} < names
 
 
@@ -308,6 +308,7 @@ def test_the_command_line(d4orm: Call, tmp_path: Path) -> None:
     assert len(TrialStore.existing(tmp_path / "evaluation").trials()) == 2 * 2 * 4
 
 
+@pytest.mark.slow
 def test_robustness_is_a_study_of_all(d4orm: Call, tmp_path: Path) -> None:
     status, out, _ = d4orm("robustness", "--policy", "go-to-goal", "-k", "2", "--seeds", "1", "--workers", "1")
     assert status == 0

@@ -369,6 +369,7 @@ def test_the_files_equal_the_store(d4orm, tmp_path: Path) -> None:
         assert len(list(csv.DictReader(file))) == 2 * 2 * 2 * 2
 
 
+@pytest.mark.slow
 def test_ten_thousand_rows_are_exported(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     store = TrialStore(tmp_path / STORE)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planner_support import hop_problem
@@ -34,7 +35,7 @@ from d4orm_planners.d4orm_c2f.estimators import (
 )
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.sampling_types import get_sampling_engine
-from d4orm_planners.tracking.steering import track_velocities
+from d4orm_planners.tracking.steering import NEAR_VIA, drives, track_velocities
 
 ALL = np.ones(3, bool)
 
@@ -243,7 +244,7 @@ def parked_cars(*, beside: float) -> Problem:
     return Problem(Team(("car", "car")), start, np.float32([[0, beside], [0, -1]]), horizon=100, margin=0.05)
 
 
-@pytest.mark.parametrize("beside", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("beside", [0.1, slow(0.3), 0.6])
 def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> None:
     """Within its turning circle there is no path home that does not lead away first."""
     problem, arrived = parked_cars(beside=beside), np.array([False, True])
@@ -254,6 +255,22 @@ def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> Non
     assert np.linalg.norm(positions - problem.goal[0], axis=1).max() > beside + 0.05
     env = navigation_v0.parallel_env(problem=problem, control_noise_std=0.2)
     assert run_episode(env, controller(), seed=0).metrics["success"]
+
+
+def test_manoeuvres_lead_by_points_a_quarter_one_and_two_turning_radii_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    window, tried = parked_cars(beside=0.1).replace(horizon=20), []
+
+    def recorded(*arguments: Any) -> Any:
+        tried.append(arguments[-1])
+        return drives(*arguments)
+
+    monkeypatch.setattr("d4orm_planners.d4orm_c2f.direct_final_approach.drives", recorded)
+    nobody, still = np.zeros(2, bool), np.zeros((20, 2, 2), np.float32)
+    direct_final_approach(window, get_sampling_engine("cpu"), still, nobody, np.array([False, True]))
+    away = np.linalg.norm(tried[0][0, :, 0] - window.start[0, :2], axis=1).reshape(-1, 16)
+    beyond = away - NEAR_VIA * window.team.largest_radius
+    expected = np.array([[0.25], [1.0], [2.0]]) * window.team.turning_radius[0]
+    np.testing.assert_allclose(beyond, np.broadcast_to(expected, (3, 16)), rtol=1e-5)
 
 
 def test_no_manoeuvre_leads_through_what_stands() -> None:
@@ -429,7 +446,7 @@ def test_an_episode_tells_how_late_commands_are(disturbance: Any, late: int) -> 
     assert policy._deviation.latency.steps == late
 
 
-@pytest.mark.parametrize("scenario", ["circle", "random"])
+@pytest.mark.parametrize("scenario", ["random", slow("circle")])
 @pytest.mark.parametrize(
     "disturbance", [Push(0.4, 0.3), LimitMismatch(0.7), Bias(0.15)], ids=lambda one: type(one).__name__
 )
@@ -453,12 +470,13 @@ def test_a_robot_that_has_stalled_is_driven_around() -> None:
 
 
 @pytest.mark.parametrize("lifelong", [False, True], ids=["once", "lifelong"])
-@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "velocity2d"])
+@pytest.mark.parametrize("model", ["velocity2d", slow("holonomic2d"), slow("differential_drive")])
 def test_finding_out_changes_nothing_while_all_is_as_believed(model: str, lifelong: bool) -> None:
     problem = make_problem("circle", num_robots=4, model=model)
     options: dict[str, Any] = {"problem": problem, "lifelong": lifelong, "max_cycles": 120 if lifelong else None}
     known = {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "last_resort": False}
     known["expect_losses"] = False
+    assert controller().config.last_resort, "by default all of it is found out"
     plain, watchful = (
         run_episode(navigation_v0.parallel_env(**options), controller(**config), seed=0) for config in (known, {})
     )

@@ -178,7 +178,7 @@ def test_a_subgoal_behind_a_corner_is_exchanged_for_one_in_sight(walls: bool) ->
 
 def test_who_stands_in_the_way_of_a_subgoal_hides_it() -> None:
     problem = hop_problem(2)
-    path, positions = right_angle(2), np.array([[0, 0], [0.5, 0.5]], np.float32)
+    path, positions = right_angle(2), np.array([[0, 0], [0.65, 0.35]], np.float32)
     indices, targets = np.zeros(2, int), np.full(2, 40)
     for standing in (False, True):
         nearer = visible_subgoals(problem, positions, path, indices, targets, np.array([False, standing]), walls=False)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -42,7 +43,7 @@ def driven(controller: Controller, problem: Problem, disturbances: Any = (), see
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("mode", ["nominal", "measured"])
+@pytest.mark.parametrize("mode", ["nominal", slow("measured")])
 def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> None:
     problem = team(model)
     policy, same = ("d4orm", {}) if model == "unicycle" else ("d4orm-c2f", {"refine": "sync"})
@@ -83,8 +84,9 @@ def test_any_policy_is_within_each_robots_limits(policy: Any) -> None:
 @pytest.mark.parametrize(
     ("mode", "disturbances"),
     [
-        ("measured", [Bias(0.25)]), ("measured", [ControlNoise(0.2)]), ("measured", [Gain(0.1)]),
-        ("measured", [StateNoise(0.01, 0.02)]), ("nominal", [ControlNoise(0.2)]), ("nominal", [StateNoise(0.01, 0.02)]),
+        ("measured", [Bias(0.25)]), slow("measured", [ControlNoise(0.2)]), slow("measured", [Gain(0.1)]),
+        ("measured", [StateNoise(0.01, 0.02)]), ("nominal", [ControlNoise(0.2)]),
+        slow("nominal", [StateNoise(0.01, 0.02)]),
     ],
 )  # fmt: skip
 def test_disturbed_robots_arrive(mode: Any, disturbances: list[Any]) -> None:

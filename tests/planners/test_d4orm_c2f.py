@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
@@ -26,6 +27,7 @@ from d4orm_planners.base.background import Background
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
+from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
@@ -33,9 +35,9 @@ from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [
-    pytest.param({"scenario": "circle", "num_robots": 16, "horizon": 150}, id="circle-16"),
+    slow({"scenario": "circle", "num_robots": 16, "horizon": 150}, id="circle-16"),
     pytest.param({"scenario": "four_obstacles", "num_robots": 12}, id="four-obstacles-12"),
-    pytest.param({"scenario": "random", "num_robots": 16}, id="random-16"),
+    slow({"scenario": "random", "num_robots": 16}, id="random-16"),
     pytest.param({"scenario": "swap", "num_robots": 8}, id="swap-8"),
     pytest.param({"scenario": "circle", "num_robots": 8, "model": "differential_drive"}, id="differential-drive-8"),
     pytest.param({"scenario": "circle", "num_robots": 8, "model": "velocity2d"}, id="velocity2d-8"),
@@ -106,7 +108,7 @@ def test_how_coarse_the_guidance_is_may_be_chosen(config: dict[str, int]) -> Non
 
 
 @pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, slow(1)])
 def test_noise_that_ruins_a_plan_is_made_up_for(model: str, seed: int) -> None:
     problem = circle(8, model=model)
     assert episode(controller(), problem, seed=seed, control_noise_std=0.3).metrics["success"]
@@ -409,8 +411,35 @@ def test_robots_within_the_margin_of_each_other_part() -> None:
     assert executed.metrics["success"], executed.metrics
 
 
+def test_who_gets_no_nearer_has_lost_the_guidance() -> None:
+    env, policy = navigation_v0.parallel_env(problem=circle(1)), controller(replan_distance=500.0, stalls=False)
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    for _ in range(50):
+        policy.act(observations, env.state())
+        observations = env.step({"robot_0": np.zeros(2, np.float32)})[0]  # something holds it
+    first, second = np.flatnonzero([loop.replanned for loop in policy.loops])
+    assert 15 <= second - first < 20, "sooner than one is stuck"
+
+
+def test_who_is_led_to_its_goal_and_has_not_docked_drives_straight_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def recorded(*arguments: Any) -> Any:
+        asked.append(arguments[-2:])
+        return direct_final_approach(*arguments)
+
+    monkeypatch.setattr("d4orm_planners.d4orm_c2f.fine_plan.direct_final_approach", recorded)
+    assert episode(controller(), circle(2)).metrics["success"]
+    assert not asked[0][0].any()
+    assert asked[-1][0].any()
+    assert not any((near & arrived).any() for near, arrived in asked)
+
+
 def test_undisturbed_robots_are_where_they_are_expected() -> None:
     policy = controller()
+    assert episode(policy, circle(1)).metrics["success"]
+    assert not any(loop.replanned for loop in policy.loops), "it gets nearer all the time"
     assert episode(policy, circle(3)).metrics["success"]
     assert policy._deviation.speed.max() < 1e-4
     assert policy._deviation.speed_slack == 0

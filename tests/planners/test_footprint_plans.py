@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from env_support import slow
 
 from d4orm_env import Problem, make_problem, navigation_v0, rollout, verify
 from d4orm_env.footprints import Box, Capsule, Ellipsoid
@@ -25,7 +26,7 @@ def straight(problem: Problem) -> np.ndarray:
 
 
 @pytest.mark.parametrize("engine", ["cpu", "jax"])
-@pytest.mark.parametrize("footprint", [Box(0.8, 0.1), Capsule(0.6, 0.05)], ids=["box", "capsule"])
+@pytest.mark.parametrize("footprint", [slow(Box(0.8, 0.1), id="box"), Capsule(0.6, 0.05)])
 def test_samples_are_scored_as_they_are_rolled_out(engine: str, footprint: object) -> None:
     """Without noise every sample is the motion itself, among two robots that are not sampled."""
     problem = boxes(horizon=60)
@@ -43,7 +44,7 @@ def test_samples_are_scored_as_they_are_rolled_out(engine: str, footprint: objec
     np.testing.assert_allclose(result.rewards[0], path.rewards[:, :2].mean(), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "hybrid", "mapf"])
+@pytest.mark.parametrize("name", ["d4orm", "d4orm-d", "mapf", slow("hybrid")])
 def test_planners_solve_teams_of_boxes_with_goal_headings(name: str) -> None:
     problem = boxes(horizon=200, goal_heading=[0.0, 1.0, np.nan, -2.0])
     plan = make_planner(name).solve(problem, seed=0, time_limit=60)

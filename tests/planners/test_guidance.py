@@ -8,6 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from env_support import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planner_support import walled_in_problem
@@ -349,10 +350,10 @@ def test_robots_may_pass_walls_closer_than_usual_if_that_is_all_they_find(
 @pytest.mark.parametrize(
     ("scenario", "num_robots", "arguments"),
     [
-        ("rooms", 12, {}), ("maze", 8, {}), ("warehouse", 12, {}), ("corridor", 8, {}), ("doorway", 8, {}),
-        ("rooms", 8, {"model": "unicycle"}), ("rooms", 8, {"model": "velocity2d"}),
-        ("forest", 10, {"model": "differential_drive"}), ("forest", 10, {"model": "holonomic3d"}),
-        ("rooms", 4, {"model": "car"}), ("warehouse", 6, {"model": "car"}),
+        ("rooms", 12, {}), ("maze", 8, {}), slow("warehouse", 12, {}), ("corridor", 8, {}), ("doorway", 8, {}),
+        ("rooms", 8, {"model": "unicycle"}), slow("rooms", 8, {"model": "velocity2d"}),
+        slow("forest", 10, {"model": "differential_drive"}), ("forest", 10, {"model": "holonomic3d"}),
+        slow("rooms", 4, {"model": "car"}), slow("warehouse", 6, {"model": "car"}),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("name", ["mapf", "hybrid"])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -86,7 +87,7 @@ def test_primitives_lead_back_where_they_began(model: str) -> None:
         assert np.abs(ends - end).min() < 1e-9
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 2, slow(3)])
 def test_swings_end_at_the_hitch_angles_of_a_circle(count: int) -> None:
     """There, held to its steering angle, the model goes on in the circle with trailers as they are."""
     kind = kind_of(f"car_with_{count}_trailer" + "s" * (count > 1))

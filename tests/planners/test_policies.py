@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_support import case_name, scenario_cases
+from env_support import scenario_params
 from planner_support import CHEAP, cheap_planner, hop_problem
 
 from d4orm_env import mujoco, navigation_v0
@@ -134,9 +134,8 @@ def test_the_environment_says_what_is_wrong_with_the_answer_of_a_function(bad: A
 
 
 @ALL
-@ENVIRONMENTS
-def test_an_episode_runs_to_its_end(name: str, make_env: Any) -> None:
-    env = make_env(scenario="circle", num_robots=4)
+def test_an_episode_runs_to_its_end(name: str) -> None:
+    env = navigation_v0.parallel_env(scenario="circle", num_robots=4)
     episode = run_episode(env, cheap_policy(name), seed=1)
     assert not env.agents
     steps = len(episode.trajectory.controls)
@@ -161,16 +160,16 @@ def test_the_same_seed_gives_the_same_episode(name: str) -> None:
 
 
 def noisy_circle() -> Any:
-    return navigation_v0.parallel_env(scenario="circle", num_robots=4, control_noise_std=0.2)
+    return navigation_v0.parallel_env(scenario="circle", num_robots=4, control_noise_std=0.2, max_cycles=25)
 
 
 @ALL
 def test_a_policy_forgets_its_last_episode(name: str) -> None:
     policy = cheap_policy(name)
     small, large = make_problem("circle", num_robots=2), make_problem("circle", num_robots=5)
-    run_episode(navigation_v0.parallel_env(problem=small), policy, seed=0)
-    after = run_episode(navigation_v0.parallel_env(problem=large), policy, seed=0)
-    fresh = run_episode(navigation_v0.parallel_env(problem=large), cheap_policy(name), seed=0)
+    run_episode(navigation_v0.parallel_env(problem=small, max_cycles=25), policy, seed=0)
+    env = navigation_v0.parallel_env(problem=large, max_cycles=25)
+    after, fresh = (run_episode(env, each, seed=0) for each in (policy, cheap_policy(name)))
     np.testing.assert_array_equal(after.trajectory.states, fresh.trajectory.states)
 
 
@@ -233,7 +232,7 @@ def test_a_bad_name_or_setting_is_refused(name: str, config: dict[str, Any], mes
 # Open loop.
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=case_name(case)) for case in scenario_cases(4)])
+@pytest.mark.parametrize("case", scenario_params(4))
 def test_open_loop_reproduces_the_plan(case: dict[str, Any]) -> None:
     problem = make_problem(**case)
     plan = cheap_planner("d4orm").solve(problem, seed=0, max_iterations=1)

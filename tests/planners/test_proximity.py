@@ -54,7 +54,7 @@ def bits(masks):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 2**32), num_robots=st.integers(1, 7), num_bodies=st.integers(0, 3), count=st.integers(1, BLOCK),
     spread=st.floats(0, 0.3), samples=st.sampled_from([0.0, 0.05, 0.5, 3.0]), broken=st.booleans(),

@@ -102,8 +102,8 @@ def ring(position: FloatArray) -> list[list[float]]:
 def test_a_team_in_a_warehouse_goes_on_without_end() -> None:
     """Nobody touches anybody, and few wait: half of the alone bound was what docking for good let them reach."""
     problem = make_problem("warehouse", num_robots=8, seed=0)
-    env = navigation_v0.parallel_env(problem=problem, lifelong=True, max_cycles=300)
+    env = navigation_v0.parallel_env(problem=problem, lifelong=True, max_cycles=150)
     policy = make_policy("d4orm-c2f", refine="off")
     executed = run_episode(env, policy, seed=0)
     assert not executed.trajectory.collided.any()
-    assert executed.metrics["goals_reached"] >= 20
+    assert executed.metrics["goals_reached"] >= 8

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, RecordedRules, cpu_rewards, engine_noise, toward_goals
-from env_support import mixed_problem
+from env_support import mixed_problem, slow
 from reference import ROUNDOFF, evaluate, position_error
 from scenario_support import needed
 
@@ -204,30 +204,23 @@ def assert_rewards(task: SamplingTask, controls: np.ndarray, rewards: np.ndarray
 ENGINES = {"cpu": CPU, "jax": JAX}
 
 
-@pytest.mark.parametrize("engine", ENGINE_NAMES)
+STEPPED = [
+    ("mixed", "robot"), ("harder", "team"), ("harder, obstacles", "team"), ("docking in space", "team"),
+    ("arrived", "robot"), ("mixed", "team"), ("harder", "robot"), ("velocity2d", "robot"), ("holonomic3d", "team"),
+    *((name, credit) for name in ("holonomic2d", "differential_drive") for credit in CREDITS), ("alone", "team"),
+    ("obstacles", "team"), ("space", "robot"), ("docking", "robot"), ("docking drives", "robot"), ("moving", "team"),
+    ("no collisions", "robot"), ("moving, no collisions", "team"), ("moving in space", "robot"), ("all docked", "team"),
+    ("docked, moving", "team"), ("all docked, moving", "robot"),
+]  # fmt: skip
+
+
+# JAX compiles for seconds for every one of them.
 @pytest.mark.parametrize(
-    ("name", "credit"),
+    ("name", "credit", "engine"),
     [
-        *((name, credit) for name in ("holonomic2d", "differential_drive", "mixed") for credit in CREDITS),
-        ("velocity2d", "robot"),
-        ("holonomic3d", "team"),
-        ("alone", "team"),
-        ("obstacles", "team"),
-        ("space", "robot"),
-        ("docking", "robot"),
-        ("docking in space", "team"),
-        ("docking drives", "robot"),
-        ("no collisions", "robot"),
-        ("moving", "team"),
-        ("moving, no collisions", "team"),
-        ("moving in space", "robot"),
-        ("harder", "team"),
-        ("harder", "robot"),
-        ("harder, obstacles", "team"),
-        ("arrived", "robot"),
-        ("docked, moving", "team"),
-        ("all docked", "team"),
-        ("all docked, moving", "robot"),
+        *((*case, "cpu") for case in STEPPED),
+        *((*case, "jax") for case in STEPPED[:5]),
+        *(slow(*case, "jax") for case in STEPPED[5:]),
     ],
 )
 def test_every_step_is_that_of_the_reference(name: str, credit: str, engine: str) -> None:
@@ -257,19 +250,19 @@ def test_so_it_is_in_every_scenario(scenario: str, engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("num_samples", [2, 65])
+@pytest.mark.parametrize("num_samples", [slow(2), 65])
 def test_so_it_is_with_any_number_of_samples(num_samples: int, engine: str) -> None:
     step_by_step(ENGINES[engine], TASKS["alone"](), num_samples=num_samples)
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
+@pytest.mark.parametrize("credit", ["team", slow("robot")])
 def test_so_it_is_with_importance(credit: str, engine: str) -> None:
     step_by_step(ENGINES[engine], replace(TASKS["holonomic2d"](), credit=credit), SOFTMAX._replace(importance=0.05))
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
+@pytest.mark.parametrize("credit", ["team", slow("robot")])
 def test_so_it_is_where_the_noise_follows_the_spread_of_the_samples(credit: str, engine: str) -> None:
     rules = SamplingRules(EliteWeights(0.1), Spread(0.05))
     step_by_step(ENGINES[engine], replace(TASKS["holonomic2d"](), credit=credit), rules)
@@ -380,8 +373,7 @@ class Spread:
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
-@pytest.mark.parametrize("name", ["holonomic2d", "holonomic3d"])
+@pytest.mark.parametrize(("name", "credit"), [slow("holonomic2d", "team"), ("holonomic3d", "robot")])
 def test_importance_weighs_by_how_likely_a_sample_is_around_zero(name: str, credit: str, engine: str) -> None:
     """The term is the logarithm of a ratio of densities, written out here from the samples themselves."""
     task = replace(TASKS[name](), credit=credit)
@@ -469,7 +461,7 @@ def bursting_controls(task: SamplingTask, burst: Burst) -> Any:
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)
-@pytest.mark.parametrize("credit", CREDITS)
+@pytest.mark.parametrize("credit", ["robot", slow("team")])
 def test_samples_that_blow_up_are_excluded_and_counted_and_change_no_other(credit: str, engine: str) -> None:
     """A quarter of the samples in each tile gets a control whose square is infinite: its robot is nowhere."""
     task = replace(TASKS["obstacles"](), credit=credit)

@@ -71,7 +71,7 @@ POLICIES: dict[str, dict[str, Any]] = {
 @cache
 def episode(name: str, where: str, factor: float = 1.0) -> Episode:
     """The episode in metres, or with all lengths multiplied."""
-    env = navigation_v0.parallel_env(problem=scaled(problem(where), factor))
+    env = navigation_v0.parallel_env(problem=scaled(problem(where), factor), max_cycles=20)
     return run_episode(env, make_policy(name, **POLICIES[name]), seed=1)
 
 

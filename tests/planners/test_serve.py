@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import slow
 
 from d4orm_env import Problem, Team
 from d4orm_planners import Controller
@@ -178,7 +179,7 @@ def until(condition: Callable[[], bool], seconds: float = 300.0) -> None:
         time.sleep(0.005)
 
 
-@pytest.mark.parametrize("poses", [False, True])
+@pytest.mark.parametrize("poses", [slow(False), True])
 def test_robots_arrive_though_messages_are_lost_and_get_new_goals(endpoint: str, poses: bool) -> None:
     with served(endpoint) as server:
         fleet = Fleet(endpoint, problem().start[:, :2].astype(float), loss=0.2, poses=poses)

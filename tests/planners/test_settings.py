@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
@@ -112,6 +112,10 @@ def test_what_is_no_text_or_truth_is_refused_by_name(kind: type[CheckedSettings]
             with pytest.raises(ValueError, match=f"^{setting} ") as caught:
                 kind(**{setting: value})
             assert "\n" not in str(caught.value)
+
+
+def test_settings_are_given_by_name_only() -> None:
+    assert [(name, one.name) for name, kind in KINDS.items() for one in fields(kind) if not one.kw_only] == []
 
 
 def test_which_settings_there_are_may_depend_on_others() -> None:

@@ -80,7 +80,9 @@ class Broken(Exception):
     """Stands for a kill."""
 
 
-def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(imitated: Path, tmp_path: Path) -> None:
+def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(tmp_path: Path) -> None:
+    short, whole, broken = replace(TINY, episodes=6, epochs=3, validation_worlds=4), tmp_path / "a", tmp_path / "b"
+    imitate(short, whole, command="d4orm train imitation ...")
     for share in (0.2, 0.5):
 
         def break_off(what: str, done: int, total: int, share: float = share) -> None:
@@ -88,12 +90,12 @@ def test_an_imitation_that_was_broken_off_goes_on_to_the_same_end(imitated: Path
                 raise Broken
 
         with pytest.raises(Broken):
-            imitate(TINY, tmp_path, progress=break_off, command="d4orm train imitation ...")
-    kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "episodes").iterdir()}
+            imitate(short, broken, progress=break_off, command="d4orm train imitation ...")
+    kept = {path.name: path.stat().st_mtime_ns for path in (broken / "episodes").iterdir()}
     assert kept
-    imitate(TINY, tmp_path, command="d4orm train imitation ...")
-    assert {name: (tmp_path / "episodes" / name).stat().st_mtime_ns for name in kept} == kept
-    one, two = (load_network(folder / "policy.safetensors") for folder in (imitated, tmp_path))
+    imitate(short, broken, command="d4orm train imitation ...")
+    assert {name: (broken / "episodes" / name).stat().st_mtime_ns for name in kept} == kept
+    one, two = (load_network(folder / "policy.safetensors") for folder in (whole, broken))
     for name, array in one.arrays.items():
         np.testing.assert_array_equal(array, two.arrays[name])
 
@@ -115,7 +117,7 @@ def test_it_begins_with_a_dataset(agents: str, tmp_path: Path) -> None:
     environment: dict[str, Any] = {"scenario": "random", "num_robots": 2, "size": 2.5}
     demonstrations = Demonstrations(policy="go-to-goal", environment=environment, seeds=range(6), agents=agents)
     write_dataset(demonstrations, tmp_path / "data set", workers=1)
-    settings = replace(TINY, dataset=tmp_path / "data set", rounds=2, episodes=4)
+    settings = replace(TINY, dataset=tmp_path / "data set", rounds=2, episodes=4, epochs=2, validation_worlds=2)
     result = imitate(settings, tmp_path / "out")
     env = navigation_v0.parallel_env(**environment)
     counts = [len(record_samples(env, make_policy("go-to-goal"), seed)) for seed in range(6)]
@@ -172,7 +174,7 @@ def test_samples_come_back_from_their_file(tmp_path: Path) -> None:
 def test_ppo_goes_on_from_what_was_imitated(imitated: Path, tmp_path: Path) -> None:
     path = imitated / "policy.safetensors"
     settings = TrainingSettings(
-        num_robots=2, steps=1, num_envs=16, stages=1, validation_worlds=20, seed=5,
+        num_robots=2, steps=1, num_envs=16, stages=1, validation_worlds=2, seed=5,
         scenario_settings={"size": 2.5}, start_from=path,
     )  # fmt: skip
     learned = train(settings, tmp_path / "on").network
@@ -200,9 +202,11 @@ def test_an_expert_is_told_that_another_drives() -> None:
 
 
 def test_what_is_trained_on_along_with_a_scenario_has_robots_like_its_own(tmp_path: Path) -> None:
-    spatial = replace(TINY, scenario="sphere", scenario_settings={}, episodes=4, rounds=2, epochs=1)
+    spatial = replace(
+        TINY, scenario="sphere", scenario_settings={}, episodes=2, rounds=1, epochs=1, validation_worlds=2
+    )
     assert imitate(spatial, tmp_path / "imitation").network.header.model == "holonomic3d"
-    settings = TrainingSettings(scenario="sphere", num_robots=2, steps=1024, num_envs=16, stages=2)
+    settings = TrainingSettings(scenario="sphere", num_robots=2, steps=1, num_envs=16, stages=1, validation_worlds=2)
     assert train(settings, tmp_path / "ppo").network.header.model == "holonomic3d"
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from env_support import slow
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -189,7 +190,7 @@ def test_robots_learn_to_reach_goals_at_any_speed_unless_something_says_otherwis
     assert TrainTask(lambda seed, num_robots: given, 2, {}).problem(0).goal_speed.tolist() == given.goal_speed.tolist()
 
 
-@pytest.fixture(scope="module", params=sorted(ALGORITHMS))
+@pytest.fixture(scope="module", params=["ppo", slow("sac")])
 def practised(request: pytest.FixtureRequest) -> TrainingSettings:
     return replace(TINY, algorithm=request.param)
 
