@@ -61,7 +61,7 @@ def memory_is_given_back() -> Iterator[None]:
     """What JAX has compiled for a module is dropped once the process is large; the cache on disk has it."""
     yield
     statm = Path("/proc/self/statm")
-    if not statm.exists() or int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") < 2**31:
+    if not statm.exists() or int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") < 2**30:
         return
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
