@@ -108,15 +108,17 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
 
 
 def _big_team_parts(settings: BenchmarkSettings) -> Iterator[Part]:
-    teams: tuple[tuple[str, tuple[int, ...], dict[str, Any]], ...] = (
-        ("random", settings.big_random, {}),
-        ("warehouse", settings.big_warehouse, {}),
-        ("warehouse", settings.big_boxes, BOXES),
+    limits = settings.big_seeds, settings.big_time_limit
+    teams: tuple[tuple[str, str, tuple[int, ...], dict[str, Any]], ...] = (
+        ("random", "robots", settings.big_random, {}),
+        ("warehouse", "robots", settings.big_warehouse, {}),
+        ("warehouse", "differential drives", settings.big_drives, {"model": "differential_drive"}),
+        ("warehouse", "boxes", settings.big_boxes, BOXES),
     )
-    for scenario, sizes, robots in teams:
+    for scenario, what, sizes, robots in teams:
         for size in sizes:
-            plan = partial(measure_big_team, scenario, size, settings.big_seeds, settings.big_time_limit, **robots)
-            yield "big teams", f"first plans of {size} {'boxes' if robots else 'robots'}, {scenario}", plan
+            plan = partial(measure_big_team, scenario, what, size, *limits, **robots)
+            yield "big teams", f"first plans of {size} {what}, {scenario}", plan
     for size in settings.improved_robots:
         work = partial(measure_improvement, "random", size, settings.big_seeds, settings.improving_limit)
         yield "improvement", f"improving plans of {size} robots", work

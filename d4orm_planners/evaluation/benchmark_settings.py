@@ -50,6 +50,7 @@ class BenchmarkSettings(CheckedSettings):
         map_cells: Cells along a side of the maps whose index of obstacles is timed.
         big_random: Team sizes for the first plan of the recommended planner on open ground.
         big_warehouse: The same in warehouses.
+        big_drives: The same of differential drives.
         big_boxes: The same of rectangles with goal headings in warehouses.
         big_seeds: Seeds of these, and of the plans that are improved.
         big_time_limit: Seconds per plan of these.
@@ -82,6 +83,7 @@ class BenchmarkSettings(CheckedSettings):
     map_cells: tuple[Count, ...] = (32, 256)
     big_random: tuple[Robots, ...] = (1000, 2000)
     big_warehouse: tuple[Robots, ...] = (100, 200)
+    big_drives: tuple[Robots, ...] = (100,)
     big_boxes: tuple[Robots, ...] = (16, 50)
     big_seeds: Count = 3
     big_time_limit: Positive = 120.0
@@ -119,6 +121,7 @@ QUICK: Mapping[str, object] = {
     "map_cells": (32,),
     "big_random": (100,),
     "big_warehouse": (16,),
+    "big_drives": (8,),
     "big_boxes": (4,),
     "big_seeds": 2,
     "big_time_limit": 10.0,

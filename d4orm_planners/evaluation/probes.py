@@ -206,14 +206,16 @@ BOXES: dict[str, Any] = {"model": "differential_drive", "footprint": Box(0.36, 0
 """Robots whose manoeuvres are planned: rectangles with goal headings."""
 
 
-def measure_big_team(scenario: str, num_robots: int, seeds: int, time_limit: float, **robots: Any) -> Measurement:
-    """Seconds of the recommended planner to its first plan, over so many seeds, for such robots."""
+def measure_big_team(
+    scenario: str, what: str, num_robots: int, seeds: int, time_limit: float, **robots: Any
+) -> Measurement:
+    """Seconds of the recommended planner to its first plan, over so many seeds, for such robots, called ``what``."""
     planner, make = make_planner(), partial(make_problem, scenario, **robots)
     planner.solve(make(num_robots=COMPILING, seed=seeds), seed=0, time_limit=time_limit)
     problems = [make(num_robots=num_robots, seed=seed) for seed in range(seeds)]
     plans = [planner.solve(problem, seed=seed, time_limit=time_limit) for seed, problem in enumerate(problems)]
     return {
-        "scenario": f"{scenario}, boxes" if robots else scenario,
+        "scenario": f"{scenario}, {what}" if robots else scenario,
         "num_robots": num_robots,
         "seeds": seeds,
         "solved": sum(plan.solved for plan in plans),

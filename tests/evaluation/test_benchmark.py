@@ -47,6 +47,7 @@ TINY: dict[str, Any] = {
     "map_cells": (4,),
     "big_random": (3,),
     "big_warehouse": (2,),
+    "big_drives": (),
     "big_boxes": (),
     "big_seeds": 1,
     "improved_robots": (3,),
