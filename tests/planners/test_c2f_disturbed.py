@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Bias, Delay, Dropout, LimitMismatch, Push, Stall, StateDelay
-from d4orm_env.envs.joint_state import JointState
+from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
@@ -195,6 +196,27 @@ def test_a_command_may_be_held_for_so_many_steps_before_robots_brake(steps: int,
         states = engine.step(problem.arrays, states, nobody, held if step < 6 else braking).states
         gap = min(gap, 0.9 - float(problem.team.radius[0]) - states[0, 0])
     assert (gap >= -1e-3) == holds
+
+
+@pytest.mark.parametrize(("run", "looked_at"), [(0, [1]), (5, [6, 3, 1] * 2)])
+def test_so_many_steps_are_as_many_as_commands_may_be_lost(
+    monkeypatch: pytest.MonkeyPatch, run: int, looked_at: list[int]
+) -> None:
+    policy, env = controller(), navigation_v0.parallel_env(problem=make_problem("circle", num_robots=2))
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    policy.act(observations, env.state())
+    asked: list[int] = []
+
+    def braking_in_time(joint: JointState, controls: Any, gap: float, speed_slack: float, steps: int) -> Any:
+        asked.append(steps)
+        return controls
+
+    monkeypatch.setattr(policy._deviation, "packet_loss", SimpleNamespace(run=run))
+    monkeypatch.setattr(policy._window, "touching", lambda *_: np.ones(2, bool))
+    monkeypatch.setattr(policy, "_braking_in_time", braking_in_time)
+    policy._evading(split_state(policy.problem, env.state()), policy._plan[0])
+    assert asked == looked_at
 
 
 def test_noise_on_measurements_sends_nobody_off_again() -> None:
@@ -476,7 +498,6 @@ def test_finding_out_changes_nothing_while_all_is_as_believed(model: str, lifelo
     options: dict[str, Any] = {"problem": problem, "lifelong": lifelong, "max_cycles": 120 if lifelong else None}
     known = {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "last_resort": False}
     known["expect_losses"] = False
-    assert controller().config.last_resort, "by default all of it is found out"
     plain, watchful = (
         run_episode(navigation_v0.parallel_env(**options), controller(**config), seed=0) for config in (known, {})
     )
