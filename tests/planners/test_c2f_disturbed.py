@@ -315,6 +315,8 @@ def test_robots_of_first_order_stray_until_their_next_command_only(model: str, w
     deviation = policy._deviation
     assert deviation.margin_inflation(0.4) == pytest.approx(within * deviation.speed.max())
     assert 0 < deviation.margin_inflation(0.4) < 0.15
+    deviation.speed = np.full(2, 9.0)
+    assert deviation.margin_inflation(0.4) == problem.team.largest_radius
 
 
 def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
