@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Bias, Delay, Dropout, LimitMismatch, Push, Stall, StateDelay
-from d4orm_env.envs.joint_state import JointState
+from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
@@ -197,6 +198,27 @@ def test_a_command_may_be_held_for_so_many_steps_before_robots_brake(steps: int,
     assert (gap >= -1e-3) == holds
 
 
+@pytest.mark.parametrize(("run", "looked_at"), [(0, [1]), (5, [6, 3, 1] * 2)])
+def test_so_many_steps_are_as_many_as_commands_may_be_lost(
+    monkeypatch: pytest.MonkeyPatch, run: int, looked_at: list[int]
+) -> None:
+    policy, env = controller(), navigation_v0.parallel_env(problem=make_problem("circle", num_robots=2))
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    policy.act(observations, env.state())
+    asked: list[int] = []
+
+    def braking_in_time(joint: JointState, controls: Any, gap: float, speed_slack: float, steps: int) -> Any:
+        asked.append(steps)
+        return controls
+
+    monkeypatch.setattr(policy._deviation, "packet_loss", SimpleNamespace(run=run))
+    monkeypatch.setattr(policy._window, "touching", lambda *_: np.ones(2, bool))
+    monkeypatch.setattr(policy, "_braking_in_time", braking_in_time)
+    policy._evading(split_state(policy.problem, env.state()), policy._plan[0])
+    assert asked == looked_at
+
+
 def test_noise_on_measurements_sends_nobody_off_again() -> None:
     problem = hop_problem(2)
     policy, env = controller(), navigation_v0.parallel_env(problem=problem)
@@ -293,6 +315,8 @@ def test_robots_of_first_order_stray_until_their_next_command_only(model: str, w
     deviation = policy._deviation
     assert deviation.margin_inflation(0.4) == pytest.approx(within * deviation.speed.max())
     assert 0 < deviation.margin_inflation(0.4) < 0.15
+    deviation.speed = np.full(2, 9.0)
+    assert deviation.margin_inflation(0.4) == problem.team.largest_radius
 
 
 def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
@@ -476,7 +500,6 @@ def test_finding_out_changes_nothing_while_all_is_as_believed(model: str, lifelo
     options: dict[str, Any] = {"problem": problem, "lifelong": lifelong, "max_cycles": 120 if lifelong else None}
     known = {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "last_resort": False}
     known["expect_losses"] = False
-    assert controller().config.last_resort, "by default all of it is found out"
     plain, watchful = (
         run_episode(navigation_v0.parallel_env(**options), controller(**config), seed=0) for config in (known, {})
     )

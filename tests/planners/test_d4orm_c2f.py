@@ -30,6 +30,7 @@ from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
@@ -555,6 +556,11 @@ def test_a_plan_that_comes_before_the_episode_ends_is_preferred(seed: int) -> No
     guide = policy._tracker
     plan = guide._planning.plan(guide.problem, late, nobody, None, 20, thorough=True)
     assert get_sampling_engine("cpu").rollout(plan.problem, plan.controls).arrived[left].all()
+
+
+def test_only_thorough_plans_keep_to_paths_between_others() -> None:
+    planning = CoarsePlanning(D4ormC2FConfig(), seed=0, last_step=None)
+    assert [planner.config.reroute for planner in (planning.planner, planning._thorough)] == [False, True]  # type: ignore[attr-defined]
 
 
 def test_who_is_behind_robots_that_have_docked_is_barred() -> None:

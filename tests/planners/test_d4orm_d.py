@@ -193,9 +193,12 @@ def test_robots_that_were_repaired_in_vain_are_repaired_jointly_and_every_other_
     towards = np.zeros((90, 2, 2), np.float32)
     towards[:20, :, 0], towards[20:40, :, 0] = [0.5, -0.5], [-0.5, 0.5]
     search = SolveRun(make_planner("d4orm-d", engine="cpu"), problem, 0, towards, engine)
+    recency = []
     for _ in range(7):
         search.advance()
         assert search.current.failed.all()
+        recency.append(np.sort(search.state.recency))
+    np.testing.assert_allclose(recency[0], [0, 0.21], err_msg="one of them was repaired, an iteration ago")
     # Six repairs, one robot at a time: before the fourth, one of them had failed only once.
     assert [task.credit for task in engine.tasks] == ["robot"] * 6 + ["team"]
     assert [task.problem.num_robots for task in engine.tasks] == [1] * 6 + [2]

@@ -64,9 +64,13 @@ def test_what_needs_no_iteration_begins_nothing(solved: bool) -> None:
     assert planner.calls == []
 
 
-@pytest.mark.parametrize("name", [name for name in list_planners() if name != "ipopt"])
-def test_states_are_data_that_nobody_changes(name: str) -> None:
-    search = SolveRun(cheap_planner(name), hop_problem(2), 0)
+STATEFUL: list[tuple[str, dict[str, Any]]] = [(name, {}) for name in list_planners() if name != "ipopt"]
+STATEFUL += [("d4orm-d", {"decoupling": "groups"}), ("d4orm-d", {"decoupling": "joint"})]
+
+
+@pytest.mark.parametrize(("name", "settings"), STATEFUL)
+def test_states_are_data_that_nobody_changes(name: str, settings: dict[str, Any]) -> None:
+    search = SolveRun(cheap_planner(name, **settings), hop_problem(2), 0)
     try:
         search.advance()
         before = search.state
