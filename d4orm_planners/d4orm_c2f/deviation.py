@@ -205,7 +205,7 @@ class Deviation:
         return 0.0 if self.drift < DRIFT_DEADBAND * self._speed else min(self.drift, MAX_SPEED_SLACK * self._speed)
 
     def margin_inflation(self, reaction_time: float) -> float:
-        """Return the distance by which robots deviate within a reaction time [s], at most :data:`MAX_INFLATION` [m].
+        """Return the distance by which robots deviate within a reaction time [s], at most :data:`MAX_INFLATION` radii.
 
         A robot of first order deviates until the next command arrives only.
         """

@@ -500,6 +500,7 @@ def test_finding_out_changes_nothing_while_all_is_as_believed(model: str, lifelo
     options: dict[str, Any] = {"problem": problem, "lifelong": lifelong, "max_cycles": 120 if lifelong else None}
     known = {"delay": 0, "filter_states": False, "learn_limits": False, "stalls": False, "last_resort": False}
     known["expect_losses"] = False
+    assert controller().config.last_resort, "by default all of it is found out"
     plain, watchful = (
         run_episode(navigation_v0.parallel_env(**options), controller(**config), seed=0) for config in (known, {})
     )

@@ -33,45 +33,6 @@ BESIDE: dict[str, dict[str, Any]] = {
 }
 """What these numbers need beside them."""
 
-SAMPLING: dict[str, Any] = {
-    "engine": "auto", "max_iterations": 50, "improve": False, "num_samples": 1024, "num_steps": 100, "credit": "team",
-    "penalty": 1.0, "penalty_per_pair": False, "short_paths": True, "final_approach": True,
-}  # fmt: skip
-SOFTMAX: dict[str, Any] = {"temperature": 0.3, "weight_cutoff": 1e-3}
-DENOISING: dict[str, Any] = {**SOFTMAX, "beta_start": 1e-4, "beta_end": 2e-2}
-DEFORMING: dict[str, Any] = {
-    **SAMPLING, **DENOISING, "num_samples": 256, "credit": "group", "penalty": 2.0, "clip_between_iterations": True,
-    "late_steps": 0.7, "late_samples": 0.5, "random_start": False,
-}  # fmt: skip
-CONTINUED = {"clip_between_iterations": False}
-DEFAULTS: dict[str, dict[str, Any]] = {
-    "mppi": {**SAMPLING, **SOFTMAX, **CONTINUED, "sigma": 1.0, "importance": 0.0},
-    "cem": {
-        **SAMPLING, **CONTINUED, "elite_fraction": 0.05, "sigma": 1.0, "adapt_variance": False, "sigma_floor": 0.05,
-        "carry_variance": False,
-    },
-    "mbd": {**SAMPLING, **DENOISING, "num_steps": 10_000, "max_iterations": 1, "check_every": None},
-    "i-mbd": {**SAMPLING, **DENOISING, **CONTINUED},
-    "d4orm": DEFORMING,
-    "d4orm-d": {
-        **DEFORMING, "penalty_rise": 0.0, "penalty_limit": 3.0, "reset_after_probe": False, "clip_after": None,
-        "big_team": 32, "decoupling": "independent", "start": "auto", "first_collisions": True, "repair_samples": 128,
-        "repair_steps": 50, "repair_penalty": 3.0,
-    },
-    "d4orm-c2f": {
-        **DENOISING, "engine": "auto", "coarse_factor": 2, "check_interval": 1, "coarse_samples": 256,
-        "coarse_steps": 50, "coarse_repair_steps": 20, "coarse_preset": None, "warm_start": None,
-        "coarse_iterations": 20, "replan_iterations": 2, "predict_horizon": 20, "execute_horizon": 1,
-        "subgoal_offset": 15, "max_lag": 5, "mean_of_all": False, "line_of_sight": True, "num_samples": 128,
-        "num_steps": 20, "credit": "robot", "penalty": 10.0, "normalise_distance": False, "safe_mix": True,
-        "direct_final_approach": True, "extra_margin": 0.0, "reaction_time": 0.4, "delay": None,
-        "filter_states": True, "learn_limits": True, "expect_losses": True, "stalls": True, "last_resort": True,
-        "refine": "background", "refine_every": 5, "replan": True, "replan_distance": 10.0, "patience": 15,
-        "deadline": None, "control_noise_std": 0.0,
-    },
-}  # fmt: skip
-"""Defaults of the paper's methods, which users' code and all tables of the documentation go by."""
-
 
 def number_type(hint: Any) -> type | None:
     """``int`` or ``float`` for a field that holds one, or none at all."""
@@ -151,11 +112,6 @@ def test_what_is_no_text_or_truth_is_refused_by_name(kind: type[CheckedSettings]
             with pytest.raises(ValueError, match=f"^{setting} ") as caught:
                 kind(**{setting: value})
             assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", DEFAULTS)
-def test_defaults_stay_as_they_are(name: str) -> None:
-    assert KINDS[name]().keywords() == DEFAULTS[name]
 
 
 def test_settings_are_given_by_name_only() -> None:
