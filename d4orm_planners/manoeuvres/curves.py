@@ -21,7 +21,7 @@ from d4orm_planners.manoeuvres.kinds import Kind, held
 from d4orm_planners.manoeuvres.lattice import TURN, moved, turned_by, write_pose
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, drive
 from d4orm_planners.manoeuvres.snapping import Goal
-from d4orm_planners.manoeuvres.trailer_moves import circle, steering, swing, tightest
+from d4orm_planners.manoeuvres.trailer_moves import circle, steering, swing, tightest_curvature
 
 LEVELS = (1.0, 0.5, 0.25, 0.125)
 """Curvatures, in that of the tightest circle."""
@@ -78,9 +78,11 @@ NO_CURVES = Curves(
 @cache
 def curves_of(kind: Kind, bent: bool) -> Curves:
     """Circles of a car with trailers, and the swings between them and straight on; ``bent`` if curves end in a bend."""
-    swings, rows, straight = [], [], (0.0,) * len(kind.model.trailers)
+    swings, rows, straight, tightest = [], [], (0.0,) * len(kind.model.trailers), tightest_curvature(kind)
+    if tightest is None:
+        return NO_CURVES
     for ends, way, level, side in product((False, True) if bent else (False,), (1, -1), LEVELS, SIDES):
-        curvature = side * level * tightest(kind)
+        curvature = side * level * tightest
         hitches = circle(kind, curvature)
         assert hitches is not None
         mode = tuple(hitches.tolist())

@@ -145,7 +145,7 @@ class TeamMotions:
         return Odds(delay, positions, until, 4 * self._interaction_range, (2, 4))
 
     def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
-        """See :meth:`LowLevelPlanner.replan`; those that are still to be planned count as waiting at their starts."""
+        """See :meth:`LowLevelPlanner.replan`; those still to be planned wait at their starts for a while, or not."""
         for group in groups:
             before, cost = self.motions.copy(), self.cost
             order = group.tolist()

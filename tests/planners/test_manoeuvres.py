@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from numba import njit
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -15,7 +17,7 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.footprints import Box, Train
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
-from d4orm_planners.manoeuvres.curves import curves_of
+from d4orm_planners.manoeuvres.curves import NO_CURVES, curves_of
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS, Kind
 from d4orm_planners.manoeuvres.lattice import buffer_size
 from d4orm_planners.manoeuvres.model_moves import MOVES
@@ -94,11 +96,19 @@ def test_primitives_lead_back_where_they_began(model: str) -> None:
 def test_moves_longer_than_a_search_has_room_for_are_left_out() -> None:
     """A robot that reverses by a hair's breadth in a step would take millions of them."""
     usual = kind_of("unicycle1")
-    slow = Kind(usual.name, (*usual.limits[:3], 1e-5, *usual.limits[4:]), usual.dt, usual.cell, usual.start)
+    slow = replace(usual, limits=(*usual.limits[:3], 1e-5, *usual.limits[4:]))
     ahead, back, _ = primitives_of(slow)
     assert np.diff(ahead.first).max() <= MAX_STEPS
     assert 0 < len(ahead.mode) < len(primitives_of(usual)[0].mode)
     assert len(back.mode) > 0
+
+
+def test_a_car_whose_trailer_can_hardly_swing_drives_straight_only() -> None:
+    """No circle is wide enough for its hitch angle, and there is none to end in either."""
+    usual, column = kind_of("car_with_1_trailer"), MODELS["car_with_1_trailer"].state_limits[0][1]
+    stiff = replace(usual, limits=(*usual.limits[:column], 0.01, *usual.limits[column + 1 :]))
+    assert primitives_of(stiff)[2] == ((0.0,),)
+    assert curves_of(stiff.base, bent=False) is NO_CURVES
 
 
 @pytest.mark.parametrize(("gap", "safe"), [(0.045, 2), (-0.005, NEVER)])
@@ -111,7 +121,12 @@ def test_a_pose_is_safe_once_another_robot_has_passed_it_in_its_last_step(gap: f
     last, gone = np.array([-1, 1]), np.full(2, NEVER)
     traffic = traffic_of(poses, last, gone, scene.area.low, scene.area.high, scene.interaction_range)
     buffer = np.zeros(buffer_size(problem.team.all_footprint_arrays), np.float32)
-    assert safe_since(scene.body(0), traffic, np.array([2.0, 0.5, 0.0, 0.0, 0.0, 0.0]), buffer) == safe
+
+    @njit
+    def since(body: Any, traffic: Any, pose: Any, buffer: Any) -> int:
+        return safe_since(body, traffic, pose, buffer)
+
+    assert since(scene.body(0), traffic, np.array([2.0, 0.5, 0.0, 0.0, 0.0, 0.0]), buffer) == safe
 
 
 def test_a_robot_whose_motion_fails_has_another_one_even_after_a_solution() -> None:
