@@ -20,7 +20,7 @@ TEAM_CELLS, LEAST_CELLS, MOST_CELLS = 4_000_000, 150_000, 400_000
 
 
 class Area(NamedTuple):
-    """The room that robots may use, and the largest cell that a lattice of it needs [m]."""
+    """The part of the plane that robots may use, and the size of the cells of the search's lattices [m]."""
 
     low: Floats
     high: Floats
@@ -63,13 +63,13 @@ def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal,
     goals = _goals(goal, lattice, len(modes) if bent else 1)
     steps, far = _spread(body, back, lattice, goals, start, modes.index(kind.start), pace)
     if far == np.inf:
-        # Cells are coarse: where none of them leads to the goal, a way may do so even so.
+        # Cells are coarse: even where no chain of them leads from the start to the goal, a path may do so.
         far, pace = float(steps[steps < np.inf].max(initial=0)), 0.0
     return Costs(lattice, steps, far, pace, (float(start[0]), float(start[1])))
 
 
 def _goals(goal: Goal, lattice: PoseLattice, modes: int) -> Floats:
-    """``(., 4)`` poses and modes at which a robot is there."""
+    """``(., 4)`` poses and modes at which a robot is at its goal."""
     headings = [goal.heading] if not np.isnan(goal.heading) else (np.arange(lattice.sectors) * SECTOR).tolist()
     return np.array([[goal.x, goal.y, heading, mode] for mode in range(modes) for heading in headings])
 

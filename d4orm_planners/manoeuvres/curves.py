@@ -18,17 +18,16 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
 from d4orm_env.engine.elementary import arctan2, cosine, sine
 from d4orm_planners.manoeuvres.kinds import Kind, held
-from d4orm_planners.manoeuvres.lattice import moved, turned_by, write_pose
+from d4orm_planners.manoeuvres.lattice import TURN, moved, turned_by, write_pose
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, drive
 from d4orm_planners.manoeuvres.snapping import Goal
-from d4orm_planners.manoeuvres.trailer_moves import circle, steering, swing, tightest
+from d4orm_planners.manoeuvres.trailer_moves import circle, steering, swing, tightest_curvature
 
 LEVELS = (1.0, 0.5, 0.25, 0.125)
 """Curvatures, in that of the tightest circle."""
 SIDES = (1, -1)
 CIRCLES = len(LEVELS) * len(SIDES)
 """Circles in each direction."""
-TURN = 2 * np.pi
 
 
 class Curves(NamedTuple):
@@ -79,9 +78,11 @@ NO_CURVES = Curves(
 @cache
 def curves_of(kind: Kind, bent: bool) -> Curves:
     """Circles of a car with trailers, and the swings between them and straight on; ``bent`` if curves end in a bend."""
-    swings, rows, straight = [], [], (0.0,) * len(kind.model.trailers)
+    swings, rows, straight, tightest = [], [], (0.0,) * len(kind.model.trailers), tightest_curvature(kind)
+    if tightest is None:
+        return NO_CURVES
     for ends, way, level, side in product((False, True) if bent else (False,), (1, -1), LEVELS, SIDES):
-        curvature = side * level * tightest(kind)
+        curvature = side * level * tightest
         hitches = circle(kind, curvature)
         assert hitches is not None
         mode = tuple(hitches.tolist())
@@ -180,7 +181,7 @@ def _sweep_swing(curves: Curves, number: Whole, swept: Floats, at: int) -> int:
 
 @compiled
 def _sweep_drive(curves: Curves, circle: Whole, curvature: float, length: float, swept: Floats, at: int) -> int:
-    """The same of a drive with hitch angles as they are."""
+    """The same for an arc or a straight on which hitch angles stay as they are."""
     begin, count = at, _count(curves, circle, length)
     x, y, heading = swept[at, 0], swept[at, 1], swept[at, 2]
     for step in range(1, count + 1):
@@ -196,7 +197,7 @@ def _sweep_drive(curves: Curves, circle: Whole, curvature: float, length: float,
 
 @compiled
 def sweep_curve(curves: Curves, curve: Curve, swept: Floats) -> int:
-    """Fill in where a curve leads, from the pose in the first row of ``swept`` on; return how many steps."""
+    """Fill in the poses of a curve, from that in the first row of ``swept`` on; return the number of steps."""
     _, first, one, straight, second, other = curve
     at = 0
     if first >= 0:

@@ -1,4 +1,4 @@
-"""Kinds of robots, on which motion primitives depend, and the primitives before they are put in tables."""
+"""Kinds of robots: model, limits and time step, on which motion primitives depend."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION, PYTHON_OPS, SPEED, Model, TimeStep
 
 SECTORS = 32
-"""Headings that are told apart."""
+"""Number of headings that are told apart."""
 SECTOR = 2 * pi / SECTORS
+"""Angle between two of them [rad]."""
+MAX_STEPS = 2**14
+"""Most steps of a move."""
 
 OPS = PYTHON_OPS._replace(
     cos=lambda x: portable.sin_cos_of(x)[1],
@@ -34,7 +37,7 @@ class Kind:
 
     Attributes:
         name: The model's name.
-        limits: Of the robot.
+        limits: ``(L,)`` of the robot, in the order of the model.
         dt: Time step [s].
         cell: Distance that should be told apart [m].
         start: Mode that the robot starts in.
@@ -75,7 +78,7 @@ class Kind:
 
     def hop(self, length: float, acceleration: float) -> tuple[int, float]:
         """Steps to speed up, and as many to brake, so that a robot moves so far; and the speed in between."""
-        count = max(1, ceil(sqrt(length / acceleration) / self.dt - 1e-6))
+        count = self.steps(sqrt(length / acceleration), 1.0)
         return count, length / (count * self.dt)
 
     def states(self, state: State, controls: FloatArray) -> list[State]:

@@ -20,7 +20,7 @@ from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
 
 TURN = 2 * np.pi
 LATER = 20
-"""Poses count by way of which a robot takes at most so many steps more to its goal than it must."""
+"""Steps by which a detour over a pose may be longer than the shortest path for its cost to be worked out."""
 
 
 Pose: TypeAlias = tuple[float, float, float, float, float, float]
@@ -28,7 +28,7 @@ Pose: TypeAlias = tuple[float, float, float, float, float, float]
 
 
 def buffer_size(footprints: FootprintArrays) -> int:
-    """Numbers that contacts are found in: two cores, and a pose of each body."""
+    """Size of the workspace of contact checks: two cores, and a pose of each body."""
     return (2 + POSE * len(footprints.robot)) * TILE
 
 
@@ -84,13 +84,14 @@ def turned_by(angle: float) -> float:
 
 @compiled
 def is_far_from_all(body: RobotBody, x: float, y: float, wider: float) -> bool:
-    """Check whether the robot's disc, and so much round it, is clear of obstacles and bounds there; it may be so too
-    where this does not find out.
+    """Check quickly whether the robot's disc, and so much round it, is clear of obstacles and bounds at a position.
+
+    It is if this says so, and may be if not.
     """
     arrays = body.arrays
-    reach = arrays.radius[body.robot] + body.extra + np.float32(wider)
+    distance = arrays.radius[body.robot] + body.extra + np.float32(wider)
     px, py, low, high = np.float32(x), np.float32(y), arrays.bounds[0], arrays.bounds[1]
-    if not (px - reach > low[0] and py - reach > low[1] and px + reach < high[0] and py + reach < high[1]):
+    if not (px - distance > low[0] and py - distance > low[1] and px + distance < high[0] and py + distance < high[1]):
         return False
     grid = arrays.grid
     if grid.clearance.shape[0] == 0:
@@ -98,12 +99,12 @@ def is_far_from_all(body: RobotBody, x: float, y: float, wider: float) -> bool:
     i, j = np.int64((px - grid.low[0]) * grid.scale), np.int64((py - grid.low[1]) * grid.scale)
     if px <= grid.low[0] or py <= grid.low[1] or i >= grid.size[0] or j >= grid.size[1]:
         return False
-    return bool(grid.clearance[i * grid.size[1] + j] - grid.slack > reach)
+    return bool(grid.clearance[i * grid.size[1] + j] - grid.slack > distance)
 
 
 @compiled
 def is_free(body: RobotBody, pose: Pose, buffer: FloatArray) -> bool:
-    """Check whether the robot is clear of obstacles and bounds there."""
+    """Check whether the robot is clear of obstacles and bounds in a pose."""
     if is_far_from_all(body, pose[0], pose[1], 0.0):
         return True
     position, poses = (np.float32(pose[0]), np.float32(pose[1]), np.float32(0)), buffer[2 * TILE :]
@@ -119,7 +120,7 @@ def is_free(body: RobotBody, pose: Pose, buffer: FloatArray) -> bool:
 
 @compiled
 def hitch_of(pose: Pose, trailer: int) -> float:
-    """Hitch angle of a trailer; of the last one there may be."""
+    """Hitch angle of a trailer, by its number."""
     return pose[3] if trailer == 0 else pose[4] if trailer == 1 else pose[5]
 
 
@@ -252,7 +253,7 @@ def fill_costs(
     body: RobotBody, primitives: Primitives, lattice: PoseLattice, goals: Floats, start: Floats, pace: float,
     costs: FloatArray, poses: Floats, heap: Heap, mode: int, buffer: FloatArray,
 ) -> float:  # fmt: skip
-    """Spread costs backwards from the goals over all poses by way of which it may be worthwhile to go there.
+    """Spread costs backwards from the goals over all poses that a robot may pass on its way there, detours included.
 
     Args:
         body: The robot.

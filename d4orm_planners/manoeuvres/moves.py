@@ -7,6 +7,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.engine.compiling import compiled
 from d4orm_planners.manoeuvres.curves import curve_of, sweep_curve
+from d4orm_planners.manoeuvres.kinds import MAX_STEPS
 from d4orm_planners.manoeuvres.lattice import (
     RobotBody,
     is_far_from_all,
@@ -16,7 +17,7 @@ from d4orm_planners.manoeuvres.lattice import (
     turned_by,
     write_pose,
 )
-from d4orm_planners.manoeuvres.nodes import MAX_STEPS, Nodes, Task
+from d4orm_planners.manoeuvres.nodes import Nodes, Task
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.snapping import TOWING, Goal, snap_of, snap_pose, snap_steps
 
@@ -26,7 +27,7 @@ AHEAD, BEHIND = -2, -3
 
 @compiled
 def reaches(goal: Goal, x: float, y: float, heading: float, speed: float, wider: float) -> bool:
-    """Check whether a robot is at its goal."""
+    """Check whether a robot is at its goal, with radius and heading tolerance so many times as wide."""
     dx, dy, radius = goal.x - x, goal.y - y, goal.radius * wider
     if dx * dx + dy * dy > radius * radius or speed > goal.speed:
         return False
@@ -76,8 +77,8 @@ def stretch_steps(task: Task, x: float, y: float, heading: float, move: int) -> 
 
 
 @compiled
-def docks_after(task: Task, nodes: Nodes, count: int) -> int:
-    """Steps of a move after which the robot docks: more than it has for none, zero where rounding decides."""
+def arrives_after(task: Task, nodes: Nodes, count: int) -> int:
+    """Steps of a move after which the robot has arrived: more than it has for none, zero where rounding decides."""
     for step in range(1, count + 1):
         x, y, heading, _, _, _, speed = nodes.swept[step]
         if reaches(task.goal, x, y, heading, speed, 1.02):

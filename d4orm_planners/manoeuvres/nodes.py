@@ -11,12 +11,10 @@ from d4orm_env.engine.compiling import compiled
 from d4orm_planners.manoeuvres.costs import Costs
 from d4orm_planners.manoeuvres.curves import Curves
 from d4orm_planners.manoeuvres.heaps import Heap, push
+from d4orm_planners.manoeuvres.kinds import MAX_STEPS
 from d4orm_planners.manoeuvres.lattice import Pose, PoseLattice, RobotBody, cell_of, turned_by
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
 from d4orm_planners.manoeuvres.snapping import Goal, Limits, snap_of, snap_steps
-
-MAX_STEPS = 2**14
-"""Most steps of a move."""
 
 
 class Nodes(NamedTuple):
@@ -31,12 +29,12 @@ class Nodes(NamedTuple):
         move: ``(N,)`` primitive, or one of :data:`AHEAD` and :data:`BEHIND`, ...
         depart: ``(N,)`` ... and the step at which it begins.
         next: ``(N,)`` another one of the same cell, -1 for none.
-        filled: ``(1,)`` how many there are.
+        filled: ``(1,)`` number of nodes.
         soonest: ``(1,)`` step from which on the robot can stay at its goal.
         cells: ``(C,)`` numbers of cells, hashed.
         heads: ``(C,)`` first node of each.
-        marks: ``(C,)`` search that wrote it.
-        heap: Those to be followed.
+        marks: ``(C,)`` number of the search that wrote each slot.
+        heap: Nodes to be followed.
         swept: ``(., 7)`` poses and speeds on a move, from where it begins.
         buffer: See :func:`~d4orm_planners.manoeuvres.lattice.buffer_size`.
     """
@@ -60,7 +58,7 @@ class Nodes(NamedTuple):
 
     @classmethod
     def of(cls, size: int, buffer: int) -> Nodes:
-        """Room for so many, and a buffer of a size."""
+        """Room for ``size`` nodes, and for ``buffer`` numbers."""
         slots = 1 << int(2 * size - 1).bit_length()
 
         def numbers(count: int) -> IntArray:
@@ -87,7 +85,7 @@ class Task(NamedTuple):
         weight: Times that these count more than the steps behind.
         departure_interval: Steps between departures that are tried.
         horizon: Last step.
-        number: Of the search; no two with the same nodes have the same.
+        number: Of the search, different in each that writes to the same nodes.
     """
 
     body: RobotBody
@@ -115,7 +113,7 @@ def slot_of(nodes: Nodes, cell: int, number: int) -> int:
 
 @compiled
 def is_dominated(nodes: Nodes, slot: int, number: int, own: int, time: int) -> bool:
-    """Check whether some other node of the cell is there as soon and may wait until then."""
+    """Check whether another node of the cell is there by ``time`` and may wait until then."""
     if nodes.marks[slot] != number:
         return False
     other = nodes.heads[slot]
@@ -128,7 +126,7 @@ def is_dominated(nodes: Nodes, slot: int, number: int, own: int, time: int) -> b
 
 @compiled
 def cost_to_go(task: Task, x: float, y: float, heading: float, mode: Whole) -> float:
-    """Steps to the goal, or the least that there may be; where there are no obstacles, those of the last stretch."""
+    """Steps to the goal, or a lower bound of them; where there are no obstacles, those of the last stretch."""
     if task.costs.steps.shape[0] == 0:
         ahead = snap_steps(snap_of(task.limits, task.goal, x, y, heading, 1.0))
         return float(min(ahead, snap_steps(snap_of(task.limits, task.goal, x, y, heading, -1.0))))
@@ -168,5 +166,5 @@ def add(
         if nodes.marks[slot] == task.number:
             nodes.next[number] = nodes.heads[slot]
         nodes.marks[slot], nodes.cells[slot], nodes.heads[slot] = task.number, cell, number
-    # Who is there too soon has to wait in any case: then the nearest is best.
+    # A robot that is there too soon has to wait in any case: then the nearest is best.
     push(nodes.heap, max(time, nodes.soonest[0] - remaining) + task.weight * remaining, number)

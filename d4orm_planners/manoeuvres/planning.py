@@ -1,4 +1,4 @@
-"""Manoeuvres of a whole team as the hybrid planner begins with, and makes better from iteration to iteration."""
+"""Manoeuvres of a whole team, with which the hybrid planner begins and which it improves in every iteration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from d4orm_planners.mapf.lns import search_neighbourhoods
 ROUNDS = 200
 """Neighbourhoods that are replanned to find a motion for everybody."""
 BETTER_ROUNDS = 16
-"""Neighbourhoods that are replanned in an iteration once there is one."""
+"""Neighbourhoods that are replanned in an iteration once everybody has one."""
 
 
 def compile_manoeuvres() -> None:
@@ -38,7 +38,7 @@ def compile_manoeuvres() -> None:
 
 
 def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
-    """Motions for the whole team, or for some robots if time is up; ``None`` if not all have one in so many rounds."""
+    """Motions of the whole team, or of some robots if time is up; ``None`` if not all have one after :data:`ROUNDS`."""
     with search.watch.paused():
         compile_manoeuvres()
     motions = TeamMotions.prepared(search.problem, search.should_stop)
@@ -59,9 +59,9 @@ def _complete(search: SolveRun, motions: TeamMotions) -> bool:
 
 
 def improve_manoeuvres(search: SolveRun, motions: TeamMotions) -> Iteration:
-    """The team's controls, after some robots have looked for faster motions, or for any that the judge accepts."""
-    if not search.best.solved:
-        motions.leave_out(np.flatnonzero(search.current.unsolved).tolist())
+    """The team's controls, after robots whose motions fail have new ones, or else some have looked for faster ones."""
+    motions.leave_out(np.flatnonzero(search.current.unsolved).tolist())
+    if motions.missing:
         _complete(search, motions)
         return Iteration(motions.controls())
     random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))

@@ -15,7 +15,7 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
-from d4orm_planners.manoeuvres.kinds import OPS, Kind, Mode, Move
+from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, Kind, Mode, Move
 from d4orm_planners.manoeuvres.model_moves import MOVES
 
 HITCHES = 3
@@ -27,8 +27,8 @@ POSE_SIZE = 3 + HITCHES
 class Primitives(NamedTuple):
     """The ``P`` primitives of a robot, as the search reads them, sorted by the mode that they begin in.
 
-    A *mode* is what of the state is neither position nor heading: speeds and steering angles. ``S`` is the sum of all
-    steps.
+    A *mode* is what of the state is neither position nor heading: speeds, steering and hitch angles. ``S`` is the sum
+    of all steps.
 
     Attributes:
         begin: ``(M + 1,)`` where those of each mode begin.
@@ -54,7 +54,8 @@ class Primitives(NamedTuple):
 @cache
 def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]:
     """The primitives of a robot, the same backwards in time, and their modes; the first one is that of rest."""
-    moves = list(MOVES[kind.name](kind))
+    # Longer ones, of a robot that is next to unable to reverse or to turn, have no room in a search.
+    moves = [move for move in MOVES[kind.name](kind) if len(move[2]) <= MAX_STEPS]
     modes = tuple(dict.fromkeys(mode for before, after, _ in moves for mode in (before, after)))
     modes = tuple(sorted(modes, key=lambda mode: sum(map(abs, mode))))
     driven = [drive(kind, before, controls) for before, _, controls in moves]
@@ -73,7 +74,7 @@ def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]
 
 
 def _is_shortest(moves: list[Move], before: Mode, after: Mode, controls: FloatArray) -> bool:
-    """Check whether no shorter move is the same, held for fewer steps: that one, some times, leads as far."""
+    """Check whether no shorter move has the same controls, which would lead as far if it is made several times."""
     return not any(
         (before, after) == own[:2] and len(own[2]) < len(controls) and (own[2] == controls[:1]).all() for own in moves
     )

@@ -1,4 +1,4 @@
-"""A robot as the search knows it: what it can do, how large its lattice is, and how far every pose is from its goal."""
+"""Robots as the search knows them: their primitives, lattices, costs to their goals, and distances that they keep."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CUTTING = 0.7
 MAX_PARTS = 8
 """Most poses that are looked at in a step."""
 CERTAIN = 0.98
-"""Share of a goal's radius, heading tolerance and speed within which a robot is there beyond doubt."""
+"""Share of a goal's radius, heading tolerance and speed within which a robot is at its goal beyond doubt."""
 
 
 class ManoeuvreScene(NamedTuple):
@@ -41,7 +41,7 @@ class ManoeuvreScene(NamedTuple):
 
     Attributes:
         problem: The problem.
-        area: The room that robots may use.
+        area: The part of the plane that robots may use.
         arrays: The problem's arrays, of one type for all problems, with an index of all obstacles within reach.
         extra: Distance kept from everything [m].
         bent: ``(K,)`` whether trailers have to be in a bend at the robot's goal.
@@ -54,7 +54,7 @@ class ManoeuvreScene(NamedTuple):
     bent: BoolArray
 
     @property
-    def reach(self) -> float:
+    def interaction_range(self) -> float:
         """Distance beyond which two robots do not matter to each other in a step [m]."""
         return 2 * float(self.problem.team.radius.max()) + self.extra + 2 * self.problem.stride
 
@@ -77,7 +77,7 @@ def scene_of(problem: Problem) -> ManoeuvreScene:
 
 
 def can_plan(problem: Problem) -> bool:
-    """Check whether robots have primitives, start at rest, and are no discs or must face somewhere at their goals."""
+    """Check whether all robots have primitives and start at rest, and any has a footprint or a goal heading."""
     team = problem.team
     if problem.dimension != 2 or not set(team.models) <= set(MOVES):
         return False
@@ -94,7 +94,7 @@ def _extra(model: Model) -> int:
 
 
 def area_of(problem: Problem) -> Area:
-    """The room that robots may use."""
+    """The part of the plane that robots may use."""
     positions = np.concatenate([problem.start[:, :2], problem.goal]).astype(np.float64)
     largest = float(problem.team.radius.max())
     low, high = positions.min(axis=0) - 2 * ROOM * largest, positions.max(axis=0) + 2 * ROOM * largest
@@ -163,7 +163,6 @@ class Robot:
     """A robot, as the search reads it.
 
     Attributes:
-        number: Its number.
         model: Its model.
         start: ``(6,)`` pose.
         mode: That it starts in.
@@ -176,7 +175,6 @@ class Robot:
         costs: Steps to the goal.
     """
 
-    number: int
     model: Model
     start: Floats
     mode: int
@@ -210,7 +208,7 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
         costs = costs_of(kind, area, body, start, goal, problem.num_robots, bent)
     curves = curves_of(kind.base, bent) if model.trailers else NO_CURVES
     mode = modes.index(kind.start)
-    return Robot(number, model, start, mode, goal, last, curves, body, primitives, lattice, costs)
+    return Robot(model, start, mode, goal, last, curves, body, primitives, lattice, costs)
 
 
 def _limits(kind: Kind) -> Limits:

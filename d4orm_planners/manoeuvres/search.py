@@ -16,7 +16,7 @@ from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.manoeuvres.curves import Curve, Curves, curve_of
 from d4orm_planners.manoeuvres.heaps import pop
 from d4orm_planners.manoeuvres.lattice import cell_of, is_far_from_all, moved, pose_of
-from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, docks_after, is_sweep_free, reaches, stretch_steps, sweep
+from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, arrives_after, is_sweep_free, reaches, stretch_steps, sweep
 from d4orm_planners.manoeuvres.nodes import Nodes, Task, add, cost_to_go, is_dominated, slot_of
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TOWING, Goal, Limits, Snap, snap_of
@@ -24,15 +24,15 @@ from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_sinc
 
 NOTHING, PAUSED = -1, -2
 """Results of a search that ends without a motion, and of one that is to go on if there is time."""
-DEPARTURE_INTERVAL = 2000
-"""Nodes that are followed until it is asked whether there is time."""
+NODES_PER_CALL = 2000
+"""Nodes that a call follows before it asks its caller whether there is time."""
 SHORT, EVERY = 40, 8
-"""Steps of a last stretch that every node tries, if it is about as quick as any way; longer ones only every eighth."""
+"""Longest last stretch that every node tries [steps]; and of which nodes, every so-manyth, longer ones are tried."""
 
 
 @compiled
 def _has_traffic(traffic: Traffic, nodes: Nodes, count: int, since: int) -> bool:
-    """Check whether anybody comes near to a move at this time or later."""
+    """Check whether another robot comes near to a move at this step or later."""
     seen = (-1, -1)
     for step in range(1, count + 1):
         begin, end = visits_of(traffic, nodes.swept[step, 0], nodes.swept[step, 1])
@@ -47,8 +47,8 @@ def _has_traffic(traffic: Traffic, nodes: Nodes, count: int, since: int) -> bool
 
 @compiled
 def _meeting(task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int, likely: int) -> tuple[int, int]:
-    """A step of a move in which another robot is met if it begins then, zero for none, and the soonest departure at
-    which that one may be gone; the likely step first.
+    """The step of a move that departs then in which it meets another robot, zero for none, and the soonest departure by
+    which that robot may be gone; the likely step is looked at first.
     """
     for first, last in ((likely, likely), (1, count)):
         if first > 0:
@@ -60,7 +60,7 @@ def _meeting(task: Task, nodes: Nodes, traffic: Traffic, count: int, depart: int
 
 @compiled
 def _first_use(task: Task, nodes: Nodes, node: int, move: int) -> int:
-    """The first step at which it is of use to begin a primitive from a node: until then others are at its end."""
+    """The first step at which beginning a primitive is of use: until then nodes at its end are as good as its own."""
     pose, first, end = nodes.pose[node], task.primitives.first[move], task.primitives.first[move + 1]
     depart, count = nodes.time[node], end - first
     if task.goal.docks:
@@ -84,22 +84,22 @@ def _first_use(task: Task, nodes: Nodes, node: int, move: int) -> int:
 
 @compiled
 def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) -> None:
-    """Make a move from a node, as soon as others let it, and later into other intervals."""
+    """Make a move from a node as soon as other robots let it pass, and later into each further safe interval."""
     depart, until = nodes.time[node], nodes.until[node]
     waits = task.primitives.rests[nodes.mode[node]]
     if move >= 0:
         soonest = _first_use(task, nodes, node, move)
-        if soonest >= until or (soonest > depart and not waits):
+        if soonest >= min(until, task.horizon) or (soonest > depart and not waits):
             return
         depart = soonest
-    count, docks = sweep(task, nodes, node, move), False
+    count, arrives = sweep(task, nodes, node, move), False
     if task.goal.docks:
-        end = docks_after(task, nodes, count)
-        count, docks = min(count, end), end <= count
+        end = arrives_after(task, nodes, count)
+        count, arrives = min(count, end), end <= count
     far = move >= 0 and is_far_from_all(task.body, nodes.swept[0, 0], nodes.swept[0, 1], task.primitives.reach[move])
     if count == 0 or not (far or is_sweep_free(task.body, nodes.swept, count, nodes.buffer)):
         return
-    mode = task.primitives.mode[move] if move >= 0 and not docks else -1
+    mode = task.primitives.mode[move] if move >= 0 and not arrives else -1
     busy, met = _has_traffic(traffic, nodes, count, depart), 0
     pose = pose_of(nodes.swept[count])
     while depart < until and depart + count <= task.horizon:
@@ -121,7 +121,7 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
 
 @compiled
 def _snaps(task: Task, nodes: Nodes, traffic: Traffic, node: int) -> None:
-    """Try the last stretch, where it is about as quick as any way."""
+    """Try the last stretch, where it takes about as few steps as the costs promise."""
     pose, mode = nodes.pose[node], nodes.mode[node]
     if task.limits.way == NOWHERE or not task.primitives.rests[mode] or (task.limits.way == TOWING and mode > 0):
         return
@@ -135,7 +135,7 @@ def _snaps(task: Task, nodes: Nodes, traffic: Traffic, node: int) -> None:
 
 @compiled
 def _soonest(task: Task, traffic: Traffic, nodes: Nodes) -> int:
-    """The step from which on the robot can stay at its goal; zero where it may face anywhere, or stands in a bend."""
+    """The step from which on the robot can stay at its goal; zero where its pose there is not known yet."""
     goal, pose = task.goal, nodes.swept[0]
     if np.isnan(goal.heading) or task.curves.last > 0:
         return 0
@@ -164,7 +164,7 @@ def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode:
     """
     if not goes_on:
         _begin(task, traffic, nodes, start, mode)
-    for _ in range(DEPARTURE_INTERVAL):
+    for _ in range(NODES_PER_CALL):
         if nodes.heap.filled[0] == 0 or nodes.filled[0] >= nodes.mode.shape[0]:
             return NOTHING
         _, node = pop(nodes.heap)
@@ -215,5 +215,5 @@ def snap_from(limits: Limits, goal: Goal, x: float, y: float, heading: float, mo
 
 @cached_kernel(**OPTIONS)
 def curve_from(curves: Curves, goal: Goal, x: float, y: float, heading: float, move: int) -> Curve:
-    """The same of a robot with trailers."""
+    """The last stretch of a robot with trailers from a pose, as one of the moves."""
     return curve_of(curves, goal, x, y, heading, -1.0 if move == BEHIND else 1.0)

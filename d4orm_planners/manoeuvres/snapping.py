@@ -15,7 +15,7 @@ NOWHERE, TURNING, SIDEWAYS, TOWING = range(4)
 """Robots that cannot turn on the spot and have no last stretch; those that can; those that need not; those that pull
 trailers, whose last stretch is in :mod:`~d4orm_planners.manoeuvres.curves`."""
 NEAR = 1e-3
-"""Distance from the goal that needs no drive, in its radius."""
+"""Distance from the goal that needs no drive, as a share of the goal radius."""
 
 
 class Limits(NamedTuple):
@@ -49,10 +49,10 @@ class Goal(NamedTuple):
         x: [m].
         y: [m].
         heading: [rad], NaN for any.
-        radius: Distance at which it is there beyond doubt [m].
+        radius: Distance at which the robot has arrived beyond doubt [m].
         tolerance: The same of its heading [rad].
         speed: The same of its speed [m/s].
-        docks: Whether it stays wherever it first is there.
+        docks: Whether the robot stays wherever it first arrives.
     """
 
     x: float

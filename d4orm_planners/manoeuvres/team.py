@@ -1,4 +1,4 @@
-"""The motions of a team: one robot at a time among the others', and some of them anew, until none is left out."""
+"""The motions of a team: planned one robot after another among the others, and replanned for a few at a time."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ FIRST_NODES = 400_000
 """... and among others at first a robot's share of so many, once more after every four searches of each: in a large
 team it is quicker to change others' motions."""
 WEIGHT = 1.5
-"""Times that the steps ahead count more than those behind."""
+"""Factor by which the steps ahead of a node count more than those behind it."""
 DEPARTURE_INTERVAL = 0.7
-"""Time between departures that are tried, in what the fastest robot takes for the radius of the largest one."""
+"""Time between departures that are tried, as a share of that in which the fastest robot drives the radius of the
+largest one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class TeamMotions:
 
     def __init__(self, scene: ManoeuvreScene, robots: list[Robot], should_stop: Callable[[], bool]) -> None:
         self.problem, self.robots, self.should_stop = scene.problem, robots, should_stop
-        self._area, self._reach, problem = scene.area, scene.reach, scene.problem
+        self._area, self._interaction_range, problem = scene.area, scene.interaction_range, scene.problem
         size, horizon = problem.num_robots, problem.horizon
         self._nodes, self._searches = self._room_for_nodes(), size
         self._poses = np.empty((size, horizon + 1, POSE_SIZE), np.float32)
@@ -128,7 +129,7 @@ class TeamMotions:
             self._drop(robot)
 
     def odds(self, random: np.random.Generator) -> Odds:
-        """See :meth:`LowLevelPlanner.odds`: who has no motion is late, and who takes longer than alone."""
+        """See :meth:`LowLevelPlanner.odds`: robots without a motion are late, or else those that are slower."""
         missing = np.array([motion is None for motion in self.motions])
         if missing.any():
             delay = missing.astype(float)
@@ -141,10 +142,10 @@ class TeamMotions:
             own = self.alone[robot]
             if own is not None:
                 positions[: own.steps + 1, robot], positions[own.steps :, robot] = own.poses[:, :2], own.poses[-1, :2]
-        return Odds(delay, positions, until, 4 * self._reach, (2, 4))
+        return Odds(delay, positions, until, 4 * self._interaction_range, (2, 4))
 
     def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
-        """See :meth:`LowLevelPlanner.replan`."""
+        """See :meth:`LowLevelPlanner.replan`; those still to be planned wait at their starts for a while, or not."""
         for group in groups:
             before, cost = self.motions.copy(), self.cost
             order = group.tolist()
@@ -187,7 +188,7 @@ class TeamMotions:
         for other, steps in held.items():
             if steps > 0:
                 last[other], gone[other] = 0, steps
-        return traffic_of(self._poses, last, gone, self._area.low, self._area.high, self._reach)
+        return traffic_of(self._poses, last, gone, self._area.low, self._area.high, self._interaction_range)
 
     def _room_for_nodes(self) -> Nodes:
         return Nodes.of(MAX_NODES, buffer_size(self.problem.team.all_footprint_arrays))
@@ -217,7 +218,7 @@ class TeamMotions:
         return None if node < 0 else _motion(robot, task, nodes, node)
 
     def controls(self) -> FloatArray:
-        """``(H, K, m)`` of the whole team; who has no motion stands."""
+        """``(H, K, m)`` of the whole team; a robot without a motion is at rest."""
         problem = self.problem
         controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
         for robot, motion in enumerate(self.motions):

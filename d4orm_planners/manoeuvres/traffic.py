@@ -1,4 +1,4 @@
-"""Poses of the other robots over time, and the time until which a pose is safe from them."""
+"""Motions of the other robots, and the steps in which a pose or a move is safe from them."""
 
 from __future__ import annotations
 
@@ -18,24 +18,22 @@ NEVER = 1 << 40
 
 
 class Traffic(NamedTuple):
-    """The motions of others, and a grid of who comes near to its cells when.
+    """The motions of other robots, and a grid of who comes near to its cells when.
 
     Attributes:
         poses: ``(K, T + 1, 6)`` float32.
         last: ``(K,)`` number of the last step at which each moves; it stays there, ...
         gone: ``(K,)`` ... but is there no more from this step on.
-        end: The last step at which anything changes.
         low: ``(2,)`` lowest corner of the grid [m].
-        scale: One over the size of its cells [1/m], no less than two robots' outer radii.
+        scale: One over the size of its cells [1/m], beyond which robots do not meet in a step.
         size: ``(2,)`` cells along x and y.
         first: ``(C + 1,)`` where the visits to each cell begin.
-        visits: ``(V, 3)`` who comes near, and the first and the last step.
+        visits: ``(V, 3)`` the robot that comes near, and the first and the last step.
     """
 
     poses: FloatArray
     last: IntArray
     gone: IntArray
-    end: int
     low: Floats
     scale: float
     size: tuple[int, int]
@@ -68,38 +66,35 @@ def count_visits(
     poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, scale: float, size: tuple[int, int],
     first: IntArray, visits: IntArray,
 ) -> None:  # fmt: skip
-    """Count the visits to every cell; or write them, if there are rows for them, which ``first`` then tells."""
+    """Count the visits to every cell in ``first``; or, if there are rows for them, write each where ``first`` says."""
     for robot in range(poses.shape[0]):
         if last[robot] < 0:
             continue
         since, at = 0, _cell(low, scale, size, poses[robot, 0, 0], poses[robot, 0, 1])
         for step in range(1, last[robot] + 1):
-            there = _cell(low, scale, size, poses[robot, step, 0], poses[robot, step, 1])
-            if there != at:
+            after = _cell(low, scale, size, poses[robot, step, 0], poses[robot, step, 1])
+            if after != at:
                 _note(first, visits, size, at, robot, since, step - 1)
-                since, at = step, there
+                since, at = step, after
         _note(first, visits, size, at, robot, since, gone[robot] - 1)
 
 
-def traffic_of(
-    poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, high: Floats, radius_sum: float
-) -> Traffic:
-    """The motions of robots ``(K, T + 1, 6)``; who has none moves last at step -1."""
-    counted = np.maximum(np.ceil((high - low) / radius_sum), 1)
+def traffic_of(poses: FloatArray, last: IntArray, gone: IntArray, low: Floats, high: Floats, cell: float) -> Traffic:
+    """The motions of robots ``(K, T + 1, 6)``, in cells of this size [m]; one that has none moves last at step -1."""
+    counted = np.maximum(np.ceil((high - low) / cell), 1)
     size = (int(counted[0]), int(counted[1]))
     cells = size[0] * size[1]
     counts = np.zeros(cells, np.int64)
-    count_visits(poses, last, gone, low, 1 / radius_sum, size, counts, np.empty((0, 3), np.int64))
-    end = int(max(last.max(), gone[gone < NEVER].max(initial=0)))
+    count_visits(poses, last, gone, low, 1 / cell, size, counts, np.empty((0, 3), np.int64))
     first = np.concatenate([[0], np.cumsum(counts)])
     visits = np.empty((max(int(first[-1]), 1), 3), np.int64)
-    count_visits(poses, last, gone, low, 1 / radius_sum, size, first[:-1].copy(), visits)
-    return Traffic(poses, last, gone, end, low, 1 / radius_sum, size, first, visits)
+    count_visits(poses, last, gone, low, 1 / cell, size, first[:-1].copy(), visits)
+    return Traffic(poses, last, gone, low, 1 / cell, size, first, visits)
 
 
 @compiled
 def visits_of(traffic: Traffic, x: float, y: float) -> tuple[int, int]:
-    """The rows of the visits to the cell of a place."""
+    """The rows of the visits to the cell of a position: the first, and the one after the last."""
     i, j = _cell(traffic.low, traffic.scale, traffic.size, x, y)
     cell = i * traffic.size[1] + j
     return traffic.first[cell], traffic.first[cell + 1]
@@ -110,27 +105,28 @@ def _meets(
     body: RobotBody, traffic: Traffic, other: Whole, step: Whole, before: Floats, after: Floats, parts: int,
     buffer: FloatArray,
 ) -> bool:  # fmt: skip
-    """Check whether another robot is too near to this one in a step that ends at a number, between two poses of it."""
+    """Check whether another robot is too near to this one in a step that ends at ``step``, between two poses of it."""
     arrays, k, last = body.arrays, body.robot, traffic.last[other]
     end, begin = traffic.poses[other, min(step, last)], traffic.poses[other, min(max(step - 1, 0), last)]
-    radius_sum = arrays.radius[k] + arrays.radius[other] + body.extra
+    safety_distance = arrays.radius[k] + arrays.radius[other] + body.extra
     dx, dy = np.float32(end[0] - after[0]), np.float32(end[1] - after[1])
-    far = radius_sum + np.float32(2 * body.stride)
+    far = safety_distance + np.float32(2 * body.stride)
     if dx * dx + dy * dy > far * far:
         return False
     for part in range(parts):
         pose, its_pose = pose_between(before, after, part / parts), pose_between(begin, end, part / parts)
         dx, dy = np.float32(its_pose[0]) - np.float32(pose[0]), np.float32(its_pose[1]) - np.float32(pose[1])
-        if dx * dx + dy * dy <= radius_sum * radius_sum and _touches(body, other, pose, its_pose, dx, dy, buffer):
+        near = dx * dx + dy * dy <= safety_distance * safety_distance
+        if near and _touches(body, other, pose, its_pose, dx, dy, buffer):
             return True
     return False
 
 
 @compiled
 def _steps_away(body: RobotBody, traffic: Traffic, other: Whole, step: Whole, pose: Floats, moving: int) -> int:
-    """Steps, from one on, in which another robot cannot be too near to one that is there, if one or both move."""
-    there = traffic.poses[other, min(step, traffic.last[other])]
-    dx, dy = there[0] - pose[0], there[1] - pose[1]
+    """Steps, from one on, in which another robot cannot be too near to a pose; ``moving`` is 1, or 2 if both move."""
+    its_pose = traffic.poses[other, min(step, traffic.last[other])]
+    dx, dy = its_pose[0] - pose[0], its_pose[1] - pose[1]
     far = body.arrays.radius[body.robot] + body.arrays.radius[other] + body.extra + 2 * body.stride
     return max(0, int((np.sqrt(dx * dx + dy * dy) - far) / (moving * body.stride)))
 
@@ -191,13 +187,13 @@ def meeting(
 
 @compiled
 def safe_until(body: RobotBody, traffic: Traffic, step: Whole, pose: Floats, buffer: FloatArray) -> int:
-    """The first step, from this one on, in which another robot comes too near to one that stands there."""
+    """The first step, from this one on, in which another robot is too near to a pose; :data:`NEVER` for none."""
     until = NEVER
     begin, end = visits_of(traffic, pose[0], pose[1])
     for row in range(begin, end):
         other = traffic.visits[row, 0]
         since = max(step, traffic.visits[row, 1])
-        # Who stands does not come nearer.
+        # A robot at rest does not come nearer.
         last, at = min(traffic.visits[row, 2], until - 1, max(traffic.last[other], since)), since
         while at <= last:
             away = _steps_away(body, traffic, other, at, pose, 1)
@@ -210,18 +206,16 @@ def safe_until(body: RobotBody, traffic: Traffic, step: Whole, pose: Floats, buf
 
 @compiled
 def safe_since(body: RobotBody, traffic: Traffic, pose: Floats, buffer: FloatArray) -> int:
-    """The first step from which on no other robot comes too near to one that stands there, :data:`NEVER` for none."""
+    """The first step from which on no other robot is too near to a pose; :data:`NEVER` for none."""
     since = 0
     begin, end = visits_of(traffic, pose[0], pose[1])
     for row in range(begin, end):
         other = traffic.visits[row, 0]
-        last = min(traffic.visits[row, 2], max(traffic.last[other], traffic.visits[row, 1]))
+        # In the step after its last move it stands as it does from then on, until it is gone.
+        last = min(traffic.visits[row, 2], traffic.last[other] + 1)
         for at in range(last, max(since, traffic.visits[row, 1]) - 1, -1):
             if _meets(body, traffic, other, at, pose, pose, body.parts, buffer):
-                if at == last < traffic.visits[row, 2]:
-                    # It stands there until it is gone.
-                    at = traffic.visits[row, 2]
-                since = max(since, min(at + 1, NEVER))
+                since = max(since, (traffic.visits[row, 2] if at == last else at) + 1)
                 break
     return since
 

@@ -15,7 +15,7 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.dynamics.car_with_trailers import MAX_STEERING, WHEELBASE
-from d4orm_planners.manoeuvres.kinds import OPS, SECTOR, Kind, Mode, Move, held
+from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, SECTOR, Kind, Mode, Move, held
 
 SHARE = 0.95
 """Share of the largest hitch and steering angles that is used."""
@@ -76,13 +76,13 @@ def circle(kind: Kind, curvature: float) -> Floats | None:
 
 
 @cache
-def tightest(kind: Kind) -> float:
+def tightest_curvature(kind: Kind) -> float | None:
     """The largest curvature of a circle that trailers can swing into and out of, in a grid of shares of that of the
-    wheels or of the shortest hitch.
+    wheels or of the shortest hitch; ``None`` if hitch angles are bounded too narrowly for any.
     """
     most = min(_most_curved(kind), 1 / min(kind.limits[column] for _, column in kind.model.trailers))
     shares = np.arange(1.0, 0.0, -FINER)
-    return next(curvature for curvature in (shares * most).tolist() if _is_joined(kind, curvature))
+    return next((curvature for curvature in (shares * most).tolist() if _is_joined(kind, curvature)), None)
 
 
 def _is_joined(kind: Kind, curvature: float) -> bool:
@@ -90,8 +90,8 @@ def _is_joined(kind: Kind, curvature: float) -> bool:
     hitches = circle(kind, curvature)
     if hitches is None:
         return False
-    there, straight = tuple(hitches.tolist()), (0.0,) * len(hitches)
-    return all(swing(kind, *ends, -1) is not None for ends in ((there, straight), (straight, there)))
+    bent, straight = tuple(hitches.tolist()), (0.0,) * len(hitches)
+    return all(swing(kind, *ends, -1) is not None for ends in ((bent, straight), (straight, bent)))
 
 
 @cache
@@ -111,7 +111,7 @@ def swing(kind: Kind, before: Mode, after: Mode, way: int) -> FloatArray | None:
         span = len(ahead) * kind.pace(1) * kind.dt
         guess = np.array([_curvature(kind, angle) for angle in ahead[:: len(ahead) // size, 1][::-1].tolist()])
     count = kind.steps(span / size, abs(speed))
-    while count <= kind.steps(LONGEST * metres / size, abs(speed)):
+    while count <= min(kind.steps(LONGEST * metres / size, abs(speed)), MAX_STEPS // size):
         controls = _shot(kind, before, np.array(after), speed, count, guess)
         if controls is not None:
             return controls
@@ -158,17 +158,17 @@ def _solved(matrix: Floats, right: Floats) -> Floats | None:
 
 
 def trailer_moves(kind: Kind) -> Iterator[Move]:
-    """Straight on, in the tightest circles to both sides, between these, and from the hitch angles at the start."""
-    base = kind.base
-    curvature = tightest(base)
-    hitches = circle(base, curvature)
-    assert hitches is not None
-    straight: Mode = (0.0,) * len(hitches)
-    left, right = tuple(hitches.tolist()), tuple((-hitches).tolist())
+    """Straight on, in the tightest circles if there are any, between these, and from the hitch angles at the start."""
+    base, straight = kind.base, (0.0,) * len(kind.model.trailers)
+    curvature = tightest_curvature(base)
+    hitches = None if curvature is None else circle(base, curvature)
     for way in (1, -1):
         speed = way * kind.pace(way)
         for length in LENGTHS:
             yield straight, straight, held(kind.steps(length * kind.cell, abs(speed)), speed, 0.0)
+        if curvature is None or hitches is None:
+            continue
+        left, right = tuple(hitches.tolist()), tuple((-hitches).tolist())
         for mode, side, sectors in ((mode, side, arc) for (mode, side), arc in product(((left, 1), (right, -1)), ARCS)):
             count = kind.steps(sectors * SECTOR / curvature, abs(speed))
             yield mode, mode, held(count, speed, steering(kind, side * curvature))

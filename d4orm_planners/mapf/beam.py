@@ -128,8 +128,8 @@ def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
     )  # fmt: skip
 
 
-def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int, lanes: int) -> BeamSpace:
-    """Space for a beam of so many paths, moves and blocks of steps, and a workspace of so many lanes' numbers."""
+def make_beam_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int, lanes: int) -> BeamSpace:
+    """Workspace for a beam of so many paths, moves and blocks of steps, with so many numbers for block drives."""
     before, moves = np.empty((2, width * num_blocks), np.int64)
     most = width * num_moves
     return BeamSpace(
@@ -141,7 +141,7 @@ def make_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, 
 
 @compiled
 def is_like_another(new: Beam, node: Whole, kept: Beam, size: Whole, dedup2: float) -> bool:
-    """Check whether a path is about where one of those kept is, about as fast."""
+    """Check whether a path is about where one of those kept is, and about as fast."""
     for other in range(size):
         gap2, change2 = 0.0, 0.0
         for axis in range(new.velocities.shape[1]):
@@ -168,7 +168,7 @@ def keep(new: Beam, node: Whole, kept: Beam, size: Whole, numbers: IntArray, eve
 
 @compiled
 def sink(bounds: Floats, heap: IntArray, position: Whole, size: Whole) -> None:
-    """Let what is at a place of a heap sink below all that comes before it: lower bounds, then lower numbers."""
+    """Let the entry at a position of a heap sink below all that come before it: lower bounds, then lower numbers."""
     node = heap[position]
     while 2 * position + 1 < size:
         child = 2 * position + 1

@@ -1,4 +1,4 @@
-"""Beam search of one robot's path among all others' known ways, in space and time, compiled with numba.
+"""Beam search of one robot's path in space and time among the known paths of all others, compiled with numba.
 
 A path is made of pieces of a block of steps each, in which the robot heads for its goal, faster or slower, stops, or
 turns off by some angle. After every block the most promising of the paths so far are kept.
@@ -43,10 +43,10 @@ Ending: TypeAlias = tuple[float, Whole, Whole]
 
 
 @compiled
-def _count_beside(
+def _count_extra(
     table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, first: Whole, last: Whole
 ) -> int:
-    """Count the further paths that a path meets from one step to another; at its end it is at rest."""
+    """Count the extra paths that a path meets from one step to another; at its end it is at rest."""
     count, end = 0, path.shape[0] - 1
     for other in range(others.extra.shape[1]):
         safety_distance = table.radius[robot] + others.radius[r, other] + table.margin
@@ -64,10 +64,10 @@ def _count_beside(
 
 @compiled
 def _count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
-    """Count those whom a path through a block meets there."""
+    """Count the robots that a path meets in a block."""
     robot, (first, last) = queries.robots[r], steps_of(table, block)
     count = count_near(table, robot, queries.others.exclude[r], path, first, block)
-    return count + _count_beside(table, robot, queries.others, r, path, first, last)
+    return count + _count_extra(table, robot, queries.others, r, path, first, last)
 
 
 @inlined
@@ -120,7 +120,7 @@ def _keep_best(
 def _count_passing(
     table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, block: Whole, last_busy: Whole
 ) -> int:
-    """Count those who come by after a block that ended at the goal, where the robot stays; ``path`` is changed."""
+    """Count the robots that come by after a block that ended at the goal, where this one stays; ``path`` is changed."""
     first, last = steps_of(table, block)
     for row in range(path.shape[0]):
         for axis in range(path.shape[1]):
@@ -128,7 +128,7 @@ def _count_passing(
     count = 0
     for later in range(block + 1, last_busy + 1):
         count += count_near(table, robot, others.exclude[r], path, steps_of(table, later)[0], later)
-    return count + _count_beside(table, robot, others, r, path, last, len(table.positions))
+    return count + _count_extra(table, robot, others, r, path, last, len(table.positions))
 
 
 def _move_follower(model: Model) -> Callable[..., int]:

@@ -12,7 +12,7 @@ from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
-from d4orm_planners.mapf.beam import BeamRules, OtherAgents, Queries, make_space
+from d4orm_planners.mapf.beam import BeamRules, OtherAgents, Queries, make_beam_space
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.mapf.block_drives import LANES
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives, Moves
@@ -65,7 +65,7 @@ def find_paths(
 def _search(
     team: WorkingPlan, model: Model, moves: Moves, rules: BeamRules, queries: Queries, u: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and arrivals, of robots of one model that did as given."""
+    """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and arrivals of one model's robots; as given if none arrives."""
     found, search = np.zeros(len(u), bool), search_kernel(model.name)
     arrays, table = team.problem.arrays, team.index.table
     # Some searches take many times as long as others: who is done takes the next one.
@@ -73,7 +73,7 @@ def _search(
 
     def look(_: IntArray) -> None:
         d, num_blocks = team.problem.dimension, len(table.first)
-        space = make_space(rules.width, len(moves.pace), num_blocks, BLOCK, x.shape[2], d, LANES)
+        space = make_beam_space(rules.width, len(moves.pace), num_blocks, BLOCK, x.shape[2], d, LANES)
         for number in waiting:
             if team.search.should_stop():
                 break

@@ -1,4 +1,4 @@
-"""Path finding for a team on a roadmap: LaCAM, a search over where the whole team is.
+"""Path finding for a team on a roadmap: LaCAM, a search over the nodes of the whole team.
 
 After K. Okumura, *LaCAM: search-based algorithm for quick multi-agent pathfinding* (AAAI 2023). What follows a
 configuration is made by :mod:`pibt <d4orm_planners.mapf.pibt>`, at first without constraints; whenever a
@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core.arrays import BoolArray, IntArray
+from d4orm_env.core.arrays import BoolArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_planners.mapf.pibt import PibtWorkspace, step_team
-from d4orm_planners.mapf.roadmap import PAIR_SLACK, ROUNDING, Footprints, Roadmap, fill_costs, is_open
+from d4orm_planners.mapf.roadmap import PAIR_SLACK, ROUNDING, Roadmap, RobotArrays, fill_costs, is_open
 
 
 class SearchConstraint(NamedTuple):
@@ -37,13 +37,14 @@ class TeamConfiguration:
         parent: Configuration that it came from; ``None`` for the start.
         moves: ``(M, 2)`` robots and edges in the order of the moves that led here.
         priorities: ``(K,)`` the highest goes first.
+        order: ``(K,)`` robots in that order.
         untried: Constraints.
     """
 
     positions: IntArray
     parent: TeamConfiguration | None
     moves: IntArray
-    priorities: np.ndarray
+    priorities: Floats
     order: IntArray = field(init=False)
     untried: deque[SearchConstraint] = field(default_factory=lambda: deque([SearchConstraint()]))
 
@@ -75,12 +76,12 @@ class TeamMoves:
 
 
 class TeamOnRoadmap:
-    """The robots' paths to their goals around those that have docked."""
+    """The robots' paths to their goals around those that have arrived, and the order in which they may arrive."""
 
     def __init__(self, problem: Problem, roadmap: Roadmap) -> None:
         self.roadmap, num_robots, num_nodes = roadmap, problem.num_robots, len(roadmap.nodes)
         radius = np.asarray(problem.team.radius, np.float64)
-        self.bodies = Footprints(
+        self.bodies = RobotArrays(
             radius=radius,
             size=problem.team.largest_radius,
             safety_distance=radius * (1 - ROUNDING) + problem.margin,
@@ -126,7 +127,7 @@ class TeamOnRoadmap:
         return arrived
 
     def fill(self, robot: int, mask: BoolArray, holds: bool = False) -> None:
-        """A robot's paths anew: to its goal, or while it holds for others to where it started, out of their path."""
+        """Find a robot's paths again: to its goal or, while it waits for others to arrive, back to its start."""
         end = self.roadmap.starts[robot] if holds else self.roadmap.goals[robot]
         fill_costs(self.roadmap, self.bodies, self.arrived_at(mask), robot, end, self.bodies.costs[robot])
         self.masks[robot], self.holds[robot] = mask, holds

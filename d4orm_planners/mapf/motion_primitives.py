@@ -49,7 +49,7 @@ class MotionPrimitives:
     on_the_spot: float = 0.001
 
     def moves(self, dimension: int, *, has_heading: bool) -> Moves:
-        """The same for the search."""
+        """The moves as arrays."""
         angle = np.radians(np.array(self.angles))
         # To the left and to the right; in space upwards and downwards too.
         across = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[: 2 * (dimension - 1)]
@@ -71,7 +71,7 @@ class MotionPrimitives:
 
 @compiled
 def frame_at(position: FloatArray, goal: FloatArray) -> Row:
-    """Unit vectors from a place to its goal, across in the plane, and upright to both, one after the other."""
+    """Unit vectors from a position to the goal, across in the plane, and upright to both, one after the other."""
     x, y, z = goal[0] - position[0], goal[1] - position[1], ZERO
     if goal.shape[0] == 3:
         z = goal[2] - position[2]

@@ -32,7 +32,7 @@ class Cells(NamedTuple):
 
 
 def sort_into_cells(points: Floats, width: float) -> Cells:
-    """Cells of this width, or larger ones where there would be many more of them than points.
+    """Sort points into cells of this width, or larger ones where there would be many more of them than points.
 
     Args:
         points: ``(N, 3)`` float64 [m].
@@ -66,13 +66,13 @@ def items_in(cells: Cells, i: int, j: int, low: int, high: int) -> tuple[Whole, 
 
 @inlined
 def cells_about(
-    cells: Cells, tail: Floats, head: Floats, radius_sum: float
+    cells: Cells, tail: Floats, head: Floats, distance: float
 ) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
-    """Along each axis the range of cells with all that may be within ``radius_sum`` of the line between two points."""
+    """Along each axis the range of cells with all that may be within ``distance`` of the line between two points."""
     return (
-        cell_range(cells, 0, min(tail[0], head[0]) - radius_sum, max(tail[0], head[0]) + radius_sum),
-        cell_range(cells, 1, min(tail[1], head[1]) - radius_sum, max(tail[1], head[1]) + radius_sum),
-        cell_range(cells, 2, min(tail[2], head[2]) - radius_sum, max(tail[2], head[2]) + radius_sum),
+        cell_range(cells, 0, min(tail[0], head[0]) - distance, max(tail[0], head[0]) + distance),
+        cell_range(cells, 1, min(tail[1], head[1]) - distance, max(tail[1], head[1]) + distance),
+        cell_range(cells, 2, min(tail[2], head[2]) - distance, max(tail[2], head[2]) + distance),
     )
 
 
@@ -91,15 +91,15 @@ def squared_gap(points: Floats, u: Whole, tails: Floats, v: Whole, heads: Floats
 
 @cached_kernel(variant="near", **OPTIONS)
 def near_lines(
-    cells: Cells, tails: Floats, heads: Floats, radius_sum: float, first: IntArray, items: Ints, after: bool
+    cells: Cells, tails: Floats, heads: Floats, distance: float, first: IntArray, items: Ints, after: bool
 ) -> int:
-    """Find the points that come within ``radius_sum`` of lines.
+    """Find the points that come within ``distance`` of lines.
 
     Args:
         cells: The ``N`` points.
         tails: ``(Q, 3)`` ends of the lines.
         heads: ``(Q, 3)``.
-        radius_sum: [m].
+        distance: [m].
         first: ``(Q + 1,)`` int64 where those of each line begin in ``items``, output.
         items: ``(room,)`` int32 numbers of points, ascending per line, output as far as there is room.
         after: Whether only points with numbers greater than that of the line are wanted.
@@ -110,7 +110,7 @@ def near_lines(
     count = 0
     for q in range(tails.shape[0]):
         first[q] = count
-        (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, tails[q], heads[q], radius_sum)
+        (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, tails[q], heads[q], distance)
         for i in range(low_i, high_i):
             for j in range(low_j, high_j):
                 begin, end = items_in(cells, i, j, low_k, high_k)
@@ -118,7 +118,7 @@ def near_lines(
                     point = cells.items[number]
                     if after and point <= q:
                         continue
-                    if squared_gap(cells.points, point, tails, q, heads, q) < radius_sum * radius_sum:
+                    if squared_gap(cells.points, point, tails, q, heads, q) < distance * distance:
                         if count < items.shape[0]:
                             items[count] = point
                         count += 1
@@ -129,13 +129,13 @@ def near_lines(
 
 
 def find_near(
-    cells: Cells, tails: Floats, heads: Floats, radius_sum: float, after: bool = False
+    cells: Cells, tails: Floats, heads: Floats, distance: float, after: bool = False
 ) -> tuple[IntArray, Ints]:
     """``(first, items)`` of :func:`near_lines`."""
     first, room = np.empty(len(tails) + 1, np.int64), 16 * len(tails)
     while True:
         items = np.empty(room, np.int32)
-        count = near_lines(cells, tails, heads, radius_sum, first, items, after)
+        count = near_lines(cells, tails, heads, distance, first, items, after)
         if count <= room:
             return first, items[:count]
         room = count

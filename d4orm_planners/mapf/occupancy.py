@@ -147,7 +147,7 @@ def note_motions(
 def find_near_boxes(
     others: Others, block: Whole, low: tuple[float, float, float], high: tuple[float, float, float], near: IntArray
 ) -> int:
-    """Find who may be too near to a box in a block of steps: how many they are; ``near`` ``(K + 1,)`` is output."""
+    """Find robots that may be too near to a box in a block, and return how many; ``near`` ``(K + 1,)`` is output."""
     boxes, count = others.boxes[block], 0
     for i in range(others.need.shape[0]):
         need = others.need[i]
@@ -166,7 +166,7 @@ def find_near_boxes(
 
 @cached_kernel(variant="meetings", **OPTIONS)
 def find_meetings(others: Others, positions: Floats, met: BoolArray) -> None:
-    """Find to whom places ``(S + 1, 3)`` are nearer than is needed, after the start; ``met`` ``(K,)`` is output."""
+    """Find the robots that positions ``(S + 1, 3)`` are too near to, after the start; ``met`` ``(K,)`` is output."""
     met[:], near = False, np.empty(others.need.shape[0] + 1, np.int64)
     for block in range((positions.shape[0] - 1) // BLOCK + 1):
         first, last = max(block * BLOCK, 1), min((block + 1) * BLOCK, positions.shape[0])

@@ -17,11 +17,12 @@ from d4orm_env.core.arrays import BoolArray, Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.mapf.near_neighbours import squared_gap
-from d4orm_planners.mapf.roadmap import Footprints, Roadmap, passes_too_near
+from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays, passes_too_near
 
 FREE, MOVING, DONE = 0, 1, 2
-"""Robots that have not moved yet in a step; that are about to, once others have made way; that have, or stay."""
+"""Robots that have not moved yet in a step; that are about to, once others have yielded; that have, or stay."""
 STAY, NOTHING = -1, -2
+"""In place of an edge: to stay at a node, and that no edge is left to try."""
 IDLE, TIE = 1 / 3, 1 / 150
 """Detour that a robot rather makes than stay where it is, and one that is as good as none, in radii of the largest
 robot."""
@@ -65,7 +66,7 @@ def _mixed(a: np.uint64, b: np.uint64) -> float:
 @compiled
 def _rank_options(
     roadmap: Roadmap,
-    bodies: Footprints,
+    bodies: RobotArrays,
     scratch: PibtWorkspace,
     depth: int,
     k: Whole,
@@ -99,7 +100,7 @@ def _rank_options(
 
 @compiled
 def _blocking_robot(
-    roadmap: Roadmap, bodies: Footprints, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: int
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: int
 ) -> Whole:
     """The first robot that has to yield before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
     nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
@@ -108,7 +109,7 @@ def _blocking_robot(
         u = np.int64(roadmap.near[number])
         if bodies.docks and u == bodies.goals[k] and u != at:
             if head != u and roadmap.gaps[number] < bodies.goal_radius + bodies.slack / 2:
-                return -2  # It would dock in passing.
+                return -2  # It would arrive in passing.
             if head == u and not scratch.may_dock[k]:
                 return -2
         i = scratch.who[u]
@@ -131,7 +132,7 @@ def _blocking_robot(
 @compiled
 def _push(
     roadmap: Roadmap,
-    bodies: Footprints,
+    bodies: RobotArrays,
     scratch: PibtWorkspace,
     positions: IntArray,
     depth: int,
@@ -160,7 +161,7 @@ def _next_edge(roadmap: Roadmap, scratch: PibtWorkspace, positions: IntArray, de
 @compiled
 def _move(
     roadmap: Roadmap,
-    bodies: Footprints,
+    bodies: RobotArrays,
     scratch: PibtWorkspace,
     positions: IntArray,
     root: Whole,
@@ -190,7 +191,7 @@ def _move(
             depth -= 1
             if e == NOTHING:
                 if depth >= 0:
-                    scratch.edges[depth] = NOTHING  # Who does not make way blocks this edge.
+                    scratch.edges[depth] = NOTHING  # A robot that does not yield blocks this edge.
                 continue
             head = np.int64(roadmap.heads[e])
             scratch.who[positions[k]], scratch.who[head], positions[k] = -1, k, head
@@ -202,7 +203,7 @@ def _move(
 @cached_kernel(variant="step", **OPTIONS)
 def step_team(
     roadmap: Roadmap,
-    bodies: Footprints,
+    bodies: RobotArrays,
     scratch: PibtWorkspace,
     order: IntArray,
     robots: IntArray,

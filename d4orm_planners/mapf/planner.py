@@ -1,4 +1,4 @@
-"""Path finding on a roadmap, driven under the robots' dynamics and made better by and by: no sampling at all."""
+"""Path finding on a roadmap, driven under the robots' dynamics and improved step by step: no sampling at all."""
 
 from __future__ import annotations
 
@@ -24,9 +24,20 @@ from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_move
 if TYPE_CHECKING:
     from d4orm_planners.mapf.roadmap import Roadmap
 
-
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
+FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
+"""Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
+FEW_PATHS, MOST_PATHS = 4, 30
+"""Paths that are planned per robot before turns on the spot are counted, and before all robots are planned at once."""
+MAX_ROBOT_STEPS = 4_000_000
+"""Most steps of all robots together, whose drives are kept several times over."""
+DETOUR_RATIO = 1.25
+"""Ratio of path to straight line from which a path is a detour; on a lattice any may be 1.1 times as long."""
+LEISURELY = 10
+"""Horizon of the small problems that kernels are compiled with, in straight drives at full speed."""
+STEPS = 3000
+"""Steps of path finding for all at once after which the next roadmap is tried."""
 
 
 @dataclass
@@ -69,20 +80,6 @@ class RoadmapPaths:
                 self.solution = changed
 
 
-FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
-"""Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
-FEW_PATHS, MOST_PATHS = 4, 30
-"""Paths that are planned per robot before turns on the spot are counted, and before all robots are planned at once."""
-MAX_ROBOT_STEPS = 4_000_000
-"""Most steps of all robots together, whose drives are kept several times over."""
-DETOUR_RATIO = 1.25
-"""Ratio of path to straight line from which a path is a detour; on a lattice any may be 1.1 times as long."""
-LEISURELY = 10
-"""Times that a straight drive at full speed takes that the robots have for which kernels are compiled."""
-STEPS = 3000
-"""Steps of path finding for all at once after which the next roadmap is tried."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class MAPFConfig(PlannerConfig):
     """Settings of path finding.
@@ -103,7 +100,7 @@ class RoadmapSolution:
 
     Attributes:
         roadmap: Roadmap that paths are found on.
-        replanning: Their improver.
+        replanning: Search for better ones.
         driven: Rollout of the team on them.
     """
 
@@ -160,27 +157,27 @@ class MAPF(Planner):
         return state, roadmap_iteration(search, state)
 
 
-def roadmap_iteration(search: SolveRun, guide: RoadmapSolution) -> Iteration:
+def roadmap_iteration(search: SolveRun, solution: RoadmapSolution) -> Iteration:
     """Return the team's controls within the horizon."""
-    return Iteration(guide.driven.until(search.problem.horizon))
+    return Iteration(solution.driven.until(search.problem.horizon))
 
 
-def going_on_from_best(search: SolveRun, guide: RoadmapSolution) -> RoadmapSolution:
-    """The guide of a team that drives as in the best plan so far."""
-    return replace(guide, driven=TeamRollout.of(search.best.trajectory))
+def going_on_from_best(search: SolveRun, solution: RoadmapSolution) -> RoadmapSolution:
+    """The solution of a team that drives as in the best plan so far."""
+    return replace(solution, driven=TeamRollout.of(search.best.trajectory))
 
 
 def improve_roadmap_solution(
-    search: SolveRun, guide: RoadmapSolution, neighbours: int, replannings: int
+    search: SolveRun, solution: RoadmapSolution, neighbours: int, replannings: int
 ) -> RoadmapSolution:
     """Replan so many groups of at most so many robots; what is no better for all together is left."""
-    paths = RoadmapPaths(guide.replanning, guide.driven, neighbours, search.should_stop)
+    paths = RoadmapPaths(solution.replanning, solution.driven, neighbours, search.should_stop)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-    return replace(guide, driven=search_neighbourhoods(paths, random, replannings, search.should_stop))
+    return replace(solution, driven=search_neighbourhoods(paths, random, replannings, search.should_stop))
 
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
-    """Paths for the whole team, or as many robots as possible; why there are none if nothing is found in time."""
+    """Paths for the whole team, or as many robots as possible; the reason if none are found in time."""
     problem, best = search.problem, None
     if problem.num_robots * problem.horizon > MAX_ROBOT_STEPS:
         return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for paths")

@@ -1,4 +1,4 @@
-"""Precedence: from moves on a roadmap to routes, and whom each robot has to let pass before it goes on.
+"""Precedence: routes along moves on a roadmap, and which robots each one lets pass before it goes on.
 
 As in action dependency graphs (W. Hoenig, S. Kiesel, A. Tinka, J. W. Durham and N. Ayanian, 2019) only the order
 matters, not the time: wherever two routes come too near to each other, the robot that moved there first goes first.
@@ -102,8 +102,8 @@ def _bends_at(corners: Floats, inner: IntArray) -> RouteBends:
 
 def _arcs(bends: RouteBends, radius: Floats, num_points: int) -> Floats:
     """``(C, P, 3)`` points along the arcs that round corners."""
-    reach = radius * bends.sine / bends.cosine
-    begin, end = bends.corners - bends.before * reach[:, None], bends.corners + bends.after * reach[:, None]
+    tangent = radius * bends.sine / bends.cosine
+    begin, end = bends.corners - bends.before * tangent[:, None], bends.corners + bends.after * tangent[:, None]
     inward = bends.after - bends.before
     inward /= np.maximum(_lengths(inward), TINY)[:, None]
     centre = bends.corners + inward * (radius / bends.cosine)[:, None]
@@ -128,10 +128,12 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
         radius = np.minimum(most, bends.straight * bends.cosine / bends.sine)
         fits = np.ones(len(inner), bool)
         if problem.world.num_obstacles:
-            reach = np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK * size
+            safety_distance = (
+                np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK * size
+            )
             arcs = _arcs(bends, radius, ARC_CHECKS)[..., : problem.dimension]
-            for distance in np.unique(reach).tolist():
-                alike = reach == distance
+            for distance in np.unique(safety_distance).tolist():
+                alike = safety_distance == distance
                 fits[alike] = problem.world.is_clear(arcs[alike], distance).all(axis=1)
         rounded = fits & (radius > SHARPEST * size)
         radii[inner[rounded]] = radius[rounded]
@@ -199,21 +201,21 @@ def _find_touched(
     times: Floats,
     radius: Floats,
     margin: float,
-    reach: float,
+    farthest: float,
     passed: IntArray,
     wanted: IntArray,
     touched: IntArray,
 ) -> int:
-    """Find whose earlier points are too near to point ``a`` of robot ``k``.
+    """Find the robots with earlier points too near to point ``a`` of robot ``k``.
 
     ``touched`` lists these robots, ``wanted`` says how far each of them has to have come; those that have ``passed``
-    as far already are left out. ``reach`` is the greatest distance that may be too near [m].
+    as far already are left out. ``farthest`` is the greatest distance that may be too near [m].
 
     Returns:
         How many they are.
     """
     points, count = cells.points, 0
-    (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], reach)
+    (low_i, high_i), (low_j, high_j), (low_k, high_k) = cells_about(cells, points[a], points[a], farthest)
     for ci in range(low_i, high_i):
         for cj in range(low_j, high_j):
             begin, end = items_in(cells, ci, cj, low_k, high_k)
@@ -244,7 +246,7 @@ def find_waits(
     wait_first: IntArray,
     waits: IntArray,
 ) -> int:
-    """Find whom robots have to let pass; see :class:`Routes`.
+    """Find the robots that each one has to let pass; see :class:`Routes`.
 
     ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it
     has come where.
@@ -252,7 +254,7 @@ def find_waits(
     Returns:
         How many waits there are; as many as there is room for are written.
     """
-    count, num_robots, reach = 0, first.shape[0] - 1, 2.0 * radius.max() + margin
+    count, num_robots, farthest = 0, first.shape[0] - 1, 2.0 * radius.max() + margin
     passed = np.zeros(num_robots, np.int64)
     wanted = np.zeros(num_robots, np.int64)
     touched = np.zeros(num_robots, np.int64)
@@ -261,7 +263,7 @@ def find_waits(
         passed[:] = 0
         for a in range(first[k], first[k + 1]):
             num_touched = _find_touched(
-                cells, a, k, first, owner, times, radius, margin, reach, passed, wanted, touched
+                cells, a, k, first, owner, times, radius, margin, farthest, passed, wanted, touched
             )
             for number in range(num_touched):
                 j = touched[number]

@@ -1,4 +1,4 @@
-"""New paths for some robots of a team that never rests, among all others on the ways that they have."""
+"""New paths for some robots of a team with ever new goals, among all others on their present paths."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ FINENESS = 1.6
 """Fineness of the roadmap."""
 DWELL = 1.0
 """Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
-TURNS = 3
-"""Paths that are planned per robot before it gives up."""
+MOST_PATHS = 3
+"""Paths that are planned per robot before the search gives up."""
 
 
 def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
@@ -23,9 +23,8 @@ def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: i
 
     Args:
         problem: The team where it is now, and its goals.
-        paths: ``(T + 1, K, d)`` where the robots are going to be, from now on [m]; those of ``changed`` are not looked
-            at.
-        changed: ``(K,)`` whose path is planned.
+        paths: ``(T + 1, K, d)`` positions of the robots from now on [m]; those of ``changed`` are not read.
+        changed: ``(K,)`` robots whose paths are planned.
         seed: Of the robots that may have to yield, and of how leisurely they drive.
 
     Returns:
@@ -42,7 +41,7 @@ def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: i
     present.positions[:, changed] = FAR
     before, random, robots = present.positions.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
     order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
-    driven = replanning.settle(present, order, random, lambda: False, TURNS * num_robots)
+    driven = replanning.settle(present, order, random, lambda: False, MOST_PATHS * num_robots)
     if driven is None:
         return None
     for robot in np.flatnonzero((driven.positions != before).any(axis=(0, 2))):
@@ -52,7 +51,7 @@ def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: i
 
 
 def _driven(problem: Problem, paths: FloatArray, dwell: int) -> TeamRollout:
-    """A team on its paths ``(H + 1, K, d)``, which leaves its goals again; nothing is known of its controls."""
+    """A team on its paths ``(H + 1, K, d)``, whose robots leave their goals again; its controls are not known."""
     steps, num_robots, d = problem.horizon, problem.num_robots, problem.dimension
     at_goal = np.linalg.norm(paths - problem.goal, axis=2) <= problem.goal_radius
     arrivals = np.where(at_goal.any(axis=0), at_goal.argmax(axis=0), steps)

@@ -12,7 +12,7 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.beam import sink
-from d4orm_planners.mapf.roadmap import Footprints, Roadmap
+from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
 from d4orm_planners.mapf.safe_intervals import Intervals, Reservations, interval_at
 from d4orm_planners.mapf.straightening import first_meeting, meeting
 from d4orm_planners.mapf.trips import Trip, steps_to_turn
@@ -111,7 +111,7 @@ def _departure(
         elif before >= 0 and tree[before, 2] <= until:
             depart += safe.ends[arrival] - until
         elif until <= dock:
-            depart = max(depart, dock - steps - trip.launch) + 1
+            depart = max(depart, dock - turn - steps - trip.launch) + 1
         elif safe.ends[arrival] < min(until + trip.dwell, trip.latest):
             depart += 1 + safe.ends[arrival] - until
         else:
@@ -167,8 +167,8 @@ def _follow_edge(
 
 
 @compiled
-def _is_way(roadmap: Roadmap, bodies: Footprints, k: Whole, node: Whole, e: Whole) -> bool:
-    """Check whether a robot can take an edge from a node: it fits, leads to the goal, and does not dock in passing."""
+def _is_way(roadmap: Roadmap, bodies: RobotArrays, k: Whole, node: Whole, e: Whole) -> bool:
+    """Check whether a robot can take an edge from a node: it fits, can go on to its goal, and does not pass that."""
     nodes, head, goal = roadmap.nodes, np.int64(roadmap.heads[e]), bodies.goals[k]
     if roadmap.room[e] < bodies.safety_distance[k] or not bodies.costs[k, head] < np.inf:
         return False
@@ -178,7 +178,7 @@ def _is_way(roadmap: Roadmap, bodies: Footprints, k: Whole, node: Whole, e: Whol
 
 
 @compiled
-def _soonest(roadmap: Roadmap, bodies: Footprints, reservations: Reservations, k: Whole, trip: Trip) -> Whole:
+def _soonest(roadmap: Roadmap, bodies: RobotArrays, reservations: Reservations, k: Whole, trip: Trip) -> Whole:
     """The first step at which some edge to the goal is free for a robot that comes to stay; none if beyond the last."""
     others, buckets, goal, until = reservations.others, reservations.buckets, bodies.goals[k], reservations.dock + 1
     while until <= trip.latest:
@@ -203,7 +203,7 @@ def _room_needed(roadmap: Roadmap, safe: Intervals, node: Whole) -> Whole:
 
 
 @compiled
-def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip: Trip, tree: _Tree) -> Whole:
+def _grow(roadmap: Roadmap, bodies: RobotArrays, search: _Search, k: Whole, trip: Trip, tree: _Tree) -> Whole:
     """Search until an entry is at the goal for good, which is returned; -1 if there is none, -2 if room is short."""
     goal, costs = bodies.goals[k], bodies.costs[k]
     passing = Trip(trip.stride, trip.launch, trip.latest, np.int64(-1), trip.turn, trip.facing)
@@ -226,10 +226,8 @@ def _grow(roadmap: Roadmap, bodies: Footprints, search: _Search, k: Whole, trip:
             if _is_way(roadmap, bodies, k, node, e):
                 head = np.int64(roadmap.heads[e])
                 motion = trip if head == goal else passing
-                dock, left = (
-                    search.reservations.dock if head == goal and bodies.docks else np.int64(-1),
-                    costs[head] / trip.stride,
-                )
+                dock = search.reservations.dock if head == goal and bodies.docks else np.int64(-1)
+                left = costs[head] / trip.stride
                 _follow_edge(search, roadmap, e, left, motion, dock, tree, entry)
                 if head == goal:
                     last = np.int64(search.came[search.reservations.safe.first[goal + 1] - 1])
@@ -251,7 +249,7 @@ def _with_room(tree: _Tree, room: Whole) -> _Tree:
 
 
 @cached_kernel(variant="path", **OPTIONS)
-def find_path(roadmap: Roadmap, bodies: Footprints, reservations: Reservations, k: Whole, trip: Trip) -> IntArray:
+def find_path(roadmap: Roadmap, bodies: RobotArrays, reservations: Reservations, k: Whole, trip: Trip) -> IntArray:
     """The soonest path of a robot to its goal among all others: safe interval path planning.
 
     After M. Phillips and M. Likhachev, *SIPP: safe interval path planning for dynamic environments* (ICRA 2011).
@@ -271,10 +269,8 @@ def find_path(roadmap: Roadmap, bodies: Footprints, reservations: Reservations, 
         return np.empty((0, 3), np.int64)
     search = _Search(reservations, np.full(reservations.safe.begins.shape[0], -1, np.int32), soonest)
     tree = _Tree(np.empty((1024, 5), np.int64), np.empty(1024), np.empty(1024, np.int64), np.zeros(2, np.int64))
-    zero, interval = (
-        np.int64(0),
-        reservations.safe.first[start],
-    )  # a literal would compile what it is passed to once more
+    zero = np.int64(0)  # a literal would compile what it is passed to once more
+    interval = reservations.safe.first[start]
     search.came[interval] = 0
     _add_entry(tree, start, zero, zero, zero - 1, interval, float(bodies.costs[k, start]) / trip.stride)
     while True:

@@ -1,4 +1,4 @@
-"""Roadmap of the free space: a lattice fitted to the walls, all starts and goals; lengths of shortest paths on it."""
+"""Roadmap of the free space, a lattice fitted to the walls with all starts and goals, and shortest paths on it."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ PAD = 3
 
 
 class Roadmap(NamedTuple):
-    """Places and the straight lines between them on which a robot keeps clear of obstacles.
+    """Positions and the straight lines between them on which a robot keeps clear of obstacles.
 
     Attributes:
-        nodes: ``(N, 3)`` float64 places [m].
+        nodes: ``(N, 3)`` float64 positions [m].
         first: ``(N + 1,)`` int64 where the edges from each begin.
         heads: ``(E,)`` int32 where each edge leads.
         lengths: ``(E,)`` float64 [m].
-        room: ``(E,)`` float64 the largest radius and margin that passes [m].
+        room: ``(E,)`` float64 largest safety distance of a robot that passes [m].
         near_first: ``(E + 1,)`` int64 where the nodes near each edge begin, those it joins included.
         near: int32 nodes near edges.
         gaps: float64 how near they are [m].
@@ -85,14 +85,14 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
 
 
 def _assembled(
-    problem: Problem, nodes: Floats, one: IntArray, other: IntArray, room: Floats, safety_distance: float
+    problem: Problem, nodes: Floats, one: IntArray, other: IntArray, room: Floats, distance: float
 ) -> Roadmap:
-    """The roadmap of nodes and undirected edges."""
+    """The roadmap of nodes and undirected edges, and of nodes within ``distance`` of these [m]."""
     tails, heads = np.concatenate([one, other]), np.concatenate([other, one])
     order = np.lexsort((heads, tails))
     tails, heads, room = tails[order], heads[order], np.concatenate([room, room])[order]
     first = np.searchsorted(tails, np.arange(len(nodes) + 1)).astype(np.int64)
-    near_first, near = find_near(sort_into_cells(nodes, safety_distance), nodes[tails], nodes[heads], safety_distance)
+    near_first, near = find_near(sort_into_cells(nodes, distance), nodes[tails], nodes[heads], distance)
     gaps = np.empty(len(near))
     measure_gaps(nodes, tails, heads, near_first, near, gaps)
     d = problem.dimension
@@ -142,8 +142,8 @@ ROUNDING = 2.0**-27
 """Share of the radius of the largest robot that is rounding."""
 
 
-class Footprints(NamedTuple):
-    """The robots.
+class RobotArrays(NamedTuple):
+    """Robots as discs, and their paths to their goals, as the kernels of path finding read them.
 
     Attributes:
         radius: ``(K,)`` [m].
@@ -177,7 +177,7 @@ def _gap(points: Floats, u: Whole, v: Whole) -> float:
 
 @compiled
 def passes_too_near(
-    roadmap: Roadmap, bodies: Footprints, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
+    roadmap: Roadmap, bodies: RobotArrays, k: Whole, tail: Whole, head: Whole, i: Whole, u: Whole, gap: float
 ) -> bool:
     """Check whether robot ``k`` passes robot ``i`` at node ``u`` too near, ``gap``, on its way between two nodes.
 
@@ -197,12 +197,12 @@ def passes_too_near(
 
 
 @compiled
-def closed(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, tail: Whole, e: Whole) -> bool:
-    """Check whether an edge is closed to a robot for good: it would dock in passing, or be too near a docked one.
+def closed(roadmap: Roadmap, bodies: RobotArrays, arrived: Ints, k: Whole, tail: Whole, head: Whole, e: Whole) -> bool:
+    """Check whether an edge, or its reverse, is closed for good to a robot that drives from ``tail`` to ``head``.
 
-    ``arrived`` ``(N,)`` is the robot docked at each node, -1 for none.
+    The robot does not fit, would arrive in passing, or be too near to one that has arrived. ``arrived`` ``(N,)`` is the
+    robot that has arrived at each node, -1 for none.
     """
-    head = np.int64(roadmap.heads[e])
     if roadmap.room[e] < bodies.safety_distance[k]:
         return True
     if not bodies.docks:
@@ -220,8 +220,8 @@ def closed(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, tail: 
 
 
 @cached_kernel(variant="costs", **OPTIONS)
-def fill_costs(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
-    """Length of a robot's shortest path from every node to one; ``costs`` ``(N,)`` is output."""
+def fill_costs(roadmap: Roadmap, bodies: RobotArrays, arrived: Ints, k: Whole, end: Whole, costs: FloatArray) -> None:
+    """Length of a robot's shortest path from every node to node ``end``; ``costs`` ``(N,)`` is output."""
     costs[:] = np.inf
     heap = [(0.0, np.int64(end))]
     costs[end] = 0.0
@@ -233,14 +233,14 @@ def fill_costs(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, en
             head = np.int64(roadmap.heads[e])
             # Compared as they are kept, in single precision, or rounding would let nodes come up for ever.
             through = np.float32(cost + roadmap.lengths[e])
-            if through < costs[head] and not closed(roadmap, bodies, arrived, k, n, e):
+            if through < costs[head] and not closed(roadmap, bodies, arrived, k, head, n, e):
                 costs[head] = through
                 heapq.heappush(heap, (np.float64(through), head))
 
 
 @cached_kernel(variant="open", **OPTIONS)
-def is_open(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
-    """Check whether no docked robot closes the path that a robot at a node would take by these costs."""
+def is_open(roadmap: Roadmap, bodies: RobotArrays, arrived: Ints, k: Whole, at: Whole, costs: FloatArray) -> bool:
+    """Check whether no robot that has arrived closes the path that a robot at a node would take by these costs."""
     if not costs[at] < np.inf:
         return False
     while at != bodies.goals[k]:
@@ -248,7 +248,10 @@ def is_open(roadmap: Roadmap, bodies: Footprints, arrived: Ints, k: Whole, at: W
         for e in range(roadmap.first[at], roadmap.first[at + 1]):
             if costs[roadmap.heads[e]] < best and roadmap.room[e] >= bodies.safety_distance[k]:
                 best, edge = costs[roadmap.heads[e]], e
-        if edge < 0 or closed(roadmap, bodies, arrived, k, at, edge):
+        if edge < 0:
             return False
-        at = np.int64(roadmap.heads[edge])
+        head = np.int64(roadmap.heads[edge])
+        if closed(roadmap, bodies, arrived, k, at, head, edge):
+            return False
+        at = head
     return True

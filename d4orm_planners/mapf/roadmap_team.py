@@ -14,6 +14,7 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_env.paths.spaces import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
@@ -113,7 +114,9 @@ class Replanning:
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
         self.bodies, self.size = TeamOnRoadmap(problem, roadmap).bodies, problem.team.largest_radius
-        speed, acceleration = (np.asarray(problem.team.limits[:, column], np.float64) for column in (0, 1))
+        speed, acceleration = (
+            np.asarray(problem.team.limits[:, column], np.float64) for column in (SPEED, ACCELERATION)
+        )
         self.strides = problem.dt * speed
         self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
         positions = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
@@ -123,8 +126,8 @@ class Replanning:
         self.turns = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
         self.turns_on_the_spot = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
         d = problem.dimension
-        ends = np.stack([problem.world.clearance(position[:, :d]) for position in positions])
-        self.own_room = ends.min(axis=0) - TOUCH * self.size
+        rooms = np.stack([problem.world.clearance(ends[:, :d]) for ends in positions])
+        self.own_room = rooms.min(axis=0) - TOUCH * self.size
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
     def replan(
@@ -213,7 +216,7 @@ class Replanning:
         random: np.random.Generator,
         minded: BoolArray | None = None,
     ) -> bool:
-        """Plan a robot's path around those that it minds in ``driven``, which is changed; whether that succeeds."""
+        """Plan a robot's path around those that it minds in ``driven``, which is changed; return whether it has one."""
         haste, others = 1 - random.random() * LEISURE, occupancy.around(self.separation(robot, KEEP))
         if minded is not None:
             others = others._replace(need=np.where(minded, others.need, 0.0))

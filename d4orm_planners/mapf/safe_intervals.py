@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, last_visit, sort_boxes
-from d4orm_planners.mapf.roadmap import Footprints, Roadmap
+from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
 
 
 class Intervals(NamedTuple):
@@ -112,7 +112,7 @@ class Reservations(NamedTuple):
 
 @cached_kernel(variant="reservations", **OPTIONS)
 def make_reservations(
-    roadmap: Roadmap, bodies: Footprints, others: Others, k: Whole, latest: int, stays: bool
+    roadmap: Roadmap, bodies: RobotArrays, others: Others, k: Whole, latest: int, stays: bool
 ) -> Reservations:
     """The reservations for paths of a robot that end by a step, at a goal where it stays or not."""
     goal = bodies.goals[k]

@@ -10,7 +10,7 @@ from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.spaces import Space, is_free_line
 from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.occupancy import BLOCK, Buckets, Others, bucket_of
-from d4orm_planners.mapf.roadmap import Footprints, Roadmap
+from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
 from d4orm_planners.mapf.trips import Trip, steps_to_turn
 
 
@@ -72,7 +72,7 @@ def first_meeting(
 @cached_kernel(variant="straighten", **OPTIONS)
 def straighten(
     roadmap: Roadmap,
-    bodies: Footprints,
+    bodies: RobotArrays,
     space: Space | None,
     others: Others,
     k: Whole,

@@ -17,7 +17,7 @@ from d4orm_env import Problem, Team, World, make_problem, verify
 from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
 from d4orm_planners.engine.sampling_types import get_sampling_engine
-from d4orm_planners.mapf.lacam import TeamMoves, find_moves
+from d4orm_planners.mapf.lacam import TeamMoves, TeamOnRoadmap, find_moves
 from d4orm_planners.mapf.lns import search_neighbourhoods
 from d4orm_planners.mapf.occupancy import Occupancy
 from d4orm_planners.mapf.planner import RoadmapPaths, needs_detour
@@ -54,6 +54,14 @@ def found(problem: Problem, fineness: float = 1.0, seed: int = 0) -> tuple[Roadm
     moves = find_moves(problem, roadmap, seed, lambda: False, 3000)
     assert moves is not None
     return roadmap, moves
+
+
+def test_a_robot_that_starts_near_an_arrived_one_has_a_path_away_from_it() -> None:
+    """It may leave its own start, however near that is to another robot's goal, if it comes no nearer."""
+    problem = walled([[2, 0], [0, 0]], [[0.37, 0], [-2, 0]], margin=0.05)
+    team = TeamOnRoadmap(problem, lay_roadmap(problem))
+    team.fill(1, np.array([True, False]))
+    assert np.isfinite(team.bodies.costs[1, team.roadmap.starts[1]])
 
 
 def assert_moves_keep_clear(problem: Problem, roadmap: Roadmap, moves: TeamMoves) -> None:
@@ -289,6 +297,20 @@ def test_a_path_in_space_and_time_lets_others_pass(fault: str) -> None:
             share = (step - depart) / (arrive - depart)
             position = roadmap.nodes[tail] * (1 - share) + roadmap.nodes[head] * share
             assert np.linalg.norm(position - positions[step, 1]) >= 0.41 - 1e-9
+
+
+def test_a_robot_that_turns_first_comes_to_its_goal_as_soon_as_it_may_stay_there() -> None:
+    """Another robot passes near the goal from step 50 to 99: the turn before is over by then."""
+    problem = walled([[0, 0], [3, 3]], [[0.5, 0], [3, 2]])
+    roadmap = lay_roadmap(problem)
+    replanning = Replanning(problem, roadmap)
+    positions = np.full((401, 2, 3), 1e9)
+    positions[50:100, 1] = [0.905, 0.0, 0.0]
+    others = Occupancy(replanning.cells, positions).around(np.array([0.0, 0.41]))
+    reservations = make_reservations(roadmap, replanning.bodies, others, 0, 400, True)
+    trip = Trip(0.09, 4, 400, -1, 10.0, (-0.6, 0.8))
+    path = find_path(roadmap, replanning.bodies, reservations, 0, trip)
+    assert path[:, [0, 2]].tolist() == [[roadmap.starts[0], 0], [roadmap.goals[0], 100]]
 
 
 def test_turns_on_the_spot_take_steps() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from env_support import slow
+from numba import njit
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -15,11 +18,15 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.footprints import Box, Train
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
-from d4orm_planners.manoeuvres.curves import curves_of
-from d4orm_planners.manoeuvres.kinds import Kind
+from d4orm_planners.manoeuvres.curves import NO_CURVES, curves_of
+from d4orm_planners.manoeuvres.kinds import MAX_STEPS, Kind
+from d4orm_planners.manoeuvres.lattice import buffer_size
 from d4orm_planners.manoeuvres.model_moves import MOVES
-from d4orm_planners.manoeuvres.primitives import primitives_of
-from d4orm_planners.manoeuvres.robots import can_plan
+from d4orm_planners.manoeuvres.planning import improve_manoeuvres
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE, primitives_of
+from d4orm_planners.manoeuvres.robots import can_plan, scene_of
+from d4orm_planners.manoeuvres.team import TeamMotions
+from d4orm_planners.manoeuvres.traffic import NEVER, safe_since, traffic_of
 
 CORRIDOR = [[0.0, 1.0, 6.0, 1.5], [0.0, -0.5, 2.5, 0.3], [3.8, -0.5, 6.0, 0.3]]
 """A corridor along x, with an alcove below it in the middle."""
@@ -85,6 +92,66 @@ def test_primitives_lead_back_where_they_began(model: str) -> None:
     ends = np.linalg.norm(ahead.poses[ahead.first[1:] - 1, :2], axis=1)
     for end in np.linalg.norm(back.poses[back.first[1:] - 1, :2], axis=1):
         assert np.abs(ends - end).min() < 1e-9
+
+
+def test_moves_longer_than_a_search_has_room_for_are_left_out() -> None:
+    """A robot that reverses by a hair's breadth in a step would take millions of them."""
+    usual = kind_of("unicycle1")
+    slow = replace(usual, limits=(*usual.limits[:3], 1e-5, *usual.limits[4:]))
+    ahead, back, _ = primitives_of(slow)
+    assert np.diff(ahead.first).max() <= MAX_STEPS
+    assert 0 < len(ahead.mode) < len(primitives_of(usual)[0].mode)
+    assert len(back.mode) > 0
+
+
+def test_a_car_whose_trailer_can_hardly_swing_drives_straight_only() -> None:
+    """No circle is wide enough for its hitch angle, and there is none to end in either."""
+    usual, column = kind_of("car_with_1_trailer"), MODELS["car_with_1_trailer"].state_limits[0][1]
+    stiff = replace(usual, limits=(*usual.limits[:column], 0.01, *usual.limits[column + 1 :]))
+    assert primitives_of(stiff)[2] == ((0.0,),)
+    assert curves_of(stiff.base, bent=False) is NO_CURVES
+
+
+@pytest.mark.parametrize(("gap", "safe"), [(0.045, 2), (-0.005, NEVER)])
+def test_a_pose_is_safe_once_another_robot_has_passed_it_in_its_last_step(gap: float, safe: int) -> None:
+    """From then on it is as far away as it stays, or else in the way for ever."""
+    problem = problem_of([[1.0, 0.5, 0.0], [4.0, 0.5, 0.0]], [[2.0, 0.5, 0.0], [5.0, 0.5, 0.0]], CORRIDOR[:1])
+    scene = scene_of(problem)
+    poses = np.zeros((2, 2, POSE_SIZE), np.float32)
+    poses[1, :, 0], poses[1, :, 1] = (2.0 + 0.5 - 0.005, 2.0 + 0.5 + gap), 0.5
+    last, gone = np.array([-1, 1]), np.full(2, NEVER)
+    traffic = traffic_of(poses, last, gone, scene.area.low, scene.area.high, scene.interaction_range)
+    buffer = np.zeros(buffer_size(problem.team.all_footprint_arrays), np.float32)
+
+    @njit
+    def since(body: Any, traffic: Any, pose: Any, buffer: Any) -> int:
+        return safe_since(body, traffic, pose, buffer)
+
+    assert since(scene.body(0), traffic, np.array([2.0, 0.5, 0.0, 0.0, 0.0, 0.0]), buffer) == safe
+
+
+def test_a_robot_whose_motion_fails_has_another_one_even_after_a_solution() -> None:
+    """The judge may refuse what the search took for free, in the first plan as well as in a better one."""
+    problem = problem_of([[1.0, 0.65, 0.0], [4.0, 0.65, 0.0]], [[2.0, 0.65, 0.0], [5.0, 0.65, 0.0]], CORRIDOR)
+    motions = TeamMotions.prepared(problem, lambda: False)
+    assert motions is not None
+    motions.plan_all()
+    dropped: list[int] = []
+
+    def leave_out(robots: list[int]) -> None:
+        dropped.extend(robots)
+        TeamMotions.leave_out(motions, robots)
+
+    motions.leave_out = leave_out  # type: ignore[assignment, method-assign]
+    run: Any = SimpleNamespace(
+        best=SimpleNamespace(solved=True),
+        current=SimpleNamespace(unsolved=np.array([False, True])),
+        iteration_seed=lambda stream: 0,
+        should_stop=lambda: False,
+    )
+    improve_manoeuvres(run, motions)
+    assert dropped == [1]
+    assert motions.missing == 0
 
 
 @pytest.mark.parametrize("count", [1, 2, slow(3)])
