@@ -90,7 +90,8 @@ class Page:
         return value
 
     def open(self, address: str) -> None:
-        """Go to an address, and wait until it is loaded."""
+        """Go to an address, and wait until it is loaded; complaints of the page before are forgotten."""
+        self.complaints.clear()
         self.call("Page.navigate", url=address)
         begin = address if address.startswith(("file:", "about:")) else "/".join(address.split("/")[:3])
         self.until(f"location.href.startsWith({begin!r}) && document.readyState === 'complete'")
