@@ -111,15 +111,14 @@ class Problem(Frozen):
         world = World(dimension=team.dimension) if world is None else world
         if world.dimension != team.dimension:
             raise ValueError(f"the world has dimension {world.dimension} and the team {team.dimension}; match them")
-        numbers = checks.checked_numbers(dt, horizon, margin, goal_radius, collision_penalty, team.num_robots)
+        size = team.num_robots
+        numbers = checks.checked_numbers(dt, horizon, margin, goal_radius, collision_penalty, size)
         checks.check_arrival(arrival)
         self._set(
             **numbers,
             team=team,
-            start=frozen_array(
-                start, "start", (team.num_robots, team.state_size), largest=LARGEST, columns=team.state_names
-            ),
-            goal=frozen_array(goal, "goal", (team.num_robots, team.dimension), largest=LARGEST),
+            start=frozen_array(start, "start", (size, team.state_size), largest=LARGEST, columns=team.state_names),
+            goal=frozen_array(goal, "goal", (size, team.dimension), largest=LARGEST),
             world=world,
             goal_speed=checks.goal_speeds(team, numbers["dt"], goal_speed),
             goal_heading=checks.goal_headings(team, goal_heading),

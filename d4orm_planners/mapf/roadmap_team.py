@@ -123,7 +123,7 @@ class Replanning:
         gaps = [np.sqrt(((ends[:, None] - ends) ** 2).sum(axis=2)) for ends in positions]
         self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.goal_radius) - ROUNDING * self.size
         # Who turns in place need not back up.
-        self.turns = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
+        self.backing = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
         self.turns_on_the_spot = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
         d = problem.dimension
         rooms = np.stack([problem.world.clearance(ends[:, :d]) for ends in positions])
@@ -260,7 +260,7 @@ class Replanning:
         stops = Corners(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
         # As soon as it can, or else by the clock of its path.
-        for backs_up, hurrying in product(self.turns[robot], (True, False)):
+        for backs_up, hurrying in product(self.backing[robot], (True, False)):
             yield drive_by_clock(self.problem, robot, route, stops, steps, hurrying=hurrying, backs_up=backs_up)
 
     def room_at_walls(self, others: Others, robot: int, drive: Drive, latest: int) -> float:

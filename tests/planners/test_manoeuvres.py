@@ -97,8 +97,8 @@ def test_primitives_lead_back_where_they_began(model: str) -> None:
 def test_moves_longer_than_a_search_has_room_for_are_left_out() -> None:
     """A robot that reverses by a hair's breadth in a step would take millions of them."""
     usual = kind_of("unicycle1")
-    slow = replace(usual, limits=(*usual.limits[:3], 1e-5, *usual.limits[4:]))
-    ahead, back, _ = primitives_of(slow)
+    crawling = replace(usual, limits=(*usual.limits[:3], 1e-5, *usual.limits[4:]))
+    ahead, back, _ = primitives_of(crawling)
     assert np.diff(ahead.first).max() <= MAX_STEPS
     assert 0 < len(ahead.mode) < len(primitives_of(usual)[0].mode)
     assert len(back.mode) > 0
