@@ -27,6 +27,7 @@ from d4orm_planners.mapf.planner import (
     MAPFConfig,
     RoadmapSolution,
     compile_roadmap,
+    find_one_by_one,
     find_roadmap_solution,
     going_on_from_best,
     improve_roadmap_solution,
@@ -69,6 +70,11 @@ LNS_PERIOD = 5
 """Number of iterations on a roadmap solution of which one improves the motions; the others replan on the roadmap."""
 
 
+def covered_by_discs(problem: Problem) -> bool:
+    """Check whether discs stand for the robots in all that is asked of them: without trailers and goal headings."""
+    return not any(model.trailers for model in problem.team.robot_models) and bool(np.isnan(problem.goal_heading).all())
+
+
 class Hybrid(Planner):
     """Path finding where it helps, D4orm-D where robots conflict, and anytime improvement of what was found."""
 
@@ -100,6 +106,10 @@ class Hybrid(Planner):
         if isinstance(state, TeamMotions):
             return state, improve_manoeuvres(search, state)
         if self.finds_manoeuvres(search):
+            if covered_by_discs(search.problem) and self.finds_paths(search):
+                solution = find_one_by_one(search)
+                if isinstance(solution, RoadmapSolution):
+                    return solution, self.follow(search, solution)
             motions = find_manoeuvres(search)
             if motions is not None:
                 return motions, Iteration(motions.controls())

@@ -26,16 +26,21 @@ if TYPE_CHECKING:
 
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
-FINENESS = (1.6, 1.25, 1.0, 2.2, 3.0)
-"""Fineness of the roadmaps that are tried; see :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
-FEW_PATHS, MOST_PATHS = 4, 30
-"""Paths that are planned per robot before turns on the spot are counted, and before all robots are planned at once."""
+ONE_BY_ONE = ((1.6, False), (1.6, True), (4.0, True), (3.0, True))
+"""Fineness of the roadmaps on which paths are looked for one by one, and whether turns on the spot are counted."""
+ALL_AT_ONCE = (1.6, 1.25, 1.0, 2.2, 3.0)
+"""Fineness of those on which they are then looked for all at once; see
+:func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
+PATIENCE, LEAST_PATIENCE, HASTE = 4, 50, 8
+"""Paths per robot, and beyond these, after which the next is tried if no fewer wait for theirs; and by how much sooner
+that is where turns are not counted, but should be."""
 MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
 DETOUR_RATIO = 1.25
 """Ratio of path to straight line from which a path is a detour; on a lattice any may be 1.1 times as long."""
 LEISURELY = 10
 """Horizon of the small problems that kernels are compiled with, in straight drives at full speed."""
+NOT_IN_TIME = "no paths found on the roadmaps in time"
 STEPS = 3000
 """Steps of path finding for all at once after which the next roadmap is tried."""
 
@@ -178,37 +183,51 @@ def improve_roadmap_solution(
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
     """Paths for the whole team, or as many robots as possible; the reason if none are found in time."""
-    problem, best = search.problem, None
+    return find_one_by_one(search) or _find_all_at_once(search)
+
+
+def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
+    """Paths for the whole team, planned one robot after another; the reason if there can be none or time is up."""
+    problem = search.problem
     if problem.num_robots * problem.horizon > MAX_ROBOT_STEPS:
         return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for paths")
     with search.watch.paused():
         compile_path_finding(problem)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-    for number, fineness in enumerate(FINENESS):
+    patience = PATIENCE * problem.num_robots + LEAST_PATIENCE
+    turning = any(model.turns_in_place for model in problem.team.robot_models)
+    for number, (fineness, counts_turns) in enumerate(ONE_BY_ONE):
+        if number == 1 and not turning:
+            continue
+        roadmap = lay_roadmap(problem, fineness)
+        replanning = Replanning(problem, roadmap, counts_turns=counts_turns)
+        if np.isfinite(replanning.alone).all():
+            tries = patience if counts_turns or not turning else patience // HASTE
+            driven = replanning.one_by_one(random, search.should_stop, tries)
+            if driven is not None:
+                return RoadmapSolution(roadmap, replanning, driven)
+        elif number == 0 and (reason := NoPaths.unless_reachable(problem)) is not None:
+            return reason
+        if search.should_stop():
+            return NoPaths(NOT_IN_TIME)
+    return None
+
+
+def _find_all_at_once(search: SolveRun) -> RoadmapSolution | NoPaths:
+    """Paths for as many robots as possible, found for all of them at once."""
+    problem, best = search.problem, None
+    for number, fineness in enumerate(ALL_AT_ONCE):
         roadmap = lay_roadmap(problem, fineness)
         replanning = Replanning(problem, roadmap)
         if not np.isfinite(replanning.alone).all():
-            reason = NoPaths.unless_reachable(problem) if number == 0 else None
-            if reason is not None:
-                return reason
             continue
-        turns = any(turn > 0 for turn, _ in replanning.turns_on_the_spot)
-        most = (FEW_PATHS if turns else MOST_PATHS) * problem.num_robots
-        driven = replanning.one_by_one(random, search.should_stop, most)
-        if driven is None and turns:
-            replanning.counts_turns = True
-            driven = replanning.one_by_one(random, search.should_stop, MOST_PATHS * problem.num_robots)
-        if driven is not None:
-            return RoadmapSolution(roadmap, replanning, driven)
-        if search.should_stop():
-            break
         seed = search.iteration_seed(Stream.GUIDANCE, number + 1)
         found = find_moves(problem, roadmap, seed, search.should_stop, STEPS)
         if found is not None and (best is None or found.arrived.sum() > best[1].arrived.sum()):
             best = RoadmapSolution(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
-    return best[0] if best else NoPaths("no paths found on the roadmaps in time")
+    return best[0] if best else NoPaths(NOT_IN_TIME)
 
 
 def compile_roadmap(problem: Problem) -> None:
@@ -239,7 +258,7 @@ def compile_path_finding(problem: Problem) -> None:
         found = find_moves(alone, roadmap, 0, lambda: False, STEPS)
         if found is not None:
             drive_moves(alone, roadmap, found.moves)
-            Replanning(alone, roadmap).one_by_one(np.random.default_rng(0), lambda: False, MOST_PATHS)
+            Replanning(alone, roadmap).one_by_one(np.random.default_rng(0), lambda: False, 1)
 
 
 def _small_problem(problem: Problem, robot: int) -> Problem:

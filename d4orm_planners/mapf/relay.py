@@ -14,8 +14,6 @@ FINENESS = 1.6
 """Fineness of the roadmap."""
 DWELL = 1.0
 """Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
-MOST_PATHS = 3
-"""Paths that are planned per robot before the search gives up."""
 
 
 def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
@@ -41,7 +39,7 @@ def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: i
     present.positions[:, changed] = FAR
     before, random, robots = present.positions.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
     order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
-    driven = replanning.settle(present, order, random, lambda: False, MOST_PATHS * num_robots)
+    driven = replanning.settle(present, order, random, lambda: False, num_robots)
     if driven is None:
         return None
     for robot in np.flatnonzero((driven.positions != before).any(axis=(0, 2))):

@@ -43,6 +43,8 @@ BOUND_FACTOR, BOUND_EXTRA = 1.5, 60
 """Bounds of the first search for a path: so many times as long as alone, and so many steps more."""
 FAR = 1e9
 """Position of robots that are not there yet [m]."""
+HOPELESS = 4
+"""Paths that robots do not find even alone after which patience is over."""
 LATER = 30
 """Steps by which a robot may come later for the sake of others."""
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
@@ -103,14 +105,17 @@ class Replanning:
         roadmap: The roadmap of its world.
         dwell: Steps after which a robot that has arrived is no obstacle any more, for it goes on to another
             goal; ``None`` if it stays.
+        counts_turns: Whether plans allow for the steps that turns on the spot take: in a crowd others come in the
+            meantime, elsewhere robots are sooner without.
 
     Attributes:
-        counts_turns: Whether plans allow for the steps that turns on the spot take; not at first.
         alone: ``(K,)`` about how many steps each robot takes by itself.
     """
 
-    def __init__(self, problem: Problem, roadmap: Roadmap, dwell: int | None = None) -> None:
-        self.problem, self.roadmap, self.dwell, self.counts_turns = problem, roadmap, dwell, False
+    def __init__(
+        self, problem: Problem, roadmap: Roadmap, dwell: int | None = None, *, counts_turns: bool = False
+    ) -> None:
+        self.problem, self.roadmap, self.dwell = problem, roadmap, dwell
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
         self.bodies, self.size = TeamOnRoadmap(problem, roadmap).bodies, problem.team.largest_radius
@@ -124,7 +129,8 @@ class Replanning:
         self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.goal_radius) - ROUNDING * self.size
         # Who turns in place need not back up.
         self.backing = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
-        self.turns_on_the_spot = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
+        turns = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
+        self.turns_on_the_spot = [(turn * counts_turns, facing) for turn, facing in turns]
         d = problem.dimension
         rooms = np.stack([problem.world.clearance(ends[:, :d]) for ends in positions])
         self.own_room = rooms.min(axis=0) - TOUCH * self.size
@@ -146,13 +152,15 @@ class Replanning:
                 return None
         return changed
 
-    def one_by_one(self, random: np.random.Generator, should_stop: Callable[[], bool], most: int) -> TeamRollout | None:
+    def one_by_one(
+        self, random: np.random.Generator, should_stop: Callable[[], bool], patience: int
+    ) -> TeamRollout | None:
         """The team, its paths planned one by one; a robot that finds none displaces others, whose turn comes again.
 
         Args:
             random: Of the order, and of the robots that may be displaced.
             should_stop: Asked before every path.
-            most: Paths planned after which it gives up.
+            patience: Paths after which it gives up if no fewer robots wait for theirs than ever before.
 
         Returns:
             All robots' paths within the horizon; ``None`` if they were not found.
@@ -162,7 +170,7 @@ class Replanning:
         controls = np.zeros((steps, num_robots, problem.control_size), np.float32)
         driven = TeamRollout(controls, positions, np.full(num_robots, steps + 1))
         waiting = np.argsort(self.alone + random.random(num_robots))
-        return self.settle(driven, waiting, random, should_stop, most)
+        return self.settle(driven, waiting, random, should_stop, patience)
 
     def settle(
         self,
@@ -170,23 +178,25 @@ class Replanning:
         robots: IntArray,
         random: np.random.Generator,
         should_stop: Callable[[], bool],
-        most: int,
+        patience: int,
     ) -> TeamRollout | None:
         """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
         steps, waiting, num_robots = len(driven.controls), robots.tolist(), self.problem.num_robots
         settled, met = np.ones((2, num_robots), bool)
         settled[robots], occupancy = False, Occupancy(self.cells, driven.positions)
-        while waiting and not should_stop():
-            most -= 1
-            if most < 0:
-                return None
+        fewest, idle = len(waiting), 0
+        while waiting and idle < patience and not should_stop():
+            fewest, idle = min(fewest, len(waiting)), 0 if len(waiting) < fewest else idle + 1
             robot = int(waiting.pop())
             for hard in (1.0, 0.5, 0.0):
                 minded = ~settled | (random.random(num_robots) < hard)
                 if self.replan_one(driven, occupancy, robot, steps, random, minded):
                     break
             else:
-                return None
+                # Not even alone: it drove too near to a wall, and might not at another pace.
+                waiting.insert(0, robot)
+                idle += patience // HOPELESS
+                continue
             others = occupancy.around(self.separation(robot, KEEP))._replace(need=self.separation(robot, TOUCH))
             find_meetings(others, driven.positions[: self.leaves(int(driven.arrivals[robot])), robot], met)
             displaced = settled & met
@@ -245,7 +255,6 @@ class Replanning:
         """Rollouts of a robot along its path, if it has one, in one of the :data:`SPEED_PROFILES`."""
         roadmap, bodies, steps = self.roadmap, self.bodies, reservations.others.positions.shape[1] - 1
         dwell, (turn, facing) = -1 if self.dwell is None else self.dwell, self.turns_on_the_spot[robot]
-        turn = turn if self.counts_turns else 0.0
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
             trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell, turn, facing)
