@@ -260,13 +260,15 @@ class Train(Footprint):
         trailers: From the front on.
 
     Raises:
-        ValueError: If one of them is no planar footprint, or there are no trailers.
+        ValueError: If one of them is no planar footprint, or the trailers are none or no sequence.
     """
 
     front: Disc | Planar
     trailers: tuple[Disc | Planar, ...]
 
     def __init__(self, front: Disc | Planar, trailers: Sequence[Disc | Planar]) -> None:
+        if not isinstance(trailers, Sequence):
+            raise ValueError(f"trailers of Train are {short_repr(trailers)}; give a list of footprints, one each")
         for footprint in (front, *trailers):
             if not isinstance(footprint, Disc | Planar):
                 raise ValueError(

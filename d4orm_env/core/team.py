@@ -88,7 +88,7 @@ class Team(Frozen):
             discs = [Disc(float(str(size))) for size in radii]  # the decimal that files have
             given = [Train(disc, (disc,) * size) if size else disc for disc, size in zip(discs, trailers, strict=True)]
             radius = None
-        footprints = tuple(given) if isinstance(given, Sequence) else (given,) * count
+        footprints = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,) * count
         if len(footprints) != count:
             raise ValueError(f"footprint has {len(footprints)} entries for {count} robots; give one each, or one")
         for robot, footprint in enumerate(footprints):

@@ -12,7 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, IntArray, frozen_array, positive_number, whole_number
+from d4orm_env.core.arrays import (
+    LARGEST,
+    FloatArray,
+    Floats,
+    IntArray,
+    frozen_array,
+    positive_number,
+    short_repr,
+    whole_number,
+)
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Kept, Scene, level, standard_deviation
@@ -150,7 +159,7 @@ class MovingObstacle(Disturbance[Kept]):
         times = frozen_array(self.times, "MovingObstacle times", (None,), largest=LARGEST).astype(np.float64)
         positions = np.array(self.positions, np.float64)
         if len(times) < 2 or (np.diff(times) <= 0).any():
-            raise ValueError("MovingObstacle times must be two or more, and increase")
+            raise ValueError(f"MovingObstacle times are {short_repr(times.tolist())}; give two or more that increase")
         if positions.ndim == 2:
             positions = positions[:, None]
         if positions.ndim != 3 or len(positions) != len(times) or not 1 <= positions.shape[1] <= MAX_INTRUDERS:
@@ -258,9 +267,12 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
             try:
                 time, x, y = (float(row[name]) for name in _COLUMNS[1:])
             except (TypeError, ValueError):
-                raise ValueError(f"{path}, line {reader.line_num}: time, x and y must be numbers") from None
+                given = ", ".join(short_repr(row[name]) for name in _COLUMNS[1:])
+                raise ValueError(f"{path}, line {reader.line_num}: time, x and y are {given}; give numbers") from None
             if people[row["id"]].setdefault(time, (x, y)) != (x, y):
-                raise ValueError(f"{path}, line {reader.line_num}: {row['id']} is at two places at {time:g} s")
+                raise ValueError(
+                    f"{path}, line {reader.line_num}: {row['id']} is at two places at {time:g} s; give one"
+                )
     times = np.unique([time for track in people.values() for time in track])
     if len(times) < 2:
         raise ValueError(f"{path} has rows at {len(times)} different times; give two at least")

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, read_only
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, read_only
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -116,6 +116,9 @@ class TrainingReward:
         time: Taken off in every step.
 
     The infos of the environments have each term as it was paid, ``reward_progress`` and so on.
+
+    Raises:
+        ValueError: If a weight is negative or no number: a negative price would pay for contacts.
     """
 
     progress: float = 0.3
@@ -124,6 +127,10 @@ class TrainingReward:
     contact: float = 3.0
     time: float = 0.05
     term_names: ClassVar[tuple[str, ...]] = ("progress", "arrival", "margin", "contact", "time")
+
+    def __post_init__(self) -> None:
+        for name in self.term_names:
+            positive_number(getattr(self, name), f"{name} of TrainingReward", zero_allowed=True)
 
     def __call__(self, step: RewardInput) -> FloatArray:
         """``(..., K)``, the sum of :meth:`terms`."""

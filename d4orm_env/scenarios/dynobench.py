@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env.core.arrays import Floats, short_repr
-from d4orm_env.core.errors import first_line
+from d4orm_env.core.errors import did_you_mean, first_line
 from d4orm_env.core.files import naming, read_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -77,6 +77,8 @@ DYNAMICS = {
     "integrator2_3d": "holonomic3d", "car_with_trailers": "car_with_1_trailer",
 }  # fmt: skip
 """Their dynamics and our models."""
+KEYS = ("min", "max", "obstacles")
+"""Keys of their environments that are read; others are not, unless they look like one of these."""
 
 
 def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[str, Any]] | None = None) -> Problem:
@@ -109,6 +111,9 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
 
 def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.PathLike[str]) -> Problem:
     robots, environment = content["robots"], content["environment"]
+    for name in environment:
+        if name not in KEYS and (meant := did_you_mean(name, KEYS)):
+            raise ValueError(f"environment has the key {short_repr(name)}{meant}")
     types = [robot["type"] for robot in robots]
     _check_types(types, models)
     parameters = [_symmetric(models[name]) | models[name] for name in types]

@@ -61,6 +61,8 @@ class SharedPolicy(Policy):
         egocentric: bool = False,
         trained: Shapes | None = None,
     ) -> None:
+        if weights is not None and not hasattr(weights, "state_dict"):
+            raise ValueError(f"the model is {short_repr(weights)}; load it first, and give what acts")
         self._predict, self._weights, self._normalized, self._egocentric = predict, weights, normalized, egocentric
         self._trained = trained
 
@@ -86,7 +88,8 @@ class SharedPolicy(Policy):
             raise ValueError(
                 f"the model was trained for observations and actions of shapes {self._trained[0]} and "
                 f"{self._trained[1]}; a robot's here have {own[0]} and {own[1]}, and the team's {observed} and "
-                f"{acted}; make the environment as it was in training, with as many robots"
+                f"{acted}; make the environment as it was in training, with as many robots, or give "
+                f"egocentric=True for a model trained in egocentric ones"
             )
         return self._trained == team and count > 1
 

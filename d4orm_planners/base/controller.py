@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
+from numbers import Real
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -137,8 +139,10 @@ class Controller:
             seed: Seeds whatever the policy draws.
 
         Raises:
-            ValueError: If the states have another shape, or the lag fits no team of this size.
+            ValueError: If there is no problem, the states have another shape, or the lag fits no team of this size.
         """
+        if not isinstance(problem, Problem):
+            raise ValueError(f"problem is {short_repr(problem)}; give a Problem, as make_problem() returns")
         self._background.forget()
         try:
             self._begin(problem, states, float(time), seed)
@@ -174,8 +178,10 @@ class Controller:
         """
         if self._env is None:
             raise RuntimeError("the controller has no team yet; call begin(problem, states) before step()")
+        if not isinstance(time, Real) or not math.isfinite(time):
+            raise ValueError(f"time is {short_repr(time)}; give the seconds of one clock")
         passed = (time - self._time) / self.problem.dt
-        if not passed > -SAME_PERIOD:
+        if passed <= -SAME_PERIOD:
             raise ValueError(f"time is {time!r} s, before the last step; give times of one clock, in seconds")
         measured, known = self._completed(states)
         if passed >= SAME_PERIOD:
@@ -204,7 +210,11 @@ class Controller:
 
     def _completed(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """``(K, n)`` measured states where they are known, the reference's elsewhere, and ``(K,)`` where."""
-        reference, measured = self._joint.states, as_float32(states)
+        reference = self._joint.states
+        try:
+            measured = as_float32(states)
+        except ValueError as error:
+            raise ValueError(f"states must be an array of numbers, not {short_repr(states)}; {error}") from error
         if measured.shape != reference.shape:
             raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
         known: BoolArray = np.all(np.isfinite(measured), axis=1)

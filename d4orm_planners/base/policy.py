@@ -63,8 +63,10 @@ class Policy(ABC):
             seed: Seeds whatever the policy draws.
 
         Raises:
-            ValueError: If the environment is egocentric.
+            ValueError: If that is no environment, or an egocentric one.
         """
+        if not hasattr(env, "unwrapped"):
+            raise ValueError(f"env is {short_repr(env)}; give an environment, such as parallel_env(problem=problem)")
         if (options := getattr(env.unwrapped, "options", None)) is not None:
             options.require_physical_units()
         self.problem = env.unwrapped.problem

@@ -1,6 +1,6 @@
 """MAPPO of BenchMARL on a task of this package; any other of its algorithms for continuous actions does as well.
 
-pip install benchmarl "torchrl<0.12"        # in an environment of its own, see docs/recipes.md
+pip install -e . benchmarl        # in an environment of its own, see docs/recipes.md
 python -m examples.recipes.benchmarl_mappo
 """
 

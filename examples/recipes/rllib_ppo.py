@@ -1,6 +1,6 @@
 """PPO of RLlib (new API stack), one network for all robots.
 
-pip install d4orm-env "ray[rllib]" torch        # in an environment of its own, see docs/recipes.md
+pip install -e . "ray[rllib]" torch        # in an environment of its own, see docs/recipes.md
 python -m examples.recipes.rllib_ppo
 """
 

@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from d4orm_env import Problem, Team, load_map, load_problem, make_problem, navigation_v0, verify
-from d4orm_planners import make_planner, make_policy, run_episode
-from d4orm_planners.base.adapters import SharedPolicy, from_sb3
+from d4orm_env.disturbances import MovingObstacle, RayNoise
+from d4orm_env.envs.rewards import TrainingReward
+from d4orm_env.footprints import Box, Train
+from d4orm_planners import Controller, make_planner, make_policy, run_episode
+from d4orm_planners.base.adapters import SharedPolicy, from_sb3, from_torch
 
 
 class Module:
@@ -22,6 +25,13 @@ class Module:
 
     def __call__(self, *given: object) -> object:
         raise RuntimeError("shapes cannot be multiplied")
+
+
+def controller() -> Controller:
+    """One that has a team."""
+    controller = Controller("orca")
+    controller.begin(PROBLEM, PROBLEM.start)
+    return controller
 
 
 DRIVE = Team(("differential_drive",))
@@ -47,6 +57,20 @@ PROBLEM = make_problem("circle", num_robots=2)
         ),
         (lambda: from_sb3("joint.zip"), "give a model of Stable-Baselines3, as PPO.load"),
         (lambda: verify(PROBLEM, SimpleNamespace(controls=0)), "not SimpleNamespace; give its controls"),
+        (lambda: from_torch("net.pt"), "the model is 'net.pt'; load it first"),
+        (lambda: make_policy("orca").reset(PROBLEM), "give an environment, such as parallel_env"),
+        (lambda: Controller("orca").begin("circle", PROBLEM.start), "problem is 'circle'; give a Problem"),
+        (lambda: controller().step(PROBLEM.start, "now"), "time is 'now'; give the seconds of one clock"),
+        (lambda: controller().step(PROBLEM.start, np.nan), "time is nan; give the seconds of one clock"),
+        (lambda: controller().step("abc", 0.0), "states must be an array of numbers, not 'abc'"),
+        (lambda: PROBLEM.replace(world="open"), "world is 'open'; give a World"),
+        (lambda: make_problem("circle", dt="0.1"), "dt must be a number, not '0.1'"),
+        (lambda: PROBLEM.replace(goal=[["1", "0"], ["0", "1"]]), "goal must be an array of numbers"),
+        (lambda: RayNoise("0.1"), "std must be a number, not '0.1'"),
+        (lambda: Team(("holonomic2d",) * 2, footprint="box"), "footprint of robot_0 is 'box'; give one such as"),
+        (lambda: Train(Box(0.3, 0.2), Box(0.3, 0.2)), "trailers of Train are Box.*give a list"),
+        (lambda: TrainingReward(contact=-3), "contact of TrainingReward is -3; it must be zero or more"),
+        (lambda: MovingObstacle([2, 1], [[0, 0], [1, 1]]), r"times are \[2.0, 1.0\]; give two or more that increase"),
         (lambda: verify(PROBLEM, np.zeros((7, 2, 2))), r"problem.replace\(horizon=7\)"),
     ],
 )

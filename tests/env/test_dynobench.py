@@ -92,6 +92,7 @@ def test_own_parameters_are_taken(instance: Path) -> None:
     [
         ("unicycle1_v0", "hovercraft_7", "robot types 'hovercraft_7' are unknown; known are unicycle1_v0"),
         ("type: box", "type: torus", "obstacle type 'torus' is unknown; known are box, sphere"),
+        ("obstacles:", "obstacle:", "environment has the key 'obstacle'; did you mean 'obstacles'?"),
         ("robots:", "agents:", "no multi-robot problem of dynobench"),
         (
             "goal: [4, 1.5, 0]",
