@@ -114,7 +114,7 @@ def test_rays_are_those_of_a_caster_that_walks_along_them(seed: int) -> None:
         polygons=polygons[: seed % 3],
         **({"lower": [-4.5, -4.5], "upper": [4.5, 4.5]} if seed % 2 else {}),
     )
-    team = Team(("unicycle", "holonomic2d", "differential_drive") * 2, radius=0.2)
+    team = Team(("differential_drive", "holonomic2d", "differential_drive") * 2, radius=0.2)
     clear = [point for point in random.uniform(-4, 4, (500, 2)) if world.clearance(point) > 0.3]
     apart: list[np.ndarray] = []
     for point in clear:

@@ -67,9 +67,7 @@ def world_space(problem: Problem) -> Space:
     bounds[:, : problem.dimension] = problem.world.bounds
     empty = np.zeros(3)
     # As those of an index are: one compilation serves worlds with obstacles and without.
-    clearance, first, items = read_only(
-        (np.full(1, np.inf, np.float32), np.zeros(2, np.int32), np.zeros(0, np.int32))
-    )
+    clearance, first, items = read_only((np.full(1, np.inf, np.float32), np.zeros(2, np.int32), np.zeros(0, np.int32)))
     return Space(
         low=empty,
         cell=1.0,
