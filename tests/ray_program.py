@@ -17,7 +17,7 @@ from typing import Any
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.base.plan import Plan
+from d4orm_planners.base.planner import Callback
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d_d4orm import ray_planner
 from d4orm_planners.d_d4orm.ray_planner import RayConnection
@@ -25,15 +25,10 @@ from d4orm_planners.d_d4orm.ray_planner import RayConnection
 SETTINGS: dict[str, Any] = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "improve": True, "k": 2}
 
 
-def solve(transport: str, **settings: Any) -> Plan:
-    """Three rounds of two nodes."""
-    planner = make_planner("d-d4orm", transport=transport, **SETTINGS, **settings)
-    return planner.solve(make_problem("circle", num_robots=4), seed=3, max_iterations=3)
-
-
-def rounds(transport: str, clip: bool) -> tuple[list[float], int]:
-    """The rewards of the rounds, and how many messages there were."""
-    plan = solve(transport, clip_between_iterations=clip)
+def rounds(transport: str, clip: bool, callback: Callback | None = None) -> tuple[list[float], int]:
+    """The rewards of three rounds of two nodes, and how many messages there were."""
+    planner = make_planner("d-d4orm", transport=transport, **SETTINGS, clip_between_iterations=clip)
+    plan = planner.solve(make_problem("circle", num_robots=4), seed=3, max_iterations=3, callback=callback)
     return [record.reward for record in plan.history], plan.metrics["messages"]
 
 
@@ -121,7 +116,6 @@ def main() -> None:
     """Every part, those that leave something behind last."""
     connection = RayConnection("local", "this test")
     report("rounds", {clip: rounds("ray", clip == "clipped") for clip in ("clipped", "unclipped")})
-    report("again", rounds("ray", clip=True))
     report("shared", connection.ray.is_initialized())
     for restarts in (3, 0):
         report(f"killed, {restarts} restarts", [kill(restarts, mode) for mode in ("sync", "async")])
@@ -129,9 +123,8 @@ def main() -> None:
     report("frozen", frozen(timeout=0.1))
     connection.close()
     heard: set[str] = set()
-    planner = make_planner("d-d4orm", transport="ray", **SETTINGS)
     look = (lambda record: heard.update(listening())) if Path("/proc/net/tcp").exists() else None
-    planner.solve(make_problem("circle", num_robots=2), max_iterations=1, callback=look)
+    report("again", rounds("ray", clip=True, callback=look))
     report("listening", sorted(heard))
     report("left open", connection.ray.is_initialized())
 

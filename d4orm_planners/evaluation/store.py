@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, fields
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -144,7 +145,7 @@ class Trial:
     def key(self) -> TrialKey:
         return TrialKey(*(getattr(self, name) for name in TrialKey._fields))
 
-    @property
+    @cached_property
     def progress(self) -> list[BestSoFar]:
         """:attr:`history`, point by point."""
         return [BestSoFar(*point) for point in json.loads(self.history)]

@@ -37,7 +37,7 @@ def measure(seeds: int, out: Path, quick: bool) -> list[dict[str, Any]]:
     imitation, reinforcement, rows = IMITATION, REINFORCEMENT, []
     if quick:
         imitation = replace(imitation, num_robots=2, episodes=20, rounds=2)
-        reinforcement = replace(reinforcement, num_robots=2, steps=100_000, stages=2)
+        reinforcement = replace(reinforcement, num_robots=2, steps=50_000, stages=2)
     for seed in range(seeds):
         learned = imitate(replace(imitation, seed=seed), out / f"imitation-{seed}", progress=report)
         rows += [_row("cloning" if not index else "DAgger", seed, point) for index, point in enumerate(learned.curve)]

@@ -45,7 +45,7 @@ def test_all_environments_show_and_do_the_same(model: str) -> None:
     assert pure.observation_shape == (3, *space.shape)
     first = stacked(seen)
     rest = joint.reset(seed=0)[0], batched.reset(seed=0)[0][1]
-    state, pure_seen = pure.reset(jax.random.key(0))
+    (state, pure_seen), advance = pure.reset(jax.random.key(0)), jax.jit(pure.advance)
     for step in range(12):
         assert all(space.contains(row) for row in stacked(seen))
         np.testing.assert_array_equal(stacked(seen).ravel(), rest[0])
@@ -55,7 +55,7 @@ def test_all_environments_show_and_do_the_same(model: str) -> None:
         seen, rewards, _, truncated, _ = parallel.step(dict(zip(parallel.agents, actions)))
         once, *_ = joint.step(actions.ravel())
         many, *_, infos = batched.step(np.tile(actions.ravel(), (2, 1)))
-        state, transition = pure.advance(jax.random.key(0), state, actions)
+        state, transition = advance(jax.random.key(0), state, actions)
         pure_seen, rest = transition.observations, (once, many[1])
         np.testing.assert_allclose(transition.rewards, list(rewards.values()), atol=1e-3)
         assert all(truncated.values()) == (step == 11)

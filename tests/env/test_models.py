@@ -288,7 +288,7 @@ def test_the_judge_integrates_what_it_has_equations_for_to_the_same_motion(name:
 def test_the_judge_integrates_all_steps_at_once_as_one_after_another(
     name: str, scale: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem = make_problem("circle" if MODELS[name].dimension == 2 else "sphere", num_robots=3, model=name)
+    problem = make_problem("circle" if MODELS[name].dimension == 2 else "sphere", num_robots=3, model=name, horizon=60)
     controls = np.cumsum(scale * random_controls(problem, 2).astype(np.float64), axis=0)
     arguments = np.arange(3), np.asarray(problem.start, np.float64), controls, problem.team, problem.dt
     at_once = Integrated(MODELS[name], *arguments)

@@ -62,14 +62,15 @@ def expected(problem: Problem, states: np.ndarray) -> np.ndarray:
 def teams() -> dict[str, Problem]:
     """A team of one footprint each, and one that pulls trailers."""
     positions = np.array([[0, 0], [2, 0], [0, 2], [2, 2]], float)
-    alone = Team(("unicycle",) * 4, footprint=SHAPES)
+    alone = Team(("differential_drive",) * 4, footprint=SHAPES)
     train = Train(Box(0.5, 0.25, 0.1), [Capsule(0.2, 0.1)])
     pulling = Team(("car_with_1_trailer",) * 4, footprint=[train, train, train, Train(KITE, [Box(0.3, 0.2)])])
-    states = {"alone": np.zeros((4, 3)), "pulling": np.zeros((4, pulling.state_size))}
-    for start in states.values():
-        start[:, :2] = positions
-    goals = positions + np.array([0, 4])
-    return {name: Problem(team, states[name], goals) for name, team in (("alone", alone), ("pulling", pulling))}
+    start, goals = np.pad(positions, ((0, 0), (0, 2))), positions + np.array([0, 4])
+    # With goal headings, as other tests have kernels compiled for the one.
+    return {
+        "alone": Problem(alone, start, goals, goal_heading=0.0),
+        "pulling": Problem(pulling, start, goals),
+    }
 
 
 @pytest.mark.parametrize("name", ["alone", "pulling"])

@@ -173,7 +173,7 @@ def test_two_cars_with_trailers_swap(tmp_path: Path) -> None:
     problem = load_dynobench(path)
     assert problem.team.models == ("car_with_1_trailer",) * 2
     assert problem.start[1, 3] == 0
-    loose = problem.replace(goal_radius=0.1, goal_heading=np.full(2, np.nan), arrival="dock", horizon=150, margin=0.05)
+    loose = problem.replace(goal_radius=0.1, goal_heading_tolerance=np.pi, arrival="dock", horizon=150, margin=0.05)
     plan = make_planner().solve(loose, seed=0, max_iterations=10)
     assert plan.solved
     assert verify(loose, plan.controls).ok

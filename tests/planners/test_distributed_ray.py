@@ -36,7 +36,7 @@ def test_rounds_over_ray(subtests: pytest.Subtests) -> None:
             here, here_messages = ray_program.rounds("local", clip == "clipped")
             np.testing.assert_allclose(rewards, here, atol=1e-6)
             assert messages == here_messages == 6
-    with subtests.test("rounds repeat"):
+    with subtests.test("rounds repeat, in an instance of their own too"):
         assert results["again"] == results["rounds"]["clipped"]
     with subtests.test("an instance that was there stays, and one of its own ends with the solve"):
         assert results["shared"]

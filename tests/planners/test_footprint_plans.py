@@ -29,7 +29,7 @@ def straight(problem: Problem) -> np.ndarray:
 @pytest.mark.parametrize("footprint", [slow(Box(0.8, 0.1), id="box"), Capsule(0.6, 0.05)])
 def test_samples_are_scored_as_they_are_rolled_out(engine: str, footprint: object) -> None:
     """Without noise every sample is the motion itself, among two robots that are not sampled."""
-    problem = boxes(horizon=60)
+    problem = boxes(horizon=60, goal_heading=0.0)
     problem = problem.replace(team=problem.team.replace(footprint=footprint))
     controls = straight(problem)
     path = rollout(problem, controls)

@@ -206,21 +206,21 @@ ENGINES = {"cpu": CPU, "jax": JAX}
 
 STEPPED = [
     ("mixed", "robot"), ("harder", "team"), ("harder, obstacles", "team"), ("docking in space", "team"),
-    ("arrived", "robot"), ("mixed", "team"), ("harder", "robot"), ("velocity2d", "robot"), ("holonomic3d", "team"),
-    *((name, credit) for name in ("holonomic2d", "differential_drive") for credit in CREDITS), ("alone", "team"),
-    ("obstacles", "team"), ("space", "robot"), ("docking", "robot"), ("docking drives", "robot"), ("moving", "team"),
-    ("no collisions", "robot"), ("moving, no collisions", "team"), ("moving in space", "robot"), ("all docked", "team"),
-    ("docked, moving", "team"), ("all docked, moving", "robot"),
+    ("arrived", "robot"), ("mixed", "team"), ("harder", "robot"), ("alone", "team"), ("docking drives", "robot"),
+    ("moving in space", "robot"), ("moving, no collisions", "team"), ("all docked, moving", "robot"),
+    ("velocity2d", "robot"), ("holonomic3d", "team"), ("obstacles", "team"), ("space", "robot"), ("docking", "robot"),
+    *((name, credit) for name in ("holonomic2d", "differential_drive") for credit in CREDITS), ("moving", "team"),
+    ("no collisions", "robot"), ("all docked", "team"), ("docked, moving", "team"),
 ]  # fmt: skip
 
 
-# JAX compiles for seconds for every one of them.
+# JAX compiles for seconds for every one of them, so it meets those that hold what the others are about.
 @pytest.mark.parametrize(
     ("name", "credit", "engine"),
     [
         *((*case, "cpu") for case in STEPPED),
         *((*case, "jax") for case in STEPPED[:5]),
-        *(slow(*case, "jax") for case in STEPPED[5:]),
+        *(slow(*case, "jax") for case in STEPPED[5:12]),
     ],
 )
 def test_every_step_is_that_of_the_reference(name: str, credit: str, engine: str) -> None:
@@ -234,8 +234,8 @@ def test_so_it_is_for_robots_that_stand_in_all_samples(engine: str) -> None:
     step_by_step(ENGINES[engine], task, sigma=(0.1, 0.05))
 
 
-WORLDS = ("circle", "sphere", "heterogeneous", "four_obstacles", "amswarm_2", "rooms", "map")
-"""Scenarios of every kind of team and of world; JAX compiles for minutes for all, and rolls out in all elsewhere."""
+WORLDS = ("sphere", "rooms", "map")
+"""Fuller worlds than those above; JAX compiles for minutes for all scenarios, and rolls out in all elsewhere."""
 
 
 @pytest.mark.parametrize(

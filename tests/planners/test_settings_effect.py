@@ -240,7 +240,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "coarse_preset": ("paper", {}),
         "warm_start": ("go-to-goal", {}),
         "coarse_iterations": (1, {}),
-        "max_lag": (0, {}),
+        "max_lag": (0, {"max_cycles": 40}),
         "line_of_sight": (False, {"scenario": past_a_docked_robot, "subgoal_offset": 15}),
         "normalise_distance": (True, {}),
         "safe_mix": (False, {"scenario": "circle", "max_cycles": 60, "disturbances": [Push(3.0, 0.5)]}),
@@ -270,7 +270,7 @@ POLICY_CHANGES: dict[str, dict[str, tuple[Any, dict[str, Any]]]] = {
         "refine": ("sync", {}),
         "refine_every": (2, {"refine": "sync"}),
         "replan_distance": (0.5, {}),
-        "patience": (1, {"extra_margin": 0.8}),
+        "patience": (1, {"extra_margin": 0.8, "max_cycles": 40}),
         "deadline": (1e-6, {}),
         "control_noise_std": (0.1, {}),
     },
@@ -300,7 +300,7 @@ def policy_settings() -> list[Any]:
 
 def executed(name: str, settings: dict[str, Any]) -> bytes:
     """What the team does by a policy."""
-    own = {"lifelong": False, "max_cycles": 40, "scenario": None, "disturbances": ()}
+    own = {"lifelong": False, "max_cycles": 20, "scenario": None, "disturbances": ()}
     env = {key: settings.get(key, value) for key, value in own.items()}
     scenario = env.pop("scenario")
     problem = crossing() if scenario is None else make_problem(scenario, num_robots=4, horizon=50, goal_speed=INF)

@@ -41,7 +41,7 @@ class Swarm:
         # A first-order robot takes any velocity at once; of the others the motion continues velocity and acceleration.
         inertia = np.array([bool(model.speed_indices) for model in team.robot_models])
         self._fixed = np.where(inertia, 3, 1)
-        self._limits = team.limits[:, [SPEED, ACCELERATION]].astype(np.float64)
+        self._limits = np.ascontiguousarray(team.limits[:, [SPEED, ACCELERATION]], np.float64)
         self._limits[~inertia, 1] = np.inf
         self._motions = np.zeros((team.num_robots, config.degree + 1, d))
         self._accelerations = np.zeros((team.num_robots, d))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, read_only
 from d4orm_env.core.portable import sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
@@ -66,15 +66,17 @@ def world_space(problem: Problem) -> Space:
     bounds = np.tile([[-np.inf], [np.inf]], 3)
     bounds[:, : problem.dimension] = problem.world.bounds
     empty = np.zeros(3)
+    # As those of an index are: one compilation serves worlds with obstacles and without.
+    clearance, first, items = read_only((np.full(1, np.inf, np.float32), np.zeros(2, np.int32), np.zeros(0, np.int32)))
     return Space(
         low=empty,
         cell=1.0,
         scale=1.0,
         size=np.ones(3, np.int64),
         rounding=0.0,
-        clearance=np.full(1, np.inf, np.float32),
-        first=np.zeros(2, np.int32),
-        items=np.zeros(0, np.int32),
+        clearance=clearance,
+        first=first,
+        items=items,
         boxes=np.zeros((0, 7)),
         triangles=np.zeros((0, 6)),
         bounds=bounds,
