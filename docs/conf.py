@@ -9,10 +9,8 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
-from sphinx.domains.python import PythonDomain
-
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE))  # for replays.py and settings_page.py
+sys.path.insert(0, str(HERE))  # for what lies beside this file
 # What is collected is worth less than the looking for it, in which JAX, once imported, takes part.
 gc.disable()
 os.environ["SCIPY_ARRAY_API"] = "1"  # without which d4orm_env.crazyflow is not imported beside SciPy
@@ -79,23 +77,6 @@ html_extra_path = ["_extra"]  # what is in it lies beside the pages
 html_title = "d4orm-env"
 
 
-class IndexedPythonDomain(PythonDomain):
-    """Sphinx's own, but it looks only for names that the last part of some object's name is.
-
-    Most names in signatures are Python's or other libraries', and for each of them Sphinx goes through all objects.
-    """
-
-    _last_parts: tuple[int, frozenset[str]] = (0, frozenset())
-
-    def find_obj(self, env: Any, modname: str, classname: str, name: str, *how: Any) -> list[tuple[str, Any]]:
-        """Objects of a name, as in the class above."""
-        if self._last_parts[0] != len(self.objects):
-            self._last_parts = len(self.objects), frozenset(known.rpartition(".")[2] for known in self.objects)
-        if name.removesuffix("()").rpartition(".")[2] not in self._last_parts[1]:
-            return []
-        return super().find_obj(env, modname, classname, name, *how)
-
-
 def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: bool, options: Any) -> bool | None:
     """Leave out a NamedTuple's ``Alias for field number 0``: the class's own docstring describes the field."""
     is_alias = str(getattr(member, "__doc__", "")).startswith("Alias for field number")
@@ -113,6 +94,8 @@ def _write_generated(app: Any, config: Any) -> None:
 
 def setup(app: Any) -> None:
     """Connect what the extensions leave to the project."""
+    from python_names import IndexedPythonDomain
+
     app.add_domain(IndexedPythonDomain, override=True)
     app.connect("config-inited", _write_generated)
     app.connect("autodoc-skip-member", _skip_described_field)
