@@ -84,7 +84,10 @@ def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: boo
 
 
 def _write_generated(app: Any, config: Any) -> None:
-    """Have the replays that the pages show, and the page of settings."""
+    """Have the replays that the pages show, and the page of settings.
+
+    Replays come first and not beside Sphinx: they show how long a planner took.
+    """
     from replays import write_replays
     from settings_page import write_settings
 
