@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from importlib.metadata import version as installed_version
@@ -9,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE))  # for replays.py and settings_page.py
+sys.path.insert(0, str(HERE))  # for what lies beside this file
+# What is collected is worth less than the looking for it, in which JAX, once imported, takes part.
+gc.disable()
 os.environ["SCIPY_ARRAY_API"] = "1"  # without which d4orm_env.crazyflow is not imported beside SciPy
 
 project = "d4orm-env"
@@ -42,6 +45,7 @@ autodoc_default_options = {"ignore-module-all": True}
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
+autodoc_use_type_comments = False  # of which there are none
 # Optional extras that a build of the documentation does without.
 autodoc_mock_imports = [
     "benchmarl",
@@ -80,7 +84,10 @@ def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: boo
 
 
 def _write_generated(app: Any, config: Any) -> None:
-    """Have the replays that the pages show, and the page of settings."""
+    """Have the replays that the pages show, and the page of settings.
+
+    Replays come first and not beside Sphinx: they show how long a planner took.
+    """
     from replays import write_replays
     from settings_page import write_settings
 
@@ -90,5 +97,8 @@ def _write_generated(app: Any, config: Any) -> None:
 
 def setup(app: Any) -> None:
     """Connect what the extensions leave to the project."""
+    from python_names import IndexedPythonDomain
+
+    app.add_domain(IndexedPythonDomain, override=True)
     app.connect("config-inited", _write_generated)
     app.connect("autodoc-skip-member", _skip_described_field)

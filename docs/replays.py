@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from d4orm_env import make_problem, navigation_v0
@@ -42,10 +42,13 @@ def episodes(title: str, cases: dict[str, dict[str, object]], **options: object)
     return Replay(title, tuple(motions))
 
 
-def planned_by(title: str, planners: Sequence[str], scenario: str, **arguments: object) -> Replay:
-    """The same problem by several planners, each with what it takes."""
-    problem = make_problem(scenario, **arguments)
-    return Replay(title, tuple(make_planner(name).solve(problem, seed=0).motion(name) for name in planners))
+def planned_by(title: str, planners: dict[str, dict[str, object]], scenario: str, **arguments: object) -> Replay:
+    """The same problem by several planners, each with its settings."""
+    problem, motions = make_problem(scenario, **arguments), []
+    for name, settings in planners.items():
+        label = ", ".join([name, *(f"{key}={value}" for key, value in settings.items())])
+        motions.append(make_planner(name, **settings).solve(problem, seed=0).motion(label))
+    return Replay(title, tuple(motions))
 
 
 REPLAYS: dict[str, Callable[[], Replay]] = {
@@ -79,11 +82,14 @@ REPLAYS: dict[str, Callable[[], Replay]] = {
         disturbances=[Delay(1), Push(0.2, 0.3), Intruder(2), StateNoise(0.02, 0.02)],
     ),
     "rivals": lambda: planned_by(
-        "The same eight robots by the rivals", ("d4orm", "mppi", "cem", "mbd", "i-mbd"), "circle", num_robots=8
+        "The same eight robots by the rivals",
+        {"d4orm": {}, "mppi": {}, "cem": {}, "mbd": {"num_steps": 1000}, "i-mbd": {}},
+        scenario="circle",
+        num_robots=8,
     ),
-    "nodes": lambda: planned_by("Nodes that exchange candidates", ("d-d4orm",), "circle", num_robots=16),
-    "amswarm": lambda: planned_by("AMSwarm", ("amswarm", "hybrid"), "amswarm_3"),
-    "ipopt": lambda: planned_by("Direct collocation", ("ipopt",), "circle", num_robots=4),
+    "nodes": lambda: planned_by("Nodes that exchange candidates", {"d-d4orm": {}}, "circle", num_robots=16),
+    "amswarm": lambda: planned_by("AMSwarm", {"amswarm": {}, "hybrid": {}}, "amswarm_3"),
+    "ipopt": lambda: planned_by("Direct collocation", {"ipopt": {}}, "circle", num_robots=4),
     "instances": lambda: episodes(
         "Other instances of one scenario",
         {"seed 1": {"seed": 1}, "seed 2": {"seed": 2}, "seed 3": {"seed": 3}},

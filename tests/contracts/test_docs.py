@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -132,3 +133,16 @@ def test_every_setting_is_described(tmp_path: Path) -> None:
     text = (tmp_path / "settings.md").read_text(encoding="utf-8")
     assert set(re.findall("^## (.+)$", text, re.MULTILINE)) - {"Scenarios"} <= set(list_policies())
     assert "|  |" not in text
+
+
+@pytest.mark.parametrize("name", ["Team", "Team()", "core.Team", "Team.size", "size", "d4orm_env.core.Team", "am", ""])
+@pytest.mark.parametrize("module", ["d4orm_env", "d4orm_env.core", ""])
+def test_names_in_signatures_lead_where_sphinx_leads_them(name: str, module: str) -> None:
+    python = pytest.importorskip("sphinx.domains.python")
+    indexed = runpy.run_path(str(DOCS / "python_names.py"))["IndexedPythonDomain"]
+    env = SimpleNamespace(domaindata={})
+    for known, kind in (("core.Team", "class"), ("core.Team.size", "method"), ("teams.Team", "class")):
+        indexed(env).objects[f"d4orm_env.{known}"] = python.ObjectEntry("page", known, kind, False)
+    for mode in (0, 1):
+        how = (env, module, "Team", name, None, mode)
+        assert indexed(env).find_obj(*how) == python.PythonDomain(env).find_obj(*how)
