@@ -26,14 +26,16 @@ if TYPE_CHECKING:
 
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
-ONE_BY_ONE = ((1.6, False), (1.6, True), (4.0, True), (3.0, True))
-"""Fineness of the roadmaps on which paths are looked for one by one, and whether turns on the spot are counted."""
+SEARCHES = ((1.6, False, 4.0), (4.0, False, 1.5), (4.0, False, 1.5), (3.0, False, 1.5))
+"""Searches for paths one by one: fineness of the roadmap, whether turns on the spot are counted, and paths per robot
+after which the next one is tried if no fewer wait for theirs. They differ by chance too: another one often succeeds."""
+TURNING = ((1.6, False, 0.5), (1.6, True, 1.5), (1.6, True, 1.5), (4.0, True, 1.5), (4.0, True, 1.5), (3.0, True, 1.5))
+"""The same for teams in which some robot turns on the spot."""
 ALL_AT_ONCE = (1.6, 1.25, 1.0, 2.2, 3.0)
-"""Fineness of those on which they are then looked for all at once; see
+"""Fineness of those on which paths are then looked for all at once; see
 :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
-PATIENCE, LEAST_PATIENCE, HASTE = 4, 50, 8
-"""Paths per robot, and beyond these, after which the next is tried if no fewer wait for theirs; and by how much sooner
-that is where turns are not counted, but should be."""
+LEAST_PATIENCE = 50
+"""Paths beyond those per robot."""
 MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
 DETOUR_RATIO = 1.25
@@ -194,16 +196,13 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
     with search.watch.paused():
         compile_path_finding(problem)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-    patience = PATIENCE * problem.num_robots + LEAST_PATIENCE
     turning = any(model.turns_in_place for model in problem.team.robot_models)
-    for number, (fineness, counts_turns) in enumerate(ONE_BY_ONE):
-        if number == 1 and not turning:
-            continue
+    for number, (fineness, counts_turns, patience) in enumerate(TURNING if turning else SEARCHES):
         roadmap = lay_roadmap(problem, fineness)
         replanning = Replanning(problem, roadmap, counts_turns=counts_turns)
         if np.isfinite(replanning.alone).all():
-            tries = patience if counts_turns or not turning else patience // HASTE
-            driven = replanning.one_by_one(random, search.should_stop, tries)
+            most = LEAST_PATIENCE + int(patience * problem.num_robots)
+            driven = replanning.one_by_one(random, search.should_stop, most)
             if driven is not None:
                 return RoadmapSolution(roadmap, replanning, driven)
         elif number == 0 and (reason := NoPaths.unless_reachable(problem)) is not None:
