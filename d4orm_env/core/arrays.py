@@ -43,10 +43,7 @@ def as_float32(value: ArrayLike) -> FloatArray:
     """
     try:
         with np.errstate(over="ignore"):
-            array = np.asarray(_detached(value))
-            if array.dtype.kind in "SU":  # NumPy would read the numbers in it
-                raise TypeError("text is no number")
-            return array.astype(np.float32)
+            return np.array(_detached(value), np.float32)
     except OverflowError:
         raise ValueError("it holds a whole number too large for a float") from None
     except (RuntimeError, TypeError, ValueError):
@@ -164,8 +161,8 @@ def positive_number(
             above ``most``.
     """
     try:
-        if isinstance(value, bool | np.bool_ | str | bytes):
-            raise TypeError("neither truth nor text is a number")
+        if isinstance(value, bool | np.bool_):
+            raise TypeError("truth is no number")
         number = float(value)  # type: ignore[arg-type] # what is none raises
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number, not {short_repr(value)}") from error

@@ -130,7 +130,8 @@ class TrainingReward:
 
     def __post_init__(self) -> None:
         for name in self.term_names:
-            positive_number(getattr(self, name), f"{name} of TrainingReward", zero_allowed=True)
+            weight = positive_number(getattr(self, name), f"{name} of TrainingReward", zero_allowed=True)
+            object.__setattr__(self, name, weight)
 
     def __call__(self, step: RewardInput) -> FloatArray:
         """``(..., K)``, the sum of :meth:`terms`."""

@@ -117,7 +117,7 @@ def test_pedestrians_are_read_from_a_file(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("id,time,x\na,0,0\n", "has no column y; it needs a header with id, time, x and y"),
-        ("id,time,x,y\na,0,0,zero\n", "line 2: time, x and y must be numbers"),
+        ("id,time,x,y\na,0,0,zero\n", "line 2: time, x and y are '0', '0', 'zero'; give numbers"),
         ("id,time,x,y\na,0,0,0\na,0,1,0\n", "line 3: a is at two places at 0 s"),
         ("id,time,x,y\na,0,0,0\n", "people.csv has rows at 1 different times; give two"),
         ("id,time,x,y\n", "people.csv has rows at 0 different times; give two"),
@@ -133,7 +133,7 @@ def test_a_bad_file_is_an_error(tmp_path: Path, text: str, message: str) -> None
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([0, 0], [[0, 0], [1, 1]]), "times must be two or more, and increase"),
+        (([0, 0], [[0, 0], [1, 1]]), "times are .*; give two or more that increase"),
         (([0, 1], [[0, 0]]), r"positions have shape \(1, 2\)"),
         (([0, 1], [[0, 0], [1, 1]], 0), "radius is 0"),
         (([0, 1], [[0, 0], [1e9, 1]]), "at most 1e\\+06 m"),

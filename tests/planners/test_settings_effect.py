@@ -152,7 +152,7 @@ def base_settings(name: str, setting: str) -> dict[str, Any]:
 def outcomes(name: str, settings: dict[str, Any]) -> Generator[Any]:
     """What each iteration of a solve gives and says, but for its time, and at last who worked on it."""
     # The first plan of four robots that are guided is hard to make better, and the first batch holds one for them.
-    crowd = {"mapf": (8,), "mmd": (8, 2)}.get(name, (4,))
+    crowd = {"mapf": (12,), "mmd": (8, 2)}.get(name, (4,))
     short = make_problem("circle", num_robots=2, diameter=0.8)  # all else are long
     search = SolveRun(make_planner(name, **settings), crossing(*crowd) if settings["improve"] else short, 1)
     try:
