@@ -15,6 +15,7 @@ from planner_support import walled_in_problem
 
 from d4orm_env import Problem, Team, World, make_problem, verify
 from d4orm_env.dynamics.models import MODELS
+from d4orm_env.footprints import Box, Disc
 from d4orm_planners import make_planner
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.mapf.lacam import TeamMoves, TeamOnRoadmap, find_moves
@@ -364,6 +365,24 @@ def test_robots_may_pass_walls_closer_than_usual_if_that_is_all_they_find(
     monkeypatch.setattr(replanning, "room_at_walls", lambda *_: room * problem.rounding)
     driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
     assert (driven is not None) == planned
+
+
+def test_a_robot_without_a_path_even_alone_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = corridor_with_bay(right=1.0)
+    replanning = Replanning(problem, lay_roadmap(problem))
+    usual, failures = replanning.replan_one, iter([False] * 3)
+    monkeypatch.setattr(replanning, "replan_one", lambda *given: next(failures, True) and usual(*given))
+    driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+    assert driven is not None
+    assert verify(problem, driven.until(problem.horizon)).ok
+
+
+def test_boxes_without_goal_headings_find_paths_as_discs() -> None:
+    problem = make_problem("warehouse", num_robots=6, seed=0, footprint=Box(0.36, 0.24))
+    discs = problem.replace(team=problem.team.replace(footprint=Disc(float(problem.team.radius[0]))))
+    plan, as_discs = (make_planner(max_iterations=1).solve(case) for case in (problem, discs))
+    assert plan.solved
+    np.testing.assert_array_equal(plan.controls, as_discs.controls)
 
 
 # What users get.
