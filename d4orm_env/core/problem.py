@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core import problem_checks as checks
-from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array, frozen_per_robot, short_repr
+from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array, frozen_per_robot
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_arrays import ProblemArrays, as_arrays, digest_of
 from d4orm_env.core.problem_checks import Arrival
 from d4orm_env.core.summary_line import KeyFigure, count, joined, team_text
 from d4orm_env.core.team import Team
-from d4orm_env.core.world import World
+from d4orm_env.core.world import World, world_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,11 +108,7 @@ class Problem(Frozen):
         goal_heading: ArrayLike | None = None,
         goal_heading_tolerance: ArrayLike = 0.1,
     ) -> None:
-        world = World(dimension=team.dimension) if world is None else world
-        if not isinstance(world, World):
-            raise ValueError(f"world is {short_repr(world)}; give a World, such as World(boxes=[...]), or leave it out")
-        if world.dimension != team.dimension:
-            raise ValueError(f"the world has dimension {world.dimension} and the team {team.dimension}; match them")
+        world = world_of(world, team.dimension)
         size = team.num_robots
         numbers = checks.checked_numbers(dt, horizon, margin, goal_radius, collision_penalty, size)
         checks.check_arrival(arrival)

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Frozen, frozen_array, read_only
+from d4orm_env.core.arrays import LARGEST, SMALLEST, FloatArray, Floats, Frozen, frozen_array, read_only, short_repr
 from d4orm_env.geometry.polygon import MAX_ALL_CORNERS, check_polygon, triangulate
 from d4orm_env.geometry.shapes import Shapes
 from d4orm_env.geometry.world_index import WorldIndex, build_index, is_farther, nearest_distance
@@ -244,3 +244,17 @@ class World(Frozen):
 def _rounded_up(distance: float) -> float:
     """The next power of two, so that distances of about the same size share an index."""
     return 2.0 ** math.ceil(math.log2(distance))
+
+
+def world_of(value: object, dimension: int) -> World:
+    """``value`` as the world of a team that moves in so many dimensions; an open one for ``None``.
+
+    Raises:
+        ValueError: If it is no world, or one of another dimension.
+    """
+    world = World(dimension=dimension) if value is None else value
+    if not isinstance(world, World):
+        raise ValueError(f"world is {short_repr(world)}; give a World, such as World(boxes=[...]), or leave it out")
+    if world.dimension != dimension:
+        raise ValueError(f"the world has dimension {world.dimension} and the team {dimension}; match them")
+    return world

@@ -78,7 +78,7 @@ DYNAMICS = {
 }  # fmt: skip
 """Their dynamics and our models."""
 KEYS = ("min", "max", "obstacles")
-"""Keys of their environments that are read; others are not, unless they look like one of these."""
+"""Keys of their environments that are read. One that looks like one of these is an error, all others are left."""
 
 
 def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[str, Any]] | None = None) -> Problem:

@@ -59,6 +59,12 @@ IN_TIME = 0.9
 """Share of a step's timeout that is a policy's deadline."""
 
 
+def _seconds(time: object) -> float:
+    if not isinstance(time, Real) or not math.isfinite(time):
+        raise ValueError(f"time is {short_repr(time)}; give the seconds of one clock")
+    return float(time)
+
+
 class Controller:
     """A policy as a controller of real or simulated robots.
 
@@ -145,7 +151,7 @@ class Controller:
             raise ValueError(f"problem is {short_repr(problem)}; give a Problem, as make_problem() returns")
         self._background.forget()
         try:
-            self._begin(problem, states, float(time), seed)
+            self._begin(problem, states, _seconds(time), seed)
         except BaseException:
             self._env = None  # there is no team to step
             raise
@@ -178,9 +184,7 @@ class Controller:
         """
         if self._env is None:
             raise RuntimeError("the controller has no team yet; call begin(problem, states) before step()")
-        if not isinstance(time, Real) or not math.isfinite(time):
-            raise ValueError(f"time is {short_repr(time)}; give the seconds of one clock")
-        passed = (time - self._time) / self.problem.dt
+        passed = (_seconds(time) - self._time) / self.problem.dt
         if passed <= -SAME_PERIOD:
             raise ValueError(f"time is {time!r} s, before the last step; give times of one clock, in seconds")
         measured, known = self._completed(states)

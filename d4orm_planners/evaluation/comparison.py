@@ -18,8 +18,6 @@ from d4orm_planners.evaluation.summary import TrialGroup, wilson_interval
 stats: Any = LazyModule("scipy.stats")
 
 _RESAMPLES = 2000
-_FEW = 13
-"""SciPy's limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +74,7 @@ def paired(
         only_second=only_second,
         success_p=mcnemar(only_first, only_second),
         difference=float(np.median(differences)),
-        cost_p=_signed_rank(moved) if len(moved) else 1.0,
+        cost_p=float(stats.wilcoxon(moved).pvalue) if len(moved) else 1.0,
     )
 
 
@@ -94,23 +92,6 @@ def mcnemar(only_first: int, only_second: int) -> float:
     """
     apart = only_first + only_second
     return float(stats.binomtest(only_first, apart).pvalue) if apart else 1.0
-
-
-def _signed_rank(differences: Floats) -> float:
-    """Return the p-value of Wilcoxon's signed-rank test of differences, none of them zero, two-sided.
-
-    Few are tested exactly, by all their signs. So does SciPy, but where ranks tie it ranks anew for all of them.
-    """
-    if not 1 < len(differences) <= _FEW:
-        return float(stats.wilcoxon(differences).pvalue)
-    ranks = stats.rankdata(np.abs(differences))
-    test = stats.permutation_test(
-        (differences,),
-        lambda signed, axis: np.sum(ranks * (signed > 0), axis),
-        permutation_type="samples",
-        vectorized=True,
-    )
-    return float(test.pvalue)
 
 
 def _circumstances(trial: Trial) -> tuple[str, float, int, str, str]:

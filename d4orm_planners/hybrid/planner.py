@@ -27,6 +27,7 @@ from d4orm_planners.mapf.planner import (
     MAPFConfig,
     RoadmapSolution,
     compile_roadmap,
+    find_all_at_once,
     find_one_by_one,
     find_roadmap_solution,
     going_on_from_best,
@@ -105,16 +106,16 @@ class Hybrid(Planner):
             return self.improve_roadmap_solution(search, state)
         if isinstance(state, TeamMotions):
             return state, improve_manoeuvres(search, state)
-        if self.finds_manoeuvres(search):
-            if covered_by_discs(search.problem) and self.finds_paths(search):
-                solution = find_one_by_one(search)
-                if isinstance(solution, RoadmapSolution):
-                    return solution, self.follow(search, solution)
+        needs_manoeuvres = self.finds_manoeuvres(search)
+        as_discs = not needs_manoeuvres or covered_by_discs(search.problem)
+        needs_paths = as_discs and self.finds_paths(search)
+        solution = find_one_by_one(search) if needs_paths else None
+        if needs_manoeuvres and not isinstance(solution, RoadmapSolution):
             motions = find_manoeuvres(search)
             if motions is not None:
                 return motions, Iteration(motions.controls())
-        if self.finds_paths(search):
-            solution = find_roadmap_solution(search)
+        if needs_paths or (not as_discs and self.finds_paths(search)):
+            solution = solution or (find_all_at_once if as_discs else find_roadmap_solution)(search)
             if isinstance(solution, RoadmapSolution):
                 return solution, self.follow(search, solution)
             state, iteration = self.without_paths(search, state)

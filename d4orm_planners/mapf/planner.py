@@ -26,11 +26,16 @@ if TYPE_CHECKING:
 
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
-SEARCHES = ((1.6, False, 4.0), (4.0, False, 1.5), (4.0, False, 1.5), (3.0, False, 1.5))
+ONE_BY_ONE = (
+    (1.6, False, 0.5),
+    (1.6, True, 1.5),
+    (1.6, True, 1.5),
+    (4.0, True, 1.5),
+    (4.0, True, 1.5),
+    (3.0, True, 1.5),
+)
 """Searches for paths one by one: fineness of the roadmap, whether turns on the spot are counted, and paths per robot
 after which the next one is tried if no fewer wait for theirs. They differ by chance too: another one often succeeds."""
-TURNING = ((1.6, False, 0.5), (1.6, True, 1.5), (1.6, True, 1.5), (4.0, True, 1.5), (4.0, True, 1.5), (3.0, True, 1.5))
-"""The same for teams in which some robot turns on the spot."""
 ALL_AT_ONCE = (1.6, 1.25, 1.0, 2.2, 3.0)
 """Fineness of those on which paths are then looked for all at once; see
 :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
@@ -185,7 +190,7 @@ def improve_roadmap_solution(
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
     """Paths for the whole team, or as many robots as possible; the reason if none are found in time."""
-    return find_one_by_one(search) or _find_all_at_once(search)
+    return find_one_by_one(search) or find_all_at_once(search)
 
 
 def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
@@ -196,13 +201,12 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
     with search.watch.paused():
         compile_path_finding(problem)
     random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-    turning = any(model.turns_in_place for model in problem.team.robot_models)
-    for number, (fineness, counts_turns, patience) in enumerate(TURNING if turning else SEARCHES):
+    for number, (fineness, counts_turns, patience) in enumerate(ONE_BY_ONE):
         roadmap = lay_roadmap(problem, fineness)
         replanning = Replanning(problem, roadmap, counts_turns=counts_turns)
         if np.isfinite(replanning.alone).all():
-            most = LEAST_PATIENCE + int(patience * problem.num_robots)
-            driven = replanning.one_by_one(random, search.should_stop, most)
+            paths = LEAST_PATIENCE + int(patience * problem.num_robots)
+            driven = replanning.one_by_one(random, search.should_stop, paths)
             if driven is not None:
                 return RoadmapSolution(roadmap, replanning, driven)
         elif number == 0 and (reason := NoPaths.unless_reachable(problem)) is not None:
@@ -212,7 +216,7 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
     return None
 
 
-def _find_all_at_once(search: SolveRun) -> RoadmapSolution | NoPaths:
+def find_all_at_once(search: SolveRun) -> RoadmapSolution | NoPaths:
     """Paths for as many robots as possible, found for all of them at once."""
     problem, best = search.problem, None
     for number, fineness in enumerate(ALL_AT_ONCE):
