@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from d4orm_planners.base.controller import Controller
     from d4orm_planners.base.episode import Episode, run_episode
+    from d4orm_planners.base.mixed_policy import MixedPolicy
     from d4orm_planners.base.names import register_planner, register_policy
     from d4orm_planners.base.plan import IterationRecord, Plan, load_plan
     from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
@@ -21,6 +22,7 @@ __all__ = [
     "Episode",
     "Iteration",
     "IterationRecord",
+    "MixedPolicy",
     "OpenLoop",
     "Plan",
     "Planner",
@@ -42,6 +44,7 @@ _HOMES = {
     "base.controller": ("Controller",),
     "base.episode": ("Episode", "run_episode"),
     "evaluation.evaluate": ("evaluate",),
+    "base.mixed_policy": ("MixedPolicy",),
     "base.names": ("register_planner", "register_policy"),
     "base.plan": ("IterationRecord", "Plan", "load_plan"),
     "base.planner": ("Iteration", "Planner", "PlannerConfig"),

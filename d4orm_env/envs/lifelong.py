@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Callable
+from typing import TypeAlias
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, frozen_array
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays, inverse_initial_distance
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.transition import arrives
 from d4orm_env.engine.types import WorldBatch
+
+GoalFunction: TypeAlias = Callable[[Problem, int, FloatArray, FloatArray, np.random.Generator], ArrayLike]
+"""The next goal ``(d,)`` of a robot, from all that :func:`fresh_goal` is given, which draws one at random."""
 
 _BATCH = 256
 _ATTEMPTS = 20
@@ -45,14 +51,38 @@ def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, control
     )
 
 
-def assign_goals(problem: Problem, robots: NDArray[np.intp], world: WorldBatch, random: np.random.Generator) -> None:
-    """Give some robots of a batch of one world, which is changed, fresh goals and distances from there."""
+def assign_goals(
+    problem: Problem, robots: NDArray[np.intp], world: WorldBatch, random: np.random.Generator, draw: GoalFunction
+) -> None:
+    """Give some robots of a batch of one world, which is changed, goals that ``draw`` says, and distances from there.
+
+    Raises:
+        ValueError: If a goal is no position in :func:`goal_region`, or the robot would be in contact with an obstacle.
+    """
     positions, goals = world.state[0, :, : problem.dimension], world.goal[0]
     for robot in robots.tolist():
-        goals[robot] = fresh_goal(problem, robot, positions, goals, random)
+        goals[robot] = _checked(problem, robot, draw(problem, robot, positions.copy(), goals.copy(), random))
     world.inverse[0, robots] = inverse_initial_distance(positions[robots], goals[robots], problem.goal_radius)
     offsets = goals[robots] - positions[robots]
     world.distance[0, robots] = np.sqrt(np.add.reduce(offsets * offsets, axis=1))
+
+
+def _checked(problem: Problem, robot: int, given: ArrayLike) -> FloatArray:
+    """A goal where the robot can be."""
+    name = f"the next goal of robot_{robot}"
+    goal, (low, high) = frozen_array(given, name, (problem.dimension,)), goal_region(problem)
+    if ((goal < low) | (goal > high)).any():
+        raise ValueError(
+            f"{name} is {goal.tolist()}; it must lie between {low.tolist()} and {high.tolist()}: give the world other "
+            "bounds, which without them follow from starts and goals"
+        )
+    radius = float(problem.team.radius[robot])
+    if (clearance := float(problem.world.clearance(goal))) < radius:
+        raise ValueError(
+            f"{name} is {goal.tolist()}, where the clearance from obstacles and bounds is {clearance:.3g} m; it must "
+            f"be at least the robot's radius of {radius:g} m"
+        )
+    return goal
 
 
 def fresh_goal(

@@ -17,6 +17,7 @@ from d4orm_env.disturbances.controls import ControlNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbances, at_work, checked_disturbances
 from d4orm_env.disturbances.perception import RayNoise
 from d4orm_env.envs.inputs import noise_std
+from d4orm_env.envs.lifelong import GoalFunction
 from d4orm_env.envs.rewards import RewardFunction
 from d4orm_env.scenarios.problems import ScenarioLike, find_scenario, make_problem, unknown_argument
 
@@ -47,7 +48,7 @@ class EnvOptions:
             subclasses of your own. Those at level zero leave the environment as it is.
         lifelong: A robot that arrives gets a fresh random goal, keeps moving and is not terminated, and so may arrive
             at any speed unless ``goal_speed`` is given; its info says ``arrived`` at that step, and
-            ``distance_to_goal`` is to the new goal.
+            ``distance_to_goal`` is to the new goal. A :data:`~d4orm_env.envs.lifelong.GoalFunction` gives the goals.
         max_cycles: Steps until truncation; the problem's horizon unless given.
         randomize_instance: Draw a new instance of the scenario at every reset. By default wherever the scenario draws
             at random, that is, where another seed gives another problem; ``False`` keeps the one of ``seed=``.
@@ -76,7 +77,7 @@ class EnvOptions:
     render_mode: str | None = None
     control_noise_std: ArrayLike = 0.0
     disturbances: Sequence[AnyDisturbance] = ()
-    lifelong: bool = False
+    lifelong: bool | GoalFunction = False
     max_cycles: int | None = None
     randomize_instance: bool | None = None
     reward: str | RewardFunction = "paper"
@@ -143,9 +144,14 @@ class EnvOptions:
             )
         if self.progress not in ("straight", "path"):
             raise ValueError(f"progress is {short_repr(self.progress)}; it must be 'straight' or 'path'")
-        for name in ("lifelong", "observed_path", "line_of_sight", "egocentric"):
+        for name in ("observed_path", "line_of_sight", "egocentric"):
             if not isinstance(value := getattr(self, name), bool):
                 raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
+        if not (isinstance(self.lifelong, bool) or callable(self.lifelong)):
+            raise ValueError(
+                f"lifelong is {short_repr(self.lifelong)}; it must be True, False or a function that gives the next "
+                "goal"
+            )
         sensed = "ray_range" if self.ray_range != type(self).ray_range else ""
         sensed = "RayNoise" if any(isinstance(one, RayNoise) for one in self.disturbances) else sensed
         if sensed and not self.observed_rays:

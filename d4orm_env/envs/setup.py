@@ -22,7 +22,7 @@ from d4orm_env.engine.types import OWN_ARRAYS, WorldBatch
 from d4orm_env.envs.features import Features
 from d4orm_env.envs.inputs import checked_cycles
 from d4orm_env.envs.joint_state import state_bounds
-from d4orm_env.envs.lifelong import goal_region
+from d4orm_env.envs.lifelong import fresh_goal, goal_region
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import find_reward, paper_reward
 from d4orm_env.paths.shortest_paths import ahead_in_each
@@ -53,6 +53,7 @@ class EnvSetup:
         disturbances: Those that change anything.
         slack: Room beyond the limits of the robots that the spaces need.
         lifelong: Whether robots that arrive get fresh goals.
+        next_goal: What gives them these.
         reward: The reward function; ``None`` for the paper's, which the engines compute.
         along_paths: Whether distances of rewards are lengths of shortest paths.
         layout: Layout of one robot's observation, before it becomes features.
@@ -72,7 +73,8 @@ class EnvSetup:
         self.max_cycles = checked_cycles(problem.horizon if options.max_cycles is None else options.max_cycles)
         self.disturbances = options.disturbances_of(problem)
         self.slack = total_slack(self.disturbances, problem).joined(slack(problem))
-        self.lifelong = options.lifelong
+        self.lifelong = options.lifelong is not False
+        self.next_goal = options.lifelong if callable(options.lifelong) else fresh_goal
         if self.lifelong and not np.isnan(problem.goal_heading).all():
             raise ValueError("lifelong mode draws goals without headings; leave goal_heading out")
         # In an open world the two are the same.

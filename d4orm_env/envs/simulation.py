@@ -297,4 +297,4 @@ class Simulation:
         self._goals_reached += self.reached
         for world in np.flatnonzero(self.reached.any(axis=1)).tolist():
             robots, one = np.flatnonzero(self.reached[world]), self.worlds.select(slice(world, world + 1))
-            assign_goals(self.problems.all[world], robots, one, self._random[world])
+            assign_goals(self.problems.all[world], robots, one, self._random[world], self.setup.next_goal)

@@ -62,7 +62,7 @@ def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None 
         ValueError: For an unknown planner or preset, or a setting that makes no sense.
         TypeError: For an unknown setting.
     """
-    kind, owner = _planner_class(name), f"planner {_called(name)!r}"
+    kind, owner = _planner_class(name), f"planner {called(name)!r}"
     planner = kind(_configured(kind.config_class, kind.presets, preset, config, owner))
     planner.preset = preset
     return planner
@@ -85,7 +85,7 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
             setting that makes no sense.
         TypeError: For an unknown setting.
     """
-    kind, owner = find_policy(name), f"policy {_called(name)!r}"
+    kind, owner = find_policy(name), f"policy {called(name)!r}"
     if is_planner_class(kind):
         time_limit = _time_limit(config)
         return OpenLoop(make_planner(name if isinstance(name, str) else kind, **config), time_limit=time_limit)
@@ -176,7 +176,7 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
     Raises:
         ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.
     """
-    kind, owner = find_policy(name), f"policy {_called(name)!r}"
+    kind, owner = find_policy(name), f"policy {called(name)!r}"
     settings: dict[str, object]
     if is_planner_class(kind):
         time_limit = _time_limit(config)
@@ -239,7 +239,7 @@ def _planner_class(name: object) -> type[Planner]:
         )
     kind = name if is_planner_class(name) else PLANNERS.find(name)
     if inspect.isabstract(kind):
-        raise ValueError(f"planner {_called(name)!r} lacks iterate; define it in the class")
+        raise ValueError(f"planner {called(name)!r} lacks iterate; define it in the class")
     return kind
 
 
@@ -277,6 +277,6 @@ def _time_limit(config: dict[str, object]) -> float | None:
     return None if limit is None else duration(limit, "time_limit")
 
 
-def _called(thing: object) -> str:
+def called(thing: object) -> str:
     """Return the name of a policy for messages."""
     return thing if isinstance(thing, str) else getattr(thing, "__name__", type(thing).__name__)
