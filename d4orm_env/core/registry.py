@@ -213,9 +213,14 @@ def source_digest(thing: object) -> str:
 
 def source_object(thing: object) -> type | Callable[..., object]:
     """The class or function whose source makes a thing what it is."""
-    while isinstance(thing, functools.partial):
-        thing = thing.func
+    while isinstance(thing, functools.partial) or _is_compiled(thing):
+        thing = thing.func if isinstance(thing, functools.partial) else inspect.unwrap(thing)
     return thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing)
+
+
+def _is_compiled(thing: object) -> bool:
+    """Check for a function in other clothes, as of ``jax.jit``; what Python wraps in a function has that's source."""
+    return hasattr(thing, "__wrapped__") and not (inspect.isfunction(thing) or inspect.ismethod(thing))
 
 
 def check_sendable(thing: object, owner: str) -> None:

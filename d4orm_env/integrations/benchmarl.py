@@ -17,7 +17,10 @@ try:
     from torchrl.data import Composite
 except ModuleNotFoundError as error:
     missing = (error.name or "benchmarl").partition(".")[0]
-    raise ImportError(f"this integration needs {missing}; install it with: pip install benchmarl") from None
+    raise ImportError(
+        f"this integration needs {missing}; give BenchMARL an environment of its own, with: pip install d4orm-env "
+        "benchmarl"
+    ) from None
 except ImportError as error:
     raise ImportError(
         f"BenchMARL does not work with the TorchRL that is installed ({error}); give the two an environment of their "

@@ -22,7 +22,9 @@ try:
     from jaxmarl.environments.spaces import Box
 except ModuleNotFoundError as error:
     missing = (error.name or "jaxmarl").partition(".")[0]
-    raise ImportError(f"this integration needs {missing}; install it with: pip install jaxmarl") from None
+    raise ImportError(
+        f"this integration needs {missing}; give JaxMARL an environment of its own, with: pip install d4orm-env jaxmarl"
+    ) from None
 
 __all__ = ["JaxMARLNavigation"]
 

@@ -5,6 +5,7 @@ No library is imported unless a model of it is given, and no file is read: load 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -114,11 +115,12 @@ class SharedPolicy(Policy):
             seen, frames = self._features.encode(seen)
         asked = seen.reshape(1, -1) if self._is_joint else seen
         try:
-            actions = as_float32(self._predict(asked)).reshape(len(seen), -1)
+            answer = self._predict(asked)
         except RuntimeError as error:  # torch's, of a module that takes something else
             raise ValueError(
                 f"the model fails on observations of shape {asked.shape}, which are those of this environment: {error}"
             ) from error
+        actions = _checked_actions(answer, len(asked)).reshape(len(seen), -1)
         if self._features is not None:
             return self._features.decode(actions, frames, self.problem.team.control_limits[robots])
         if self._normalized:
@@ -197,25 +199,41 @@ def from_rllib(module: Model, normalized: bool = True, egocentric: bool = False)
     return SharedPolicy(partial(_ask_rllib, module), module, normalized, egocentric)
 
 
+def _checked_actions(answer: Any, count: int) -> FloatArray:
+    """What a model answers, ``(count, ...)`` actions.
+
+    Raises:
+        ValueError: If it is anything else, as actions with the state of a recurrent network.
+    """
+    with contextlib.suppress(ValueError):
+        if not isinstance(answer, tuple) and (actions := as_float32(answer)).shape[:-1] == (count,):
+            return actions
+    shape = f" of shape {tuple(answer.shape)}" if hasattr(answer, "shape") else ""
+    raise ValueError(
+        f"the model answers with a {type(answer).__name__}{shape} for {count} observations; it must be actions alone, "
+        f"({count}, m), so give a module or function that returns these"
+    )
+
+
 def _ask_sb3(model: Model, observations: FloatArray, *, deterministic: bool) -> ArrayLike:
     return model.predict(observations, deterministic=deterministic)[0]
 
 
 def _ask_torch(module: Model, observations: FloatArray) -> ArrayLike:
     with torch.no_grad():
-        return module(torch.as_tensor(observations)).numpy()
+        return module(torch.as_tensor(observations))
 
 
 def _ask_torchrl(module: Model, observations: FloatArray, *, observation_key: Key, action_key: Key) -> ArrayLike:
     asked = tensordict.TensorDict({observation_key: torch.as_tensor(observations)}, batch_size=[len(observations)])
     with torch.no_grad(), tensordict_nn.set_interaction_type(tensordict_nn.InteractionType.DETERMINISTIC):
-        return module(asked)[action_key].cpu().numpy()
+        return module(asked)[action_key]
 
 
 def _ask_rllib(module: Model, observations: FloatArray) -> ArrayLike:
     with torch.no_grad():
         answer = module.forward_inference({"obs": torch.as_tensor(observations)})
         if "actions" in answer:
-            return answer["actions"].cpu().numpy()
+            return answer["actions"]
         kind = module.get_inference_action_dist_cls()
-        return kind.from_logits(answer["action_dist_inputs"]).to_deterministic().sample().cpu().numpy()
+        return kind.from_logits(answer["action_dist_inputs"]).to_deterministic().sample()

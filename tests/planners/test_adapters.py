@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from d4orm_env import make_problem, navigation_v0
-from d4orm_planners import run_episode
-from d4orm_planners.base.adapters import from_rllib, from_sb3, from_torch, from_torchrl
+from d4orm_planners import evaluate, make_policy, run_episode
+from d4orm_planners.base.adapters import SharedPolicy, from_rllib, from_sb3, from_torch, from_torchrl
 from d4orm_planners.tracking.steering import limit_controls
 
 torch = pytest.importorskip("torch")
@@ -19,7 +23,7 @@ PROBLEM = make_problem("circle", num_robots=3, horizon=10, model="differential_d
 
 def first_actions(policy: Any) -> tuple[np.ndarray, np.ndarray, Any]:
     """What the robots observe first, what the policy has them do, and the space of that."""
-    env = navigation_v0.parallel_env(problem=PROBLEM)
+    env, policy = navigation_v0.parallel_env(problem=PROBLEM), make_policy(policy)
     episode = run_episode(env, policy)
     assert len(episode.trajectory.controls) == PROBLEM.horizon
     observed = np.stack(list(episode.observations[0].values()))
@@ -50,6 +54,76 @@ def test_a_module_of_torch() -> None:
     wanted = module(torch.as_tensor(observed)).detach().numpy()
     np.testing.assert_allclose(actions, limit_controls(PROBLEM, wanted), rtol=1e-5, atol=1e-6)
     assert from_torch(module).identity() != from_torch(module, normalized=True).identity()
+
+
+SIZE = navigation_v0.parallel_env(problem=PROBLEM).observation_space("robot_0").shape[0]
+
+
+class Also(torch.nn.Linear):
+    """A module that returns more than actions, as a recurrent one does."""
+
+    def __init__(self, answer: Any) -> None:
+        super().__init__(SIZE, 2)
+        self.answer = answer
+
+    def forward(self, seen: Any) -> Any:
+        return self.answer(super().forward(seen))
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda actions: (actions, None), "answers with a tuple for 3 observations; it must be actions alone, \\(3, m"),
+        (lambda actions: (actions, actions), "answers with a tuple"),
+        (lambda actions: torch.distributions.Normal(actions, 1.0), "answers with a Normal"),
+        (lambda actions: actions.ravel(), "answers with a Tensor of shape \\(6,\\) for 3 observations"),
+        (lambda actions: actions[:1], "answers with a Tensor of shape \\(1, 2\\) for 3 observations"),
+    ],
+)
+def test_a_module_that_returns_no_actions_is_told(answer: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        first_actions(from_torch(Also(answer)))
+
+
+def test_functions_may_return_tensors_of_any_kind() -> None:
+    module = Also(lambda actions: actions.bfloat16())
+    observed, actions, _ = first_actions(lambda observation: module(torch.as_tensor(observation)))
+    wanted = module(torch.as_tensor(observed)).detach().float().numpy()
+    np.testing.assert_allclose(actions, limit_controls(PROBLEM, wanted), rtol=1e-2, atol=1e-2)
+    np.testing.assert_allclose(first_actions(from_torch(module))[1], actions, rtol=1e-2, atol=1e-2)
+    team = run_episode(
+        navigation_v0.parallel_env(problem=PROBLEM),
+        lambda observations, state: {agent: module(torch.as_tensor(seen)) for agent, seen in observations.items()},
+    )
+    np.testing.assert_allclose(team.trajectory.controls[0], actions, rtol=1e-2, atol=1e-2)
+
+
+def linear(weights: Any, observations: Any) -> Any:
+    return jnp.tanh(observations @ weights)
+
+
+def weights_of(seed: int) -> Any:
+    return jax.random.normal(jax.random.key(seed), (SIZE, 2)) / 10
+
+
+def test_a_pure_function_of_jax(tmp_path: Path) -> None:
+    weights = weights_of(0)
+    observed, actions, _ = first_actions(SharedPolicy(jax.jit(partial(linear, weights)), None))
+    np.testing.assert_allclose(actions, limit_controls(PROBLEM, np.asarray(linear(weights, observed))), rtol=1e-5)
+    for one in (jax.jit(partial(linear, weights)), partial(jax.jit(linear), weights), partial(linear, weights)):
+        np.testing.assert_allclose(first_actions(one)[1], actions, rtol=1e-5, atol=1e-6)
+    # A store of trials tells networks by their weights.
+    mine = {f"{seed} {kind.__name__}": kind(seed) for seed in (0, 1) for kind in (shared, jitted)}
+    rows = evaluate(mine, [PROBLEM], seeds=[0], out=tmp_path, workers=1)
+    assert [(row.label, row.errors) for row in rows] == [(label, 0) for label in mine]
+
+
+def shared(seed: int) -> SharedPolicy:
+    return SharedPolicy(jax.jit(partial(linear, weights_of(seed))), None)
+
+
+def jitted(seed: int) -> Any:
+    return jax.jit(partial(linear, weights_of(seed)))
 
 
 def test_torchrl() -> None:
