@@ -47,7 +47,9 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ValueError(f"{error.filename or path}: cannot be read ({error.strerror})") from error
+        raise ValueError(
+            f"{error.filename or path}: cannot be read ({error.strerror}); check name and permissions"
+        ) from error
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
 
@@ -206,9 +208,11 @@ def parse_yaml(text: str) -> object:
         events = _not_too_many(yaml.parse(text, Loader=_LOADER))
         documents = [_node(events, event, 0) for event in events if isinstance(event, yaml.NodeEvent)]
     except yaml.MarkedYAMLError as error:
-        raise ValueError(f"is not YAML: {error.problem or error.context}{_line(error.problem_mark)}") from error
+        raise ValueError(
+            f"is not YAML: {error.problem or error.context}{_line(error.problem_mark)}; correct that"
+        ) from error
     except yaml.YAMLError as error:
-        raise ValueError(f"is not YAML: {error}") from error
+        raise ValueError(f"is not YAML: {error}; correct that") from error
     if len(documents) != 1:
         raise ValueError(f"holds {len(documents)} YAML documents; expected one")
     return documents[0]
@@ -236,7 +240,7 @@ def _node(events: Iterator[yaml.Event], event: Any, depth: int) -> object:
     for item in _until(events, yaml.MappingEndEvent):
         key = item.value if isinstance(item, yaml.ScalarEvent) and item.tag is None else None
         if key is None:
-            raise ValueError(f"has a field name that is not plain text{_line(item.start_mark)}")
+            raise ValueError(f"has a field name that is not plain text{_line(item.start_mark)}; write it as text")
         if key in mapping:
             raise ValueError(f"gives {key!r} twice{_line(item.start_mark)}; remove one")
         mapping[key] = _node(events, next(events), depth + 1)
@@ -276,7 +280,7 @@ def _read_text(path: Path) -> str:
     try:
         content = read_limited(path, "a YAML file", MAX_BYTES)
     except OSError as error:
-        raise ValueError(f"cannot be read ({error.strerror})") from error
+        raise ValueError(f"cannot be read ({error.strerror}); check name and permissions") from error
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

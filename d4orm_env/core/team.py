@@ -90,7 +90,10 @@ class Team(Frozen):
             radius = None
         footprints = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,) * count
         if len(footprints) != count:
-            raise ValueError(f"footprint has {len(footprints)} entries for {count} robots; give one each, or one")
+            raise ValueError(
+                f"footprint has {len(footprints)} entries for {count} robots; give one for each, such as "
+                "Box(0.5, 0.25), or one for all"
+            )
         for robot, footprint in enumerate(footprints):
             if not isinstance(footprint, Footprint):
                 raise ValueError(

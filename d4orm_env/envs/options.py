@@ -149,8 +149,7 @@ class EnvOptions:
                 raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
         if not (isinstance(self.lifelong, bool) or callable(self.lifelong)):
             raise ValueError(
-                f"lifelong is {short_repr(self.lifelong)}; it must be True, False or a function that gives the next "
-                "goal"
+                f"lifelong is {short_repr(self.lifelong)}; it must be True or False, or a function that gives goals"
             )
         sensed = "ray_range" if self.ray_range != type(self).ray_range else ""
         sensed = "RayNoise" if any(isinstance(one, RayNoise) for one in self.disturbances) else sensed

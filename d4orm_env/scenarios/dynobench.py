@@ -103,9 +103,10 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
         try:
             return _problem(read_yaml(path), known, path)
         except (KeyError, TypeError, IndexError) as error:
+            reason = f"it lacks {error}" if isinstance(error, KeyError) else first_line(error)
             raise ValueError(
-                f"no multi-robot problem of dynobench, {first_line(error)} is missing or is not what was expected; "
-                f"it has environment: min, max, obstacles, and robots: type, start, goal"
+                f"is no multi-robot problem of dynobench ({reason}); it has environment: min, max, obstacles, and "
+                "robots: type, start, goal"
             ) from error
 
 
@@ -129,10 +130,11 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     start, goal = np.zeros((2, team.num_robots, team.state_size))
     for robot, (entry, model) in enumerate(zip(robots, team.robot_models, strict=True)):
         for what, states in (("start", start), ("goal", goal)):
-            if len(entry[what]) != model.state_size:
+            state = _numbers(entry[what], f"{what} of robot_{robot}")
+            if len(state) != model.state_size:
                 given, kind = short_repr(entry[what]), entry["type"]
                 raise ValueError(f"{what} of robot_{robot} is {given}; a {kind} has {model.state_size} components")
-            states[robot, : model.state_size] = _state(model, entry[what])
+            states[robot, : model.state_size] = _state(model, state)
     turning = np.array([model.heading_index is not None for model in team.robot_models])
     inertia = np.array([not model.first_order for model in team.robot_models])
     d = team.dimension
@@ -160,6 +162,9 @@ def _check_types(types: list[Any], models: Mapping[str, dict[str, Any]]) -> None
                 f"robot type {name}: dynamics {short_repr(own.get('dynamics'))} has no model here; "
                 f"there are {', '.join(DYNAMICS)}"
             )
+        for limit, value in own.items():
+            if isinstance(value, str) and limit not in ("dynamics", "shape"):
+                raise ValueError(f"robot type {name}: {limit} is {short_repr(value)}; it must be a number")
         for least in ("min_vel", "min_angular_vel"):
             if own.get(least, -1.0) >= 0:
                 raise ValueError(f"robot type {name}: {least} is {own[least]:g}; it must be negative, for robots rest")
@@ -197,12 +202,20 @@ def _own_limits(parameters: list[dict[str, Any]], names: tuple[str, ...]) -> dic
     return {name: [limits.get(name, 1.0) for limits in own] for name in dict.fromkeys(chain(*own))}
 
 
-def _state(model: Model, theirs: list[float]) -> Floats:
+def _state(model: Model, theirs: Floats) -> Floats:
     """A state of ours; trailers turn by their hitch angles, and in theirs by their headings."""
-    state = np.array(theirs, np.float64)
-    if model.trailers:
-        state[3:] = _wrapped(state[2:-1] - state[3:])
-    return state
+    return np.append(theirs[:3], _wrapped(theirs[2:-1] - theirs[3:])) if model.trailers else theirs
+
+
+def _numbers(given: object, name: str) -> Floats:
+    """A list of numbers in a file, or one."""
+    try:
+        numbers = np.atleast_1d(np.array(given, np.float64))
+    except (TypeError, ValueError):
+        numbers = np.zeros((0, 0))
+    if numbers.ndim != 1:
+        raise ValueError(f"{name} is {short_repr(given)}; it must be a list of numbers, as [1.0, 2.5]")
+    return numbers
 
 
 def _wrapped(angle: Floats) -> Floats:
@@ -218,19 +231,18 @@ def _footprint(own: Mapping[str, Any]) -> Footprint:
 
 def _world(environment: Mapping[str, Any], team: Team) -> World:
     d, covered = team.dimension, min(footprint.inner_radius for footprint in team.footprint)
-    lower, upper = np.array(environment["min"], float)[:d] - covered, np.array(environment["max"], float)[:d] + covered
+    lower, upper = (_numbers(environment[name], f"environment's {name}")[:d] for name in ("min", "max"))
     boxes, balls = [], []
-    for obstacle in environment.get("obstacles") or ():
-        centre = np.array(obstacle["center"], float)[:d]
+    for number, obstacle in enumerate(environment.get("obstacles") or ()):
+        centre, size = (_numbers(obstacle[name], f"{name} of obstacle {number}")[:d] for name in ("center", "size"))
         if obstacle["type"] == "sphere":
-            balls.append([*centre, obstacle["size"] if np.isscalar(obstacle["size"]) else obstacle["size"][0]])
+            balls.append([*centre, size[0]])
             continue
         if obstacle["type"] != "box":
             raise ValueError(f"obstacle type {short_repr(obstacle['type'])} is unknown; known are box, sphere")
-        half = np.array(obstacle["size"], float)[:d] / 2
-        boxes.append([*(centre - half), *(centre + half)])
+        boxes.append([*(centre - size / 2), *(centre + size / 2)])
     kind = {"circles" if d == 2 else "spheres": balls}
-    return World(d, boxes=boxes, lower=lower, upper=upper, **kind)
+    return World(d, boxes=boxes, lower=lower - covered, upper=upper + covered, **kind)
 
 
 def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:

@@ -108,7 +108,7 @@ def _task(line: str, number: int, shape: tuple[int, int]) -> MapTask:
         )
     for column, row in (start, goal):
         if not (0 <= column < width and 0 <= row < height):
-            raise ValueError(f"names the cell ({column}, {row}) in line {number}, which is not on the map")
+            raise ValueError(f"names the cell ({column}, {row}) in line {number}, which is not on the map; correct it")
     if not (math.isfinite(path_length) and path_length >= 0):
         raise ValueError(f"gives a length of {path_length} in line {number}; it must be zero or more and finite")
     return MapTask(number, start, goal, path_length)
@@ -204,7 +204,8 @@ def _listed_positions(settings: Settings, grid: GridMap, space: FreeSpace, path:
         for task in tasks:
             for what, cell in (("start", task.start), ("goal", task.goal)):
                 if grid.blocked[cell[::-1]]:
-                    raise ValueError(f"has a {what} at ({cell[0]}, {cell[1]}) in line {task.line}, a blocked cell")
+                    at = f"({cell[0]}, {cell[1]}) in line {task.line}"
+                    raise ValueError(f"has a {what} at {at}, a blocked cell; give the file that belongs to the map")
                 if not space.contains(grid.centres(np.array([cell]))[0]):
                     raise ValueError(
                         f"has a {what} at ({cell[0]}, {cell[1]}) in line {task.line}, which robots of radius "

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
+from pettingzoo import ParallelEnv
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import BoolArray, FloatArray, short_repr, whole_number
@@ -23,9 +24,6 @@ from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Policy, robot_indices
-
-if TYPE_CHECKING:
-    from pettingzoo import ParallelEnv
 
 PHYSICS = ("model", "mujoco", "crazyflow")
 """Physics that moves robots: the equations that planners know, rigid bodies in MuJoCo, or drones in crazyflow."""
@@ -144,10 +142,13 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
         ImportError: If the physics needs a library that is not installed.
     """
     whole_number(seed, "seed", 0)
-    if not hasattr(env, "reset"):
-        raise ValueError(f"env is {short_repr(env)}; give the environment first, then the policy")
     if isinstance(env, gymnasium.Env):
         env = _parallel(env)
+    if not isinstance(env, ParallelEnv):
+        raise ValueError(
+            f"env is {short_repr(env)}; give the environment of one team first, as navigation_v0.parallel_env(...) or "
+            "gymnasium.make(...), then the policy"
+        )
     if physics is not None:
         env = _moved_by(env, physics)
     actor = make_policy(policy)

@@ -69,7 +69,7 @@ def read_plan(path: str | os.PathLike[str]) -> Plan:
         provenance = None if made is None else Provenance(**made)
         return _evaluated(problem, history, claimed, _checked(header) | {"provenance": provenance})
     except FileNotFoundError:
-        raise FileNotFoundError(f"there is no plan at {source}") from None
+        raise FileNotFoundError(f"there is no plan at {source}; write one with Plan.save or d4orm plan") from None
     except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
         raise ValueError(
             f"{source} is not a readable plan ({first_line(error)}); write it anew with Plan.save"

@@ -15,6 +15,9 @@ from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy
 from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
+_NO_TEXT = ("bool", "float", "int")
+"""Annotations of keywords for which text, as a command line has it, is refused."""
+
 RECOMMENDED = "hybrid"
 """The planner that solves most problems, and soonest."""
 
@@ -257,9 +260,13 @@ def _check_keywords(kind: Callable[..., object], config: Mapping[str, object], o
     parameters = signature.parameters
     if not parameters:
         _refuse_settings(config, owner)
-    for name in config:
+    for name, value in config.items():
         if name not in parameters and not any(known.kind is known.VAR_KEYWORD for known in parameters.values()):
             raise no_setting(name, owner, parameters)
+        hint = getattr(parameters.get(name), "annotation", None)
+        hint = getattr(hint, "__name__", hint)  # annotations may be text
+        if isinstance(value, str) and hint in _NO_TEXT:
+            raise ValueError(f"{name} of {owner} is {short_repr(value)}; it must be a {hint}")
     try:
         signature.bind(**config)
     except TypeError as error:

@@ -106,7 +106,9 @@ def read_parquet(path: str | os.PathLike[str]) -> list[Trial]:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         # A damaged file is to pyarrow an OSError as well.
-        raise ValueError(f"{os.fspath(path)} is no Parquet file of trials: {first_line(error)}") from error
+        raise ValueError(
+            f"{os.fspath(path)} is no Parquet file of trials ({first_line(error)}); give one that d4orm evaluate wrote"
+        ) from error
 
 
 def _trials(file: ParquetFile) -> Iterator[Trial]:

@@ -225,9 +225,11 @@ def _load_zip(algorithm: str, path: Path) -> Any:
             f"a policy in a .zip needs Stable-Baselines3; install it with: pip install 'd4orm-env[rl]' ({path})"
         ) from None
     if not path.is_file():
-        raise FileNotFoundError(f"policy file {path} does not exist")
+        raise FileNotFoundError(f"policy file {path} does not exist; give what model.save() wrote")
     try:
         return getattr(stable_baselines3, algorithm.upper()).load(path, device="cpu")
     except Exception as error:  # whatever a foreign file makes its reader raise
         message = " ".join(str(error).split())
-        raise ValueError(f"policy file {path} is no {algorithm.upper()} model of SB3: {message}") from error
+        raise ValueError(
+            f"policy file {path} is no {algorithm.upper()} model of SB3 ({message}); give what model.save() wrote"
+        ) from error

@@ -209,9 +209,12 @@ def _header(path: Path, text: str) -> Header:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "header"
-        raise ValueError(f"policy file {path}: {where}: {first['msg']}") from None
+        raise ValueError(f"policy file {path}: {where}: {first['msg']}; write one with 'd4orm train'") from None
     if header.format != FORMAT:
-        raise ValueError(f"policy file {path} has format {header.format}, and this program reads format {FORMAT}")
+        raise ValueError(
+            f"policy file {path} has format {header.format}, and this program reads format {FORMAT}; write one with "
+            "'d4orm train'"
+        )
     if header.activation not in _ACTIVATIONS:
         raise ValueError(
             f"policy file {path}: activation {header.activation!r} is unknown; known are {', '.join(_ACTIVATIONS)}"

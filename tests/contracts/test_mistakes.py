@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from d4orm_env import Problem, Team, load_map, load_problem, make_problem, navig
 from d4orm_env.disturbances import MovingObstacle
 from d4orm_env.envs.rewards import TrainingReward
 from d4orm_env.footprints import Box, Train
-from d4orm_planners import Controller, make_planner, make_policy, run_episode
+from d4orm_planners import Controller, Policy, make_planner, make_policy, run_episode
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3, from_torch
 
 
@@ -25,6 +26,20 @@ class Module:
 
     def __call__(self, *given: object) -> object:
         raise RuntimeError("shapes cannot be multiplied")
+
+
+class Spring(Policy):
+    """A policy with a setting that is a number."""
+
+    def __init__(self, gain: float = 1.0) -> None:
+        self.gain = gain
+
+    def act(self, observations: Any, state: Any) -> Any:
+        return {agent: -self.gain * seen[:2] for agent, seen in observations.items()}
+
+
+def make_vec() -> Any:
+    return gymnasium.make_vec("d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point")
 
 
 def controller() -> Controller:
@@ -58,6 +73,11 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: from_sb3("joint.zip"), "give a model of Stable-Baselines3, as PPO.load"),
         (lambda: verify(PROBLEM, SimpleNamespace(controls=0)), "not SimpleNamespace; give its controls"),
         (lambda: from_torch("net.pt"), "the model is 'net.pt'; load it first"),
+        (lambda: run_episode(make_vec(), "orca"), r"num_envs=2\); give the environment of one team first, as navig"),
+        (lambda: run_episode(navigation_v0.env("circle"), "orca"), "give the environment of one team first"),
+        (lambda: make_policy(Spring, gain="stiff"), "gain of policy 'Spring' is 'stiff'; it must be a float"),
+        (lambda: load_problem("none.yaml"), r"none.yaml: cannot be read \(No such file .*\); check name and permiss"),
+        (lambda: Team(("unicycle",) * 3, footprint=[0.3, 0.2]), "has 2 entries for 3 robots; give one for each, such"),
         (lambda: make_policy("orca").reset(PROBLEM), "give an environment, such as parallel_env"),
         (lambda: Controller("orca").begin("circle", PROBLEM.start), "problem is 'circle'; give a Problem"),
         (lambda: controller().step(PROBLEM.start, "now"), "time is 'now'; give the seconds of one clock"),

@@ -93,7 +93,11 @@ def test_own_parameters_are_taken(instance: Path) -> None:
         ("unicycle1_v0", "hovercraft_7", "robot types 'hovercraft_7' are unknown; known are unicycle1_v0"),
         ("type: box", "type: torus", "obstacle type 'torus' is unknown; known are box, sphere"),
         ("obstacles:", "obstacle:", "environment has the key 'obstacle'; did you mean 'obstacles'?"),
-        ("robots:", "agents:", "no multi-robot problem of dynobench"),
+        ("robots:", "agents:", "is no multi-robot problem of dynobench (it lacks 'robots'); it has environment: min"),
+        ("goal: [4, 1.5, 0]", "goal: [4, left, 0]", "goal of robot_0 is [4, 'left', 0]; it must be a list of numbers"),
+        ("goal: [4, 1.5, 0]", "goal: there", "goal of robot_0 is 'there'; it must be a list of numbers, as"),
+        ("min: [0, 0]", "min: [0, low]", "environment's min is [0, 'low']; it must be a list of numbers, as"),
+        ("size: [", "size: [big, ", "size of obstacle 0 is ['big', "),
         (
             "goal: [4, 1.5, 0]",
             "goal: [4, 1.5]",

@@ -198,7 +198,10 @@ def test_files_keep_footprints(tmp_path: object) -> None:
             "Polygon is not convex at corner 2, [0.2, 0.2]; give the corners of its convex hull",
         ),
         (lambda: Polygon([[np.cos(4 * np.pi * i / 5), np.sin(4 * np.pi * i / 5)] for i in range(5)]), "not convex"),
-        (lambda: Team(("unicycle",) * 2, footprint=[Disc(1)]), "footprint has 1 entries for 2 robots"),
+        (
+            lambda: Team(("unicycle",) * 2, footprint=[Disc(1)]),
+            "footprint has 1 entries for 2 robots; give one for each, such as Box",
+        ),
         (lambda: Team(("unicycle",), footprint=Ellipsoid(1, 1, 1)), "lies in 3 dimensions and the team moves in 2"),
         (lambda: Team(("holonomic3d",), footprint=Box(1, 1)), "lies in 2 dimensions and the team moves in 3"),
         (lambda: Team(("unicycle",), footprint=["box"]), "footprint of robot_0 is 'box'; give one such as Box"),

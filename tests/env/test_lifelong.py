@@ -108,5 +108,5 @@ def test_a_goal_where_the_robot_cannot_be_is_refused(goal: Any, message: str) ->
 
 
 def test_what_gives_no_goals_is_refused() -> None:
-    with pytest.raises(ValueError, match="lifelong is 'often'; it must be True, False or a function that gives the"):
+    with pytest.raises(ValueError, match="lifelong is 'often'; it must be True or False, or a function that gives"):
         navigation_v0.parallel_env("circle", lifelong="often")

@@ -381,9 +381,12 @@ class TestMovingAiScenario:
             ("", "is not a Moving AI scenario; it must begin with a line 'version 1'"),
             ("version 1\n", "has 0 rows for 1 robots; use num_robots=0 or another file"),
             ("version 1\n" + ROW.format(1, 1, 0, 0), r"has a start at \(1, 1\) in line 2, a blocked cell"),
-            ("version 1\n" + ROW.format(0, 0, 1, 1), r"has a goal at \(1, 1\) in line 2, a blocked cell"),
+            (
+                "version 1\n" + ROW.format(0, 0, 1, 1),
+                r"has a goal at \(1, 1\) in line 2, a blocked cell; give the file that",
+            ),
             ("version 1\n" + ROW.format(0, 0, 4, 0), r"names the cell \(4, 0\) in line 2, which is not on the map"),
-            ("version 1\n" + ROW.format(0, 0, -1, 0), "which is not on the map"),
+            ("version 1\n" + ROW.format(0, 0, -1, 0), "which is not on the map; correct it"),
             ("version 1\n" + ROW.format(0, 0, "x", 0), "has a line 2 that is not bucket, map, width, height"),
             ("version 1\n1 2 3\n", "has a line 2 that is not bucket"),
             (

@@ -248,7 +248,7 @@ BAD_FILES = [
     ("just text", "expected fields such as"),
     ("[1, 2]", "expected fields such as"),
     (f"---\n{MINIMAL}---\n{MINIMAL}", "holds 2 YAML documents"),
-    ("version: 1\n robots: ]", "is not YAML: .* in line 2"),
+    ("version: 1\n robots: ]", "is not YAML: .* in line 2; correct that"),
     ("\tversion: 1", "is not YAML"),
     (b"\xff\xfe\x00", r"is not UTF-8 text \(byte 0\)"),
     (b"name: \x00", "is not YAML"),

@@ -77,7 +77,9 @@ FILES: dict[str, Callable[[Path], None]] = {
 def test_parquet_that_holds_no_trials_is_refused(name: str, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     FILES[name](path := tmp_path / "trials.parquet")
-    with pytest.raises(ValueError, match=r"trials\.parquet is no Parquet file of trials: ") as error:
+    with pytest.raises(
+        ValueError, match=r"trials\.parquet is no Parquet file of trials \(.*\); give one that d4orm eval"
+    ) as error:
         read_parquet(path)
     assert len(one_line(error.value)) < 500
 
