@@ -211,7 +211,7 @@ def source_digest(thing: object) -> str:
     return hashlib.sha256(source).hexdigest()
 
 
-def source_object(thing: object) -> type | Callable[..., object]:
+def source_object(thing: Any) -> type | Callable[..., object]:
     """The class or function whose source makes a thing what it is."""
     while isinstance(thing, functools.partial) or _is_compiled(thing):
         thing = thing.func if isinstance(thing, functools.partial) else inspect.unwrap(thing)
