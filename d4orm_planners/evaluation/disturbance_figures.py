@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -115,20 +116,22 @@ def _grid(
     return figure, axes[:count]
 
 
+@own_style(_STYLE)
 def draw_noise(groups: Mapping[str, Sequence[SuccessRate]]) -> Figure:
-    """Success against the execution noise: a panel per title, and in it a line with a confidence band per policy."""
+    """Success against the execution noise: a panel per title, and in it a line with confidence intervals per policy.
+
+    One panel is as wide as a column and has no title, more are as wide as a page.
+    """
     across = min(3, len(groups))
-    figure, axes = _grid(len(groups), across, lambda rows: (4.8 * across, 3.6 * rows))
-    for ax, (title, group) in zip(axes, groups.items()):
-        for label in dict.fromkeys(rate.label for rate in sorted(group, key=lambda rate: rate.control_noise_std)):
-            line = sorted((rate for rate in group if rate.label == label), key=lambda rate: rate.control_noise_std)
-            x = [rate.control_noise_std for rate in line]
-            (drawn,) = ax.plot(x, [rate.rate for rate in line], marker="o", label=label, clip_on=False)
-            lower, upper = [rate.lower for rate in line], [rate.upper for rate in line]
-            ax.fill_between(x, lower, upper, color=drawn.get_color(), alpha=0.15, linewidth=0)
-        ax.set(title=title, xlabel="standard deviation of the control noise", ylabel="success rate", ylim=(0, 1))
-        ax.grid(alpha=0.3)
-    axes[0].legend(loc="best")
+    labels = list(dict.fromkeys(rate.label for group in groups.values() for rate in group))
+    width = PAGE if across > 1 else COLUMN
+    figure, axes = _grid(len(groups), across, lambda rows: (width, 0.3 + 1.9 * rows), sharey=True)
+    for number, (ax, (title, group)) in enumerate(zip(axes, groups.items())):
+        rates = [replace(rate, level=rate.control_noise_std) for rate in group]
+        _draw_panel(ax, "control_noise", labels, sorted(rates, key=lambda rate: rate.control_noise_std))
+        ax.set(title=title if len(groups) > 1 else "", xlabel="standard deviation of the control noise")
+        ax.set_ylabel("success rate" if number % across == 0 else "")
+    _add_legend(figure, axes, across)
     return figure
 
 
@@ -145,9 +148,14 @@ def draw_lines(rates: Sequence[SuccessRate]) -> Figure:
     for number, (ax, name) in enumerate(zip(axes, names)):
         _draw_panel(ax, name, labels, [rate for rate in rates if rate.disturbance == name])
         ax.set_ylabel("success rate" if number % across == 0 else "")
-    lines = axes[0].get_legend_handles_labels()
-    figure.legend(*lines, loc="outside lower center", ncols=min(max(across, 2), len(labels)), frameon=False)
+    _add_legend(figure, axes, across)
     return figure
+
+
+def _add_legend(figure: Figure, axes: Sequence[Axes], across: int) -> None:
+    lines, labels = axes[0].get_legend_handles_labels()
+    columns = min(max(across, 2), len(labels))
+    figure.legend(lines, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def _draw_panel(ax: Axes, name: str, labels: Sequence[str], rates: Sequence[SuccessRate]) -> None:

@@ -9,7 +9,6 @@ from math import isfinite
 from pathlib import Path
 
 from d4orm_env.core.arrays import short_repr
-from d4orm_env.render.style import own_style
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, draw_noise, quantity_of, write_figure
@@ -34,8 +33,8 @@ def _check_given(given: object, kind: type, source: str) -> None:
 
 
 def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
-    """Write ``robustness.csv``, ``robustness.md`` and, where nothing but noise went wrong, ``robustness.png``, success
-    against it.
+    """Write ``robustness.csv``, ``robustness.md`` and, where nothing but noise went wrong, the figure ``robustness`` as
+    PDF, SVG and PNG, success against it.
 
     Args:
         folder: Output folder.
@@ -49,15 +48,13 @@ def write_robustness(folder: str | os.PathLike[str], rates: Sequence[SuccessRate
         OSError: If the folder does not exist or cannot be written to.
     """
     _check_given(rates, SuccessRate, "evaluate()")
-    paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md", "png")]
+    paths = [Path(folder, f"robustness.{kind}") for kind in ("csv", "md")]
     write_rates(paths[0], rates)
     with target(paths[1]) as path:
         path.write_text(markdown(rates), encoding="utf-8")
     if any(rate.disturbance for rate in rates):
-        return paths[:2]
-    with target(paths[2]) as path, own_style({"text.parse_math": False}):  # no name is a formula
-        draw_noise(panels(rates)).savefig(path, dpi=150)
-    return paths
+        return paths
+    return paths + write_figure(Path(folder), "robustness", draw_noise(panels(rates)))
 
 
 def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGroup]) -> list[Path]:

@@ -463,7 +463,8 @@ def test_the_files(d4orm, tmp_path: Path) -> None:
     assert status == 0, err
     written = {path.name for path in (tmp_path / "here").iterdir()}
     assert {"robustness.csv", "robustness.md", "robustness.png", STORE} <= written
-    assert (tmp_path / "here" / "robustness.png").read_bytes().startswith(b"\x89PNG")
+    for kind, magic in (("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")):
+        assert (tmp_path / "here" / f"robustness.{kind}").read_bytes().startswith(magic)
     with (tmp_path / "here" / "robustness.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * 2 * 2
