@@ -19,7 +19,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, coarse_problem, int
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.d4orm_d.settings import D4ormDConfig
-from d4orm_planners.hybrid.planner import Hybrid, HybridConfig
+from d4orm_planners.hybrid.planner import Hybrid, HybridConfig, covered_by_discs
 from d4orm_planners.mapf.planner import RoadmapSolution
 
 
@@ -80,6 +80,21 @@ class CoarsePlanning:
         return guidance
 
     def _planned(
+        self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
+    ) -> tuple[Candidate, CoarsePlan]:
+        """A plan for the discs round the robots, who then move all at once; where there is none, for them themselves.
+
+        Footprints are planned one after another (:mod:`d4orm_planners.manoeuvres`), and the last ones come late.
+        """
+        team = coarse.team
+        if team.shapes and covered_by_discs(coarse):
+            discs = coarse.with_state(coarse.start, coarse.goal, team=team.replace(radius=team.radius))
+            chosen, plan = self._searched(discs, step, initial, iterations, thorough)
+            if not chosen.failed.any():
+                return chosen, plan
+        return self._searched(coarse, step, initial, iterations, thorough)
+
+    def _searched(
         self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
     ) -> tuple[Candidate, CoarsePlan]:
         """The first plan that passes the checks, or the best one."""

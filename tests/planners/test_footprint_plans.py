@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from env_support import slow
 
-from d4orm_env import Problem, make_problem, navigation_v0, rollout, verify
+from d4orm_env import Problem, Team, World, make_problem, navigation_v0, rollout, verify
 from d4orm_env.footprints import Box, Capsule, Ellipsoid
 from d4orm_planners import make_planner, make_policy, run_episode
+from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine, moving_robots
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
@@ -78,3 +79,28 @@ def test_c2f_executes_them() -> None:
     problem = boxes(horizon=150, goal_heading=0.0)
     episode = run_episode(navigation_v0.parallel_env(problem=problem), make_policy("d4orm-c2f", refine="sync"), seed=0)
     assert episode.metrics["success"] == 1.0
+
+
+def test_c2f_guides_them_as_discs_which_move_all_at_once() -> None:
+    problem = make_problem("circle", num_robots=8, footprint=Box(0.36, 0.24))
+    policy = make_policy("d4orm-c2f", refine="sync")
+    episode = run_episode(navigation_v0.parallel_env(problem=problem), policy, seed=0)
+    assert episode.metrics["success"] == 1.0
+    assert episode.metrics["makespan"] < 0.75 * problem.horizon * problem.dt
+    assert isinstance(policy.guidance, CoarsePlan)
+    assert not policy.guidance.problem.team.shapes
+
+
+def test_c2f_guides_them_as_they_are_where_discs_do_not_pass() -> None:
+    walls = [[-0.1, 0.25, 0.1, 2.0], [-0.1, -2.0, 0.1, -0.25]]
+    world = World(boxes=walls, lower=[-2, -2], upper=[2, 2])
+    team = Team(("differential_drive",), footprint=Box(0.5, 0.2))
+    problem = Problem(team, [[-1.0, 0, 0, 0]], [[1.0, 0]], world)
+    assert 2 * float(team.radius[0]) > 0.5
+    policy = make_policy("d4orm-c2f", refine="sync", engine="cpu")
+    env = navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy.reset(env, seed=0)
+    assert isinstance(policy.guidance, CoarsePlan)
+    assert policy.guidance.problem.team.shapes == team.shapes
+    assert np.linalg.norm(policy.guidance.path[-1] - problem.goal) < 0.1
