@@ -38,7 +38,7 @@ test-apart = $(PYTHON) -m venv $(VENV)-$(1) && \
 integrations: ## Test the integrations whose libraries need an environment of their own: RLlib, BenchMARL, JaxMARL, crazyflow
 	$(call test-apart,rllib,'ray[rllib]==2.60.0' torch==2.13.0)
 	$(call test-apart,benchmarl,benchmarl==1.5.2)
-	$(call test-apart,jaxmarl,jaxmarl==0.2.0)
+	$(call test-apart,jaxmarl,jaxmarl==0.2.0 six)
 	$(call test-apart,crazyflow,crazyflow==0.4.0)
 
 portability: $(DEV_STAMP) ## Plan under the instruction sets of other processors and compare to the bit

@@ -22,8 +22,10 @@ try:
     from jaxmarl.environments.spaces import Box
 except ModuleNotFoundError as error:
     missing = (error.name or "jaxmarl").partition(".")[0]
+    # gymnax, which JaxMARL brings, imports six and does not say so.
     raise ImportError(
-        f"this integration needs {missing}; give JaxMARL an environment of its own, with: pip install d4orm-env jaxmarl"
+        f"this integration needs {missing}; give JaxMARL an environment of its own, with: pip install d4orm-env "
+        "jaxmarl six"
     ) from None
 
 __all__ = ["JaxMARLNavigation"]

@@ -112,7 +112,7 @@ def test_the_planners_are_not_loaded_by_the_environment() -> None:
 
 @pytest.mark.parametrize(
     ("library", "package"),
-    [("jaxmarl", "d4orm-env jaxmarl"), ("torchrl", "'d4orm-env[rl]'"), ("benchmarl", "d4orm-env benchmarl")],
+    [("jaxmarl", "d4orm-env jaxmarl six"), ("torchrl", "'d4orm-env[rl]'"), ("benchmarl", "d4orm-env benchmarl")],
 )
 @pytest.mark.slow
 def test_an_integration_says_which_library_is_missing(library: str, package: str) -> None:
