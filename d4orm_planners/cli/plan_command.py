@@ -75,12 +75,7 @@ def solving(
 ) -> AbstractContextManager[Callback]:
     """Compile what planning needs, and show a live line meanwhile; gives the callback of the solve."""
     if get_sampling_engine(planner.config.engine).name == "cpu":
-        compile_for_planning(
-            problem.team.models,
-            lambda: typer.echo("compiling, once per robot model ...", err=True),
-            driver=planner.name if planner.drives_straight else "",
-            walls=len(problem.arrays.boxes) + len(problem.arrays.triangles) > 0,
-        )
+        compile_for_planning(planner, problem, lambda: typer.echo("compiling, once per robot model ...", err=True))
     limit = planner.config.max_iterations if max_iterations is None else max_iterations
     return solve_progress(planner.name, problem.num_robots, limit, enabled=not quiet)
 

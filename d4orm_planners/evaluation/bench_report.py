@@ -155,7 +155,7 @@ _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
         "plan.sample(), ms": lambda row: milliseconds(row["sample"]),
     }),
     "startup": _tabulated("From the start of a process to its first plan", {
-        "robots": itemgetter("num_robots"),
+        "problem": lambda row: f"{row['scenario']}, {row['num_robots']} robots",
         "compiling, s": lambda row: f"{row['compiling']:.1f}",
         "process with an empty cache, s": lambda row: f"{row['cold']:.1f}",
         "process with a full cache, s": lambda row: seconds(row["warm"]),

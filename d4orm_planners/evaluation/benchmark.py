@@ -95,7 +95,9 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for mode in get_args(Mode):
         loops = partial(measure_robots, mode, settings.repetitions, settings.time_limit)
         yield "robots", f"control loops, {mode}", loops
-    yield "startup", "first plan of a process", partial(measure_startup, 8, min(settings.repetitions, 5))
+    for scenario, size in (("circle", 8), ("warehouse", 16)):
+        start = partial(measure_startup, scenario, size, min(settings.repetitions, 5))
+        yield "startup", f"first plan of a process, {scenario}", start
     for size in (settings.memory_robots,) if find_spec("resource") else ():  # Windows has none
         memory = partial(measure_memory, size, settings.num_samples, settings.horizon, diameter(size))
         yield "memory", f"memory of {size} robots", memory
@@ -114,6 +116,7 @@ def _big_team_parts(settings: BenchmarkSettings) -> Iterator[Part]:
         ("warehouse", "robots", settings.big_warehouse, {}),
         ("warehouse", "differential drives", settings.big_drives, {"model": "differential_drive"}),
         ("warehouse", "boxes", settings.big_boxes, BOXES),
+        ("warehouse", "boxes without goal headings", settings.big_free_boxes, {"footprint": BOXES["footprint"]}),
     )
     for scenario, what, sizes, robots in teams:
         for size in sizes:

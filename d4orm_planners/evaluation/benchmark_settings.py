@@ -52,6 +52,7 @@ class BenchmarkSettings(CheckedSettings):
         big_warehouse: The same in warehouses.
         big_drives: The same of differential drives.
         big_boxes: The same of rectangles with goal headings in warehouses.
+        big_free_boxes: The same of rectangles without.
         big_seeds: Seeds of these, and of the plans that are improved.
         big_time_limit: Seconds per plan of these.
         improved_robots: Team sizes whose first plans are improved.
@@ -85,6 +86,7 @@ class BenchmarkSettings(CheckedSettings):
     big_warehouse: tuple[Robots, ...] = (100, 200)
     big_drives: tuple[Robots, ...] = (100,)
     big_boxes: tuple[Robots, ...] = (16, 50)
+    big_free_boxes: tuple[Robots, ...] = (100,)
     big_seeds: Count = 3
     big_time_limit: Positive = 120.0
     improved_robots: tuple[Robots, ...] = (8, 24)
@@ -123,6 +125,7 @@ QUICK: Mapping[str, object] = {
     "big_warehouse": (16,),
     "big_drives": (8,),
     "big_boxes": (4,),
+    "big_free_boxes": (8,),
     "big_seeds": 2,
     "big_time_limit": 10.0,
     "improved_robots": (8,),

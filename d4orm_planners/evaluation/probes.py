@@ -32,9 +32,9 @@ from d4orm_env import make_problem
 from d4orm_planners import make_planner
 from d4orm_planners.hybrid.compile_ahead import compile_for_planning
 imported = time.perf_counter()
-problem = make_problem("circle", num_robots=int(sys.argv[1]))
+problem = make_problem(sys.argv[1], num_robots=int(sys.argv[2]))
 planner = make_planner(engine="cpu")
-compile_for_planning(problem.team.models, driver=planner.name)  # as the command line does
+compile_for_planning(planner, problem)  # as the command line does
 plan = planner.solve(problem, seed=0)
 done = time.perf_counter()
 print(json.dumps({"import": imported - begin, "solve": done - imported, "planning": plan.wall_time,
@@ -91,7 +91,7 @@ def _run(code: str, *arguments: object, cache: str | None = None) -> tuple[float
     return seconds, result
 
 
-def measure_startup(num_robots: int, repetitions: int) -> Measurement:
+def measure_startup(scenario: str, num_robots: int, repetitions: int) -> Measurement:
     """First plan of a process: once with an empty kernel cache, then with a full one.
 
     Returns:
@@ -99,10 +99,11 @@ def measure_startup(num_robots: int, repetitions: int) -> Measurement:
         nor planning; ``warm`` the :class:`Spread` of the processes after it, start to exit.
     """
     with tempfile.TemporaryDirectory() as cache:
-        cold, first = _run(_FIRST_PLAN, num_robots, cache=cache)
-        warm = [_run(_FIRST_PLAN, num_robots, cache=cache)[0] for _ in range(repetitions)]
+        cold, first = _run(_FIRST_PLAN, scenario, num_robots, cache=cache)
+        warm = [_run(_FIRST_PLAN, scenario, num_robots, cache=cache)[0] for _ in range(repetitions)]
     compiling = first["solve"] - first["planning"]
-    return {"num_robots": num_robots, "cold": cold, "compiling": compiling, "warm": Spread.of(warm)}
+    seconds = {"cold": cold, "compiling": compiling, "warm": Spread.of(warm)}
+    return {"scenario": scenario, "num_robots": num_robots, **seconds}
 
 
 def measure_memory(num_robots: int, num_samples: int, horizon: int, diameter: float) -> Measurement:

@@ -1,7 +1,6 @@
 """Kernels compiled ahead of planning: each is called once, on the smallest problem, in this process or another.
 
-What samples and rolls out takes as long as what searches for drives. numba compiles one kernel at a time in a process,
-so that two processes do it in half the time.
+numba compiles one kernel at a time in a process, so that two processes do it in half the time.
 """
 
 from __future__ import annotations
@@ -19,51 +18,54 @@ from d4orm_env.engine.caching import has_to_be_compiled
 from d4orm_env.engine.cpu import world_kernels
 from d4orm_env.engine.threads import Threads
 from d4orm_env.scenarios import make_problem
+from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import Sampling
 from d4orm_planners.engine.path_index import PathIndex, check_alone
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
-from d4orm_planners.engine.score import score_kernel
+from d4orm_planners.hybrid.planner import Hybrid
+from d4orm_planners.mapf.planner import compile_path_finding
 from d4orm_planners.sampling.weights import SoftmaxWeights
 from d4orm_planners.tracking.steering import at_rest, prepare_drives
 
 _RULES = SamplingRules(weights=SoftmaxWeights(1.0))
 
 
-def compile_for_planning(
-    models: tuple[str, ...], announce: Callable[[], None] = lambda: None, *, driver: str = "", walls: bool = False
-) -> None:
-    """Compile what planning on the CPU needs, in this process and another, unless it is on disk already.
+def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[[], None] = lambda: None) -> None:
+    """Compile what a first plan on the CPU needs, in this process and another, unless it is on disk already.
 
     Args:
-        models: The team's.
+        planner: Its planner.
+        problem: The problem.
         announce: Called before it begins, if there is anything to do.
-        driver: The planner's name, if it looks for drives before it samples.
-        walls: Whether it then finds paths among obstacles too.
     """
-    if not (has_to_be_compiled(score_kernel(models)) and has_to_be_compiled(world_kernels(models).roll_out)):
+    models = problem.team.models
+    if not has_to_be_compiled(world_kernels(models).roll_out):
         return
     announce()
+    walls = len(problem.arrays.boxes) + len(problem.arrays.triangles) > 0
     # Either takes about half of the time. Should the other fail, its kernels are compiled when they are needed.
-    drive, paths = f"drive_once({models!r}, {driver!r})", "; find_paths()" if walls else ""
-    other = in_another_process(drive + paths if driver else f"average_once({models!r}); roll_out_once({models!r})")
-    if driver:
-        # First what the other process needs too, later.
+    if walls and isinstance(planner, Hybrid):
+        other = in_another_process("find_paths()")
         roll_out_once(models)
-    if driver and walls:
         spread_waves()
-    sample_once((models,))
+        drive_once(models)
+    elif planner.drives_straight:
+        other = in_another_process(f"drive_once({models!r}, {planner.name!r})")
+        index_paths(models)
+        if not isinstance(planner, Hybrid) or planner.straight_start(problem) is None:
+            sample_once((models,))
+    else:
+        other = in_another_process(f"average_once({models!r}); roll_out_once({models!r})")
+        sample_once((models,))
     other.wait()
 
 
 def in_another_process(call: str) -> subprocess.Popen[bytes]:
     """Start a process that calls functions of this module."""
     # What ends it, as Ctrl-C, ends this process too, which says so.
-    names = "average_once, drive_once, find_paths, roll_out_once, sample_once, spread_waves"
-    return subprocess.Popen(
-        [sys.executable, "-c", f"from {__name__} import {names}; {call}"], stderr=subprocess.DEVNULL
-    )
+    return subprocess.Popen([sys.executable, "-c", f"from {__name__} import *; {call}"], stderr=subprocess.DEVNULL)
 
 
 def roll_out_once(models: tuple[str, ...]) -> None:
@@ -81,23 +83,23 @@ def average_once(models: tuple[str, ...]) -> None:
 
 
 def drive_once(models: tuple[str, ...], driver: str = "hybrid") -> None:
-    """Look for drives as a planner begins with, in the smallest problem of a team of these models."""
-    planner, problem = make_planner(driver, engine="cpu"), smallest_problem(models)
+    """Do what a planner begins with, in the smallest problem of a team of these models."""
+    planner = make_planner(driver, engine="cpu")
+    planner.init(SolveRun(planner, smallest_problem(models), seed=0))
+    index_paths(models)
+
+
+def index_paths(models: tuple[str, ...]) -> None:
+    """Drive straight to the goals, and look for meetings and faults of robots that stay where they are."""
+    problem = smallest_problem(models)
     prepare_drives(problem)
-    _index_paths(problem)
-    # Last, because this rolls out, which another process compiles meanwhile.
-    planner.init(SolveRun(planner, problem, seed=0))
-
-
-def _index_paths(problem: Problem) -> None:
-    """Look for meetings and faults of robots that stay where they are."""
     states, robots = at_rest(problem)[0], np.arange(problem.num_robots)
     index = PathIndex(states[..., : problem.dimension], problem.team.radius, problem.margin)
-    index.pairs()
-    index.move(robots, index.positions)
     paths = states.swapaxes(0, 1)[:, None]
-    index.count_meetings(robots, paths)
     check_alone(problem.arrays, robots, paths)
+    index.count_meetings(robots, paths)
+    index.move(robots, index.positions)
+    index.pairs()
 
 
 def sample_once(teams: tuple[tuple[str, ...], ...]) -> None:
@@ -120,6 +122,8 @@ def spread_waves() -> None:
 
 def find_paths() -> None:
     """Find paths for a team among walls, and drive along them."""
+    # First what needs no roll-out, which another process compiles meanwhile.
+    compile_path_finding(_doorway())
     make_planner("mapf", engine="cpu").solve(_doorway(), seed=0)
 
 

@@ -50,8 +50,6 @@ LATER = 30
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
 """Distances beyond radii and margin that a path is planned to keep, where starts and goals allow it, and keeps; and
 what starts and goals themselves must be apart less, for rounding."""
-
-
 Drive: TypeAlias = tuple[FloatArray, Floats, int]
 """Controls ``(T, m)``, positions ``(T + 1, 3)`` and step of arrival of a robot."""
 
@@ -119,9 +117,7 @@ class Replanning:
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
         self.bodies, self.size = TeamOnRoadmap(problem, roadmap).bodies, problem.team.largest_radius
-        speed, acceleration = (
-            np.asarray(problem.team.limits[:, column], np.float64) for column in (SPEED, ACCELERATION)
-        )
+        speed, acceleration = np.asarray(problem.team.limits, np.float64)[:, [SPEED, ACCELERATION]].T
         self.strides = problem.dt * speed
         self.launch = np.round(LAUNCH * speed / acceleration / problem.dt).astype(np.int64)
         positions = [roadmap.nodes[ends] for ends in (roadmap.starts, roadmap.goals)]
@@ -131,9 +127,8 @@ class Replanning:
         self.backing = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
         turns = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
         self.turns_on_the_spot = [(turn * counts_turns, facing) for turn, facing in turns]
-        d = problem.dimension
-        rooms = np.stack([problem.world.clearance(ends[:, :d]) for ends in positions])
-        self.own_room = rooms.min(axis=0) - TOUCH * self.size
+        rooms = [problem.world.clearance(ends[:, : problem.dimension]) for ends in positions]
+        self.own_room = np.minimum(*rooms) - TOUCH * self.size
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
     def replan(

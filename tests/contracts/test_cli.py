@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import BinaryIO
 
 import numpy as np
@@ -77,6 +78,24 @@ def test_run_takes_settings_of_policies(d4orm, tmp_path: Path) -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_what_is_compiled_ahead_fits_robots_of_every_model(model: str) -> None:
     assert compile_ahead.smallest_problem((model,) * 3).num_robots == 3
+
+
+@pytest.mark.parametrize(
+    ("planner", "scenario", "samples"),
+    [
+        ("hybrid", "circle", True), ("hybrid", "random", False), ("hybrid", "warehouse", False),
+        ("d4orm-d", "random", True), ("d4orm", "warehouse", True),
+    ],
+)  # fmt: skip
+def test_what_samples_is_compiled_ahead_where_a_first_plan_samples(
+    monkeypatch: pytest.MonkeyPatch, planner: str, scenario: str, samples: bool
+) -> None:
+    sampled: list[object] = []
+    monkeypatch.setattr(compile_ahead, "has_to_be_compiled", lambda kernel: True)
+    monkeypatch.setattr(compile_ahead, "in_another_process", lambda call: SimpleNamespace(wait=lambda: None))
+    monkeypatch.setattr(compile_ahead, "sample_once", sampled.append)
+    compile_ahead.compile_for_planning(make_planner(planner), make_problem(scenario, 8, seed=0))
+    assert bool(sampled) == samples
 
 
 @pytest.mark.parametrize(

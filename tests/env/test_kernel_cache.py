@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import errno
+import gc
 import hashlib
 import importlib.util
 import os
@@ -17,8 +18,9 @@ from typing import Any
 import pytest
 from numba.core import config
 
-from d4orm_env.engine import kernel_files
+from d4orm_env.engine import caching, file_turns, kernel_files
 from d4orm_env.engine.caching import has_to_be_compiled
+from d4orm_env.engine.file_turns import Turn
 
 KERNEL = """
 from os import environ
@@ -267,6 +269,46 @@ class TestKernelCache:
         monkeypatch.setattr(config, "DISABLE_JIT", 1)
         with pytest.raises(ImportError, match="NUMBA_DISABLE_JIT is set"):
             self.hits(path)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks on files are POSIX's")
+def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNEL)
+    call = "import kernels; kernels.twice(2); print(sum(kernels.twice.stats.cache_hits.values()))"
+    environment = os.environ | {"KERNEL_KEY": "", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    running = [
+        subprocess.Popen([sys.executable, "-c", call], cwd=tmp_path, env=environment, stdout=subprocess.PIPE)
+        for _ in range(3)
+    ]
+    assert sorted(process.communicate()[0].split() for process in running) == [[b"0"], [b"1"], [b"1"]]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks on files are POSIX's")
+def test_nobody_waits_for_ever_nor_where_nothing_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(file_turns, "_PATIENCE", 0.1)
+    first, second = Turn(tmp_path / "a.lock"), Turn(tmp_path / "a.lock")
+    assert not first.wait()
+    assert second.wait()  # given up
+    second.end()
+    first.end()
+    assert not second.wait()
+    second.end()
+    (tmp_path / "file").touch()
+    assert not Turn(tmp_path / "file" / "a.lock").wait()
+
+
+def test_nothing_is_collected_while_a_kernel_is_compiled_and_everything_afterwards() -> None:
+    collecting = []
+
+    def compiled() -> None:
+        collecting.append(gc.isenabled())
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        caching._compile_once(compiled, None)()
+    assert (collecting, gc.isenabled()) == ([False], True)
 
 
 def test_numbas_registries_are_filled_only_to_compile(tmp_path: Path) -> None:

@@ -49,6 +49,7 @@ TINY: dict[str, Any] = {
     "big_warehouse": (2,),
     "big_drives": (),
     "big_boxes": (),
+    "big_free_boxes": (),
     "big_seeds": 1,
     "improved_robots": (3,),
     "loop_robots": (3,),
@@ -236,7 +237,7 @@ def test_bad_input_is_one_line(
 
 
 def test_a_first_plan_is_made_and_told_apart_from_compiling() -> None:
-    _, told = probes._run(probes._FIRST_PLAN, 2)
+    _, told = probes._run(probes._FIRST_PLAN, "circle", 2)
     assert told["solved"]
     assert 0 < told["planning"] <= told["solve"]
 
@@ -261,7 +262,7 @@ def test_startup_is_measured_with_an_empty_cache_and_then_with_a_full_one(monkey
         return seconds, told
 
     monkeypatch.setattr(probes, "_run", noted)
-    startup = measure_startup(num_robots=2, repetitions=2)
+    startup = measure_startup("circle", num_robots=2, repetitions=2)
     assert solves == [3.0, 1.0, 1.0]
     assert startup["compiling"] == 2.0
     assert startup["warm"].count == 2
