@@ -137,8 +137,8 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
         The executed trajectory and its metrics.
 
     Raises:
-        ValueError: If the seed is negative, there is no such policy or physics, or robots have no bodies in it; or if
-            the environment is wrapped, and the physics given.
+        ValueError: If the seed is negative, the environment is none of one team, there is no such policy or physics, or
+            robots have no bodies in it; or if the environment is wrapped, and the physics given.
         ImportError: If the physics needs a library that is not installed.
     """
     whole_number(seed, "seed", 0)
