@@ -327,7 +327,7 @@ def test_a_warning_is_one_line_without_a_line_of_the_program(d4orm, tmp_path: Pa
             ("run", "--scenario", "map", "--scenario-set", "map=map.yaml"),
             "map.yaml: is not a file; give the path of an",
         ),
-        (("leaderboard", "pipe.parquet"), "pipe.parquet is no Parquet file of trials: is not a file; give the path"),
+        (("leaderboard", "pipe.parquet"), "pipe.parquet is no Parquet file of trials (is not a file; give the path"),
         (("leaderboard", "pipe.sqlite"), "there is no store of trials at pipe.sqlite"),
         (("node", "--config", "pipe.yaml"), "pipe.yaml: is not a file"),
     ],
