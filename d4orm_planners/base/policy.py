@@ -95,7 +95,7 @@ class Policy(ABC):
         """Identity by which a store of trials distinguishes this instance from others of its class, as JSON has it.
 
         By default the settings in ``config``, if it has any, else its attributes, which are digests unless they are
-        numbers or text.
+        numbers or text, without what a reset has left.
 
         Raises:
             ValueError: If one of these cannot be told from others of its kind, as an open file.
@@ -103,8 +103,7 @@ class Policy(ABC):
         config = getattr(self, "config", None)
         if isinstance(config, CheckedSettings):
             return self.identity_with(config)
-        episode = (ATTRIBUTE, "problem")  # what a reset has left
-        return {name: value for name, value in attributes(self).items() if name not in episode}
+        return {name: value for name, value in attributes(self).items() if name not in (ATTRIBUTE, "problem")}
 
     @classmethod
     def identity_with(cls, config: CheckedSettings) -> dict[str, object]:
@@ -223,16 +222,14 @@ class OpenLoop(StatePolicy):
 
     def identity(self) -> dict[str, object]:
         if self.planner is not None:
-            config = self.planner.config.keywords()
-            return {"planner": self.planner.name, **config, "time_limit": self.time_limit}
+            return {"planner": self.planner.name, **self.planner.config.keywords(), "time_limit": self.time_limit}
         assert self.plan is not None
         return {"controls": hashlib.sha256(self.plan.controls.tobytes()).hexdigest()}
 
     def _controls(self, joint: JointState) -> FloatArray:
         assert self.plan is not None
-        if joint.steps >= len(self.plan.controls):
-            return np.zeros_like(self.plan.controls[0])
-        return self.plan.controls[joint.steps]
+        controls, step = self.plan.controls, joint.steps
+        return controls[step] if step < len(controls) else np.zeros_like(controls[0])
 
 
 class GoToGoal(StatePolicy):
