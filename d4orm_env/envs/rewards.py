@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, read_only
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, read_only, short_repr
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -207,6 +207,11 @@ def compute_rewards(function: RewardFunction, step: RewardInput) -> tuple[FloatA
     if not names:
         return _checked(function(step), name, shape), {}
     terms = function.terms(step)  # type: ignore[attr-defined] # it has names for them
+    if not (isinstance(terms, Mapping) and terms.keys() == set(names)):
+        raise ValueError(
+            f"terms of reward {name!r} returned {short_repr(terms)}; it must return a dictionary with an array "
+            f"{shape} for each of {', '.join(names)}"
+        )
     parts = {name: sum(terms.values()), **{f"{name}.{term}": terms[term] for term in names}}
     rewards, *paid = _all_checked(parts, shape)
     return rewards, dict(zip(names, paid))

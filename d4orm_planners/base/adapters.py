@@ -150,12 +150,18 @@ def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False)
         egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
 
     Raises:
-        ValueError: If it is no model.
+        ValueError: If it is no model, or one whose environment normalises the observations (``VecNormalize``).
     """
     if not hasattr(model, "policy"):
         raise ValueError(
             f"model is {short_repr(model)}; give a model of Stable-Baselines3, as PPO.load(path), or use "
             "make_policy('ppo', path=...)"
+        )
+    if getattr(getattr(model, "get_vec_normalize_env", lambda: None)(), "norm_obs", False):
+        raise ValueError(
+            "model was trained on observations that VecNormalize had normalised; with "
+            "norm=model.get_vec_normalize_env() and norm.training=False give SharedPolicy(lambda seen: "
+            "model.predict(norm.normalize_obs(seen), deterministic=True)[0], model.policy)"
         )
     ask = partial(_ask_sb3, model, deterministic=deterministic)
     trained = model.observation_space.shape, model.action_space.shape

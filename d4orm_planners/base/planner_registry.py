@@ -123,6 +123,10 @@ def find_policy(policy: object) -> object:
                 f"policy {short_repr(policy)} has {present} and lacks {missing}; define it, or subclass "
                 "d4orm_planners.Policy"
             )
+    if hasattr(policy, "predict"):
+        raise ValueError(
+            f"policy {short_repr(policy)} is a model; give from_sb3(model), from d4orm_planners.base.adapters"
+        )
     raise unknown("policy", policy, list_policies(), "give a Policy, a function, or package.module:Name of one")
 
 

@@ -31,7 +31,9 @@ TIMED = ("big-teams", "coarseness", "ipopt")
 """Figures of the paper that were measured on a machine that did nothing else."""
 FIGURES = ("amswarm", "nodes", "noise-schedule", "robustness", "selections", "team-size", *TIMED)
 
-PRESETS = {"algorithm_4": ("big-teams", "coarseness"), "ipopt_preset": ("ipopt",)}
+PRESETS = {
+    "algorithm_4": ("big-teams", "coarseness"), "algorithm_4_noise": ("robustness",), "ipopt_preset": ("ipopt",),
+}  # fmt: skip
 """Further trials of these, on a machine that did other work: of the paper's presets, few."""
 
 

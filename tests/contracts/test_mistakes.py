@@ -70,6 +70,7 @@ PROBLEM = make_problem("circle", num_robots=2)
             lambda: run_episode(navigation_v0.parallel_env(problem=PROBLEM), SharedPolicy(Module(), None)),
             r"fails on observations of shape \(2, .*cannot be multiplied",
         ),
+        (lambda: make_policy(SimpleNamespace(predict=print)), r"is a model; give from_sb3\(model\), from d4orm_pl"),
         (lambda: from_sb3("joint.zip"), "give a model of Stable-Baselines3, as PPO.load"),
         (lambda: verify(PROBLEM, SimpleNamespace(controls=0)), "not SimpleNamespace; give its controls"),
         (lambda: from_torch("net.pt"), "the model is 'net.pt'; load it first"),

@@ -112,6 +112,23 @@ def test_the_training_reward_in_numbers() -> None:
     assert env.last_step.rewards[0] == 0
 
 
+@pytest.mark.parametrize("terms", [[np.zeros(2)], {"near": np.zeros(2)}, {"fast": np.zeros(2), "more": np.zeros(2)}])
+def test_terms_that_are_not_the_named_ones_are_refused(terms: object) -> None:
+    class Own:
+        term_names = ("fast",)
+
+        def terms(self, step: RewardInput) -> Any:
+            return terms
+
+        def __call__(self, step: RewardInput) -> Any:
+            return step.distances
+
+    env = navigation_v0.parallel_env(problem=line_problem([0.15, 2.0]), reward=Own())
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"it must return a dictionary with an array \(2,\) for each of fast"):
+        env.step(act(env, np.zeros((2, 2), np.float32)))
+
+
 def test_infos_say_what_the_training_reward_is_made_of() -> None:
     problem = line_problem([0.15, 2.0])
     options: dict[str, Any] = {"problem": problem, "reward": "training"}

@@ -369,6 +369,19 @@ def test_a_zip_of_sb3_trained_on_the_joint_environment(tmp_path: Path) -> None:
             policy.reset(other)
 
 
+def test_a_model_that_saw_normalised_observations_is_refused_as_it_is() -> None:
+    import gymnasium
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    worlds = DummyVecEnv([lambda: gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=3)])
+    from_sb3(PPO("MlpPolicy", VecNormalize(worlds, norm_obs=False), device="cpu", n_steps=8, batch_size=8))
+    norm = VecNormalize(worlds)
+    model = PPO("MlpPolicy", norm, device="cpu", n_steps=8, batch_size=8).learn(8)
+    with pytest.raises(ValueError, match=r"VecNormalize had normalised; .* give SharedPolicy"):
+        from_sb3(model)
+
+
 def test_a_zip_trained_in_egocentric_environments(tmp_path: Path) -> None:
     import gymnasium
     import stable_baselines3
