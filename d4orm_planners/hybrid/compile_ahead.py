@@ -24,6 +24,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import Sampling
 from d4orm_planners.engine.path_index import PathIndex, check_alone
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
+from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.hybrid.planner import Hybrid
 from d4orm_planners.mapf.planner import compile_path_finding
 from d4orm_planners.sampling.weights import SoftmaxWeights
@@ -42,11 +43,13 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
     """
     models = problem.team.models
     if not has_to_be_compiled(world_kernels(models).roll_out):
+        if has_to_be_compiled(score_kernel(models)) and _samples_first(planner, problem):
+            announce()
+            sample_once((models,))
         return
     announce()
-    walls = len(problem.arrays.boxes) + len(problem.arrays.triangles) > 0
     # Either takes about half of the time. Should the other fail, its kernels are compiled when they are needed.
-    if walls and isinstance(planner, Hybrid):
+    if isinstance(planner, Hybrid) and _has_walls(problem):
         other = in_another_process("find_paths()")
         roll_out_once(models)
         spread_waves()
@@ -54,12 +57,21 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
     elif planner.drives_straight:
         other = in_another_process(f"drive_once({models!r}, {planner.name!r})")
         index_paths(models)
-        if not isinstance(planner, Hybrid) or planner.straight_start(problem) is None:
+        if _samples_first(planner, problem):
             sample_once((models,))
     else:
         other = in_another_process(f"average_once({models!r}); roll_out_once({models!r})")
         sample_once((models,))
     other.wait()
+
+
+def _samples_first(planner: Planner, problem: Problem) -> bool:
+    """Check whether the first iteration samples, unless it improves a plan."""
+    return not isinstance(planner, Hybrid) or not (_has_walls(problem) or planner.straight_start(problem) is not None)
+
+
+def _has_walls(problem: Problem) -> bool:
+    return len(problem.arrays.boxes) + len(problem.arrays.triangles) > 0
 
 
 def in_another_process(call: str) -> subprocess.Popen[bytes]:

@@ -20,6 +20,7 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.cli import outputs
+from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.hybrid import compile_ahead
 
 QUICK = ("--set", "num_samples=64", "--set", "num_steps=5", "--max-iterations", "1")
@@ -91,11 +92,14 @@ def test_what_samples_is_compiled_ahead_where_a_first_plan_samples(
     monkeypatch: pytest.MonkeyPatch, planner: str, scenario: str, samples: bool
 ) -> None:
     sampled: list[object] = []
-    monkeypatch.setattr(compile_ahead, "has_to_be_compiled", lambda kernel: True)
+    problem, said = make_problem(scenario, 8, seed=0), []
     monkeypatch.setattr(compile_ahead, "in_another_process", lambda call: SimpleNamespace(wait=lambda: None))
     monkeypatch.setattr(compile_ahead, "sample_once", sampled.append)
-    compile_ahead.compile_for_planning(make_planner(planner), make_problem(scenario, 8, seed=0))
-    assert bool(sampled) == samples
+    for missing in ([score_kernel(problem.team.models)], [score_kernel(problem.team.models), None], []):
+        monkeypatch.setattr(compile_ahead, "has_to_be_compiled", lambda kernel, m=missing: kernel in m or None in m)
+        compile_ahead.compile_for_planning(make_planner(planner), problem, lambda: said.append("compiling"))
+    # With all kernels missing something is always compiled, with none nothing.
+    assert (len(sampled), len(said)) == (2 * samples, 1 + samples)
 
 
 @pytest.mark.parametrize(
