@@ -173,7 +173,7 @@ def cached_kernel(variant: str = "", key: str = "", **options: Any) -> Callable[
 
 
 def _compile_once(compile_kernel: Callable[P, R_co], cache: object) -> Callable[P, R_co]:
-    """Compile without garbage collection, which takes a sixth of the time and finds next to nothing.
+    """Compile without garbage collection, which takes a twelfth of the time and finds next to nothing.
 
     Meanwhile other processes that need the kernel wait, as :meth:`_SourceKeyedCache.load_overload` says.
     """

@@ -57,19 +57,30 @@ def assign_goals(
     """Give some robots of a batch of one world, which is changed, goals that ``draw`` says, and distances from there.
 
     Raises:
-        ValueError: If a goal is no position in :func:`goal_region`, or the robot would be in contact with an obstacle.
+        ValueError: See :func:`given_goal`.
     """
     positions, goals = world.state[0, :, : problem.dimension], world.goal[0]
     for robot in robots.tolist():
-        goals[robot] = _checked(problem, robot, draw(problem, robot, positions.copy(), goals.copy(), random))
+        goals[robot] = draw(problem, robot, positions, goals, random)
     world.inverse[0, robots] = inverse_initial_distance(positions[robots], goals[robots], problem.goal_radius)
     offsets = goals[robots] - positions[robots]
     world.distance[0, robots] = np.sqrt(np.add.reduce(offsets * offsets, axis=1))
 
 
-def _checked(problem: Problem, robot: int, given: ArrayLike) -> FloatArray:
-    """A goal where the robot can be."""
-    name = f"the next goal of robot_{robot}"
+def given_goal(
+    function: GoalFunction,
+    problem: Problem,
+    robot: int,
+    positions: FloatArray,
+    goals: FloatArray,
+    random: np.random.Generator,
+) -> FloatArray:
+    """A goal ``(d,)`` that a function of a user's gives.
+
+    Raises:
+        ValueError: If it is no position in :func:`goal_region`, or the robot would be in contact with an obstacle.
+    """
+    name, given = f"the next goal of robot_{robot}", function(problem, robot, positions.copy(), goals.copy(), random)
     goal, (low, high) = frozen_array(given, name, (problem.dimension,)), goal_region(problem)
     if ((goal < low) | (goal > high)).any():
         raise ValueError(

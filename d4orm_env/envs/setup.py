@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +23,7 @@ from d4orm_env.engine.types import OWN_ARRAYS, WorldBatch
 from d4orm_env.envs.features import Features
 from d4orm_env.envs.inputs import checked_cycles
 from d4orm_env.envs.joint_state import state_bounds
-from d4orm_env.envs.lifelong import fresh_goal, goal_region
+from d4orm_env.envs.lifelong import fresh_goal, given_goal, goal_region
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import find_reward, paper_reward
 from d4orm_env.paths.shortest_paths import ahead_in_each
@@ -74,7 +75,7 @@ class EnvSetup:
         self.disturbances = options.disturbances_of(problem)
         self.slack = total_slack(self.disturbances, problem).joined(slack(problem))
         self.lifelong = options.lifelong is not False
-        self.next_goal = options.lifelong if callable(options.lifelong) else fresh_goal
+        self.next_goal = partial(given_goal, options.lifelong) if callable(options.lifelong) else fresh_goal
         if self.lifelong and not np.isnan(problem.goal_heading).all():
             raise ValueError("lifelong mode draws goals without headings; leave goal_heading out")
         # In an open world the two are the same.

@@ -207,15 +207,16 @@ def _state(model: Model, theirs: Floats) -> Floats:
     return np.append(theirs[:3], _wrapped(theirs[2:-1] - theirs[3:])) if model.trailers else theirs
 
 
-def _numbers(given: object, name: str) -> Floats:
-    """A list of numbers in a file, or one."""
+def _numbers(given: object, name: str, count: int | None = None) -> Floats:
+    """A list of numbers in a file, or one number; the first ``count`` of them, where so many are wanted."""
     try:
         numbers = np.atleast_1d(np.array(given, np.float64))
     except (TypeError, ValueError):
         numbers = np.zeros((0, 0))
-    if numbers.ndim != 1:
-        raise ValueError(f"{name} is {short_repr(given)}; it must be a list of numbers, as [1.0, 2.5]")
-    return numbers
+    if numbers.ndim != 1 or len(numbers) < (count or 0):
+        wanted = "be a list of numbers, as [1.0, 2.5]" if count is None else f"have numbers, {count} of them"
+        raise ValueError(f"{name} is {short_repr(given)}; it must {wanted}")
+    return numbers[:count]
 
 
 def _wrapped(angle: Floats) -> Floats:
@@ -231,12 +232,13 @@ def _footprint(own: Mapping[str, Any]) -> Footprint:
 
 def _world(environment: Mapping[str, Any], team: Team) -> World:
     d, covered = team.dimension, min(footprint.inner_radius for footprint in team.footprint)
-    lower, upper = (_numbers(environment[name], f"environment's {name}")[:d] for name in ("min", "max"))
+    lower, upper = (_numbers(environment[name], f"environment's {name}", d) for name in ("min", "max"))
     boxes, balls = [], []
     for number, obstacle in enumerate(environment.get("obstacles") or ()):
-        centre, size = (_numbers(obstacle[name], f"{name} of obstacle {number}")[:d] for name in ("center", "size"))
+        centre = _numbers(obstacle["center"], f"center of obstacle {number}", d)
+        size = _numbers(obstacle["size"], f"size of obstacle {number}", 1 if obstacle["type"] == "sphere" else d)
         if obstacle["type"] == "sphere":
-            balls.append([*centre, size[0]])
+            balls.append([*centre, *size])
             continue
         if obstacle["type"] != "box":
             raise ValueError(f"obstacle type {short_repr(obstacle['type'])} is unknown; known are box, sphere")

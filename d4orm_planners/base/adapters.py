@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -140,32 +141,41 @@ class SharedPolicy(Policy):
         return {**settings, **own, "normalized": self._normalized, "weights": digest.hexdigest()}
 
 
+@dataclass(frozen=True)
+class _Normalised:
+    """The weights of a network, and the running statistics by which what it observes is normalised."""
+
+    network: Model
+    statistics: Model
+
+    def state_dict(self) -> dict[str, Any]:
+        statistics = {name: torch.as_tensor(getattr(self.statistics, name)) for name in ("mean", "var")}
+        return {**self.network.state_dict(), **statistics}
+
+
 def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False) -> SharedPolicy:
     """A model of Stable-Baselines3, trained on the environment's own observations and actions: each robot's, as
     through SuperSuit, or the team's, in the joint Gymnasium environment.
 
     Args:
-        model: Result of ``PPO.load(path)`` or of the training.
+        model: Result of ``PPO.load(path)`` or of the training. If its environment is a ``VecNormalize``, it is asked
+            for what that makes of the observations.
         deterministic: Take the most likely action rather than draw one.
         egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
 
     Raises:
-        ValueError: If it is no model, or one whose environment normalises the observations (``VecNormalize``).
+        ValueError: If it is no model.
     """
     if not hasattr(model, "policy"):
         raise ValueError(
             f"model is {short_repr(model)}; give a model of Stable-Baselines3, as PPO.load(path), or use "
             "make_policy('ppo', path=...)"
         )
-    if getattr(getattr(model, "get_vec_normalize_env", lambda: None)(), "norm_obs", False):
-        raise ValueError(
-            "model was trained on observations that VecNormalize had normalised; with "
-            "norm=model.get_vec_normalize_env() and norm.training=False give SharedPolicy(lambda seen: "
-            "model.predict(norm.normalize_obs(seen), deterministic=True)[0], model.policy)"
-        )
+    normalising = model.get_vec_normalize_env()
+    weights = model.policy if normalising is None else _Normalised(model.policy, normalising.obs_rms)
     ask = partial(_ask_sb3, model, deterministic=deterministic)
     trained = model.observation_space.shape, model.action_space.shape
-    return SharedPolicy(ask, model.policy, egocentric=egocentric, trained=trained)
+    return SharedPolicy(ask, weights, egocentric=egocentric, trained=trained)
 
 
 def from_torch(module: Model, normalized: bool = False, egocentric: bool = False) -> SharedPolicy:
@@ -206,7 +216,7 @@ def from_rllib(module: Model, normalized: bool = True, egocentric: bool = False)
 
 
 def _checked_actions(answer: Any, count: int) -> FloatArray:
-    """What a model answers, ``(count, ...)`` actions.
+    """Actions ``(count, m)`` that a model answers with.
 
     Raises:
         ValueError: If it is anything else, as actions with the state of a recurrent network.
@@ -222,6 +232,8 @@ def _checked_actions(answer: Any, count: int) -> FloatArray:
 
 
 def _ask_sb3(model: Model, observations: FloatArray, *, deterministic: bool) -> ArrayLike:
+    if (normalising := model.get_vec_normalize_env()) is not None:
+        observations = normalising.normalize_obs(observations)
     return model.predict(observations, deterministic=deterministic)[0]
 
 

@@ -45,7 +45,7 @@ class MixedPolicy(Policy):
         return {**super().__getstate__(), "_members": [*map(copy.copy, self._members)]}
 
     def observation_options(self, problem: Problem) -> Mapping[str, object]:
-        """What any of them wants to observe; where they differ, the most."""
+        """The most that any of them wants to observe."""
         options: dict[str, Any] = {}
         for member in self._members:
             wanted: Mapping[str, Any] = member.observation_options(problem) if isinstance(member, Policy) else {}

@@ -67,7 +67,9 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
 
 def _samples_first(planner: Planner, problem: Problem) -> bool:
     """Check whether the first iteration samples, unless it improves a plan."""
-    return not isinstance(planner, Hybrid) or not (_has_walls(problem) or planner.straight_start(problem) is not None)
+    if not isinstance(planner, Hybrid):
+        return True
+    return not _has_walls(problem) and planner.straight_start(problem) is None
 
 
 def _has_walls(problem: Problem) -> bool:

@@ -1,7 +1,7 @@
 """Kinds of solution that a planner finds: two robots swap positions around an obstacle (the paper's appendix A).
 
     python -m examples.studies multimodality --seeds 500
-    python -m examples.studies multimodality --team 8 --seeds 500
+    python -m examples.studies multimodality --team 8 --seeds 50
 
 One solve per planner and seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of
 robot 1 about the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in

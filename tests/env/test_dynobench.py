@@ -96,8 +96,12 @@ def test_own_parameters_are_taken(instance: Path) -> None:
         ("robots:", "agents:", "is no multi-robot problem of dynobench (it lacks 'robots'); it has environment: min"),
         ("goal: [4, 1.5, 0]", "goal: [4, left, 0]", "goal of robot_0 is [4, 'left', 0]; it must be a list of numbers"),
         ("goal: [4, 1.5, 0]", "goal: there", "goal of robot_0 is 'there'; it must be a list of numbers, as"),
-        ("min: [0, 0]", "min: [0, low]", "environment's min is [0, 'low']; it must be a list of numbers, as"),
+        ("min: [0, 0]", "min: [0, low]", "environment's min is [0, 'low']; it must have numbers, 2 of them"),
         ("size: [", "size: [big, ", "size of obstacle 0 is ['big', "),
+        ("min: [0, 0]", "min: [0]", "environment's min is [0]; it must have numbers, 2 of them"),
+        ("center: [2.5, 3.2]", "center: [2.5]", "center of obstacle 0 is [2.5]; it must have numbers, 2 of them"),
+        ("size: [0.4, 0.6]", "size: 0.4", "size of obstacle 0 is 0.4; it must have numbers, 2 of them"),
+        ("min: [0, 0]", "min: 0", "environment's min is 0; it must have numbers, 2 of them"),
         (
             "goal: [4, 1.5, 0]",
             "goal: [4, 1.5]",

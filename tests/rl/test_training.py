@@ -369,17 +369,25 @@ def test_a_zip_of_sb3_trained_on_the_joint_environment(tmp_path: Path) -> None:
             policy.reset(other)
 
 
-def test_a_model_that_saw_normalised_observations_is_refused_as_it_is() -> None:
+def test_a_model_that_saw_normalised_observations_is_asked_for_such(tmp_path: Path) -> None:
     import gymnasium
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    worlds = DummyVecEnv([lambda: gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=3)])
-    from_sb3(PPO("MlpPolicy", VecNormalize(worlds, norm_obs=False), device="cpu", n_steps=8, batch_size=8))
-    norm = VecNormalize(worlds)
+    joint = gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=3)
+    norm = VecNormalize(DummyVecEnv([lambda: joint]))
     model = PPO("MlpPolicy", norm, device="cpu", n_steps=8, batch_size=8).learn(8)
-    with pytest.raises(ValueError, match=r"VecNormalize had normalised; .* give SharedPolicy"):
-        from_sb3(model)
+    model.save(tmp_path / "joint.zip")
+    norm.save(tmp_path / "norm.pkl")
+    loaded = VecNormalize.load(tmp_path / "norm.pkl", DummyVecEnv([lambda: joint]))
+    again, bare = (PPO.load(tmp_path / "joint.zip", env=env, device="cpu") for env in (loaded, None))
+    observation, _ = joint.reset(seed=0)
+    wanted = model.predict(norm.normalize_obs(observation), deterministic=True)[0].reshape(3, 2)
+    wanted /= np.maximum(np.linalg.norm(wanted, axis=1, keepdims=True), 1)
+    for one in (model, again):
+        np.testing.assert_allclose(run_episode(joint, from_sb3(one), 0).trajectory.controls[0], wanted, atol=1e-5)
+    assert np.abs(run_episode(joint, from_sb3(bare), 0).trajectory.controls[0] - wanted).max() > 1e-3
+    assert from_sb3(model).identity() == from_sb3(again).identity() != from_sb3(bare).identity()
 
 
 def test_a_zip_trained_in_egocentric_environments(tmp_path: Path) -> None:
