@@ -172,7 +172,8 @@ def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False)
             "make_policy('ppo', path=...)"
         )
     normalising = model.get_vec_normalize_env()
-    weights = model.policy if normalising is None else _Normalised(model.policy, normalising.obs_rms)
+    changed = normalising is not None and normalising.norm_obs
+    weights = _Normalised(model.policy, normalising.obs_rms) if changed else model.policy
     ask = partial(_ask_sb3, model, deterministic=deterministic)
     trained = model.observation_space.shape, model.action_space.shape
     return SharedPolicy(ask, weights, egocentric=egocentric, trained=trained)

@@ -375,6 +375,8 @@ def test_a_model_that_saw_normalised_observations_is_asked_for_such(tmp_path: Pa
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     joint = gymnasium.make("d4orm/Navigation-v0", scenario="circle", num_robots=3)
+    rewards_only = VecNormalize(DummyVecEnv([lambda: joint]), norm_obs=False)
+    run_episode(joint, from_sb3(PPO("MlpPolicy", rewards_only, device="cpu", n_steps=8, batch_size=8)), 0)
     norm = VecNormalize(DummyVecEnv([lambda: joint]))
     model = PPO("MlpPolicy", norm, device="cpu", n_steps=8, batch_size=8).learn(8)
     model.save(tmp_path / "joint.zip")
