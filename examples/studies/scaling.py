@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 from examples.common import COLOURS, count, grouped, plt, save_figure, save_table, study_parser, study_rows
-from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
 
-ROBOTS = (8, 16, 32, 64, 100, 200, 500, 1000)
+ROBOTS = (8, 16, 32, 64, 100, 200, 500, 1000, 2000)
 AREA = 10.0**2 / 64
 """Square metres per robot."""
 
@@ -47,7 +46,7 @@ def measure(sizes: Sequence[int], seeds: int, time_limit: float) -> list[dict[st
     for robots in sizes:
         for seed in range(seeds):
             size = (robots * AREA) ** 0.5
-            problem = make_problem("random", num_robots=robots, seed=seed, size=size, **AS_IN_THE_PAPER)
+            problem = make_problem("random", num_robots=robots, seed=seed, size=size)
             plan = planner.solve(problem, seed=seed, time_limit=time_limit)
             rows.append(
                 {"robots": robots, "seed": seed, "solved": plan.solved, "iterations": plan.iterations,

@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from examples.common import grouped, save_table, study_parser, study_rows
-from examples.studies import AS_IN_THE_PAPER
+from examples.studies.least_times import least_times
 
 from d4orm_env import Problem, make_problem, verify
-from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 from d4orm_planners import make_planner
 
 
@@ -112,8 +111,8 @@ def instance(scenario: str, settings: Mapping[str, Any], seed: int) -> Problem:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "cells.map"
             path.write_text("\n".join(["type octile", "height 32", "width 32", "map", *rows, ""]))
-            return make_problem(scenario, **settings, map=path, seed=seed, **AS_IN_THE_PAPER)
-    problem = make_problem(scenario, **settings, seed=seed, **AS_IN_THE_PAPER)
+            return make_problem(scenario, **settings, map=path, seed=seed)
+    problem = make_problem(scenario, **settings, seed=seed)
     if not scenario.startswith("amswarm"):
         return problem
     start = problem.start.copy()
@@ -123,15 +122,8 @@ def instance(scenario: str, settings: Mapping[str, Any], seed: int) -> Problem:
 
 def least_travel_time(problem: Problem) -> float:
     """A bound on the mean travel time of any plan [s]: straight to the edge of the goal, as fast as limits allow."""
-    limits, dt = problem.team.limits.astype(float), problem.dt
-    left = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1) - problem.goal_radius
-    speed, times = np.zeros(problem.num_robots), np.zeros(problem.num_robots)
-    while (going := left > 1e-4).any():
-        after = np.minimum(speed + limits[:, ACCELERATION] * dt, limits[:, SPEED])
-        left[going] -= (speed + after)[going] * dt / 2
-        times[going] += dt
-        speed = after
-    return float(times.mean())
+    distance = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1) - problem.goal_radius
+    return float(least_times(problem, distance, np.zeros(problem.num_robots), problem.goal_speed).mean())
 
 
 def measure(chosen: Mapping[str, Cases], seeds: int, preset: str | None, improve: float | None) -> list[dict[str, Any]]:

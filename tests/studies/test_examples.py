@@ -24,7 +24,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from d4orm_env import make_problem
+from d4orm_env import make_problem, rollout
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners import Plan
 from d4orm_planners.evaluation.tables import read_parquet
@@ -678,10 +678,10 @@ def test_scaling_example_solves_every_team(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("position", "velocity", "seconds"),
     [
-        (0.0, 0.0, 1 + (4 - 0.5)),  # half a metre to reach 1 m/s
-        (0.0, 1.0, 4.0),
-        (0.0, -1.0, 2 + 4.0),  # two seconds to stop and come back at top speed
-        (3.92, 0.0, np.sqrt(2 * 0.08)),
+        (0.0, 0.0, 1 + 3.4),  # half a metre to reach 1 m/s, then 34 steps of 0.105 m
+        (0.0, 1.0, 3.9),
+        (0.0, -1.0, 2 + 3.9),  # two seconds to stop and come back at top speed
+        (3.92, 0.0, 0.4),  # 0.005 m, 0.015 m, ... add up to 0.08 m
         (4.05, 0.0, 0.0),
     ],
     ids=["from rest", "at top speed", "backwards", "near", "there already"],
@@ -696,7 +696,24 @@ def test_lifelong_bound_is_the_time_of_a_straight_drive(
     goal = np.array([[4 + problem.goal_radius, 0]], np.float32)
     states = np.array([[position, 0, velocity, 0]], np.float32)
     joint = JointState(states, goal, np.zeros((1, 2), np.float32), np.zeros(1, bool), 0)
-    assert lifelong.least_times(problem, joint) == pytest.approx([seconds], abs=1e-5)
+    assert lifelong.bounds_of(problem, joint) == pytest.approx([seconds], abs=1e-5)
+
+
+@pytest.mark.parametrize("last_speed", [np.inf, 0.1])
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
+def test_no_drive_is_sooner_than_the_least_and_a_straight_one_is_as_soon(
+    monkeypatch: pytest.MonkeyPatch, model: str, last_speed: float
+) -> None:
+    monkeypatch.syspath_prepend(ROOT)
+    solve_rates = importlib.import_module("examples.studies.solve_rates")
+    problem = make_problem("circle", num_robots=1, model=model, goal_speed=last_speed)
+    braking = range(48, 57) if last_speed < 1 else ()  # from 1 m/s to 0.1 m/s
+    controls = np.zeros((problem.horizon, 1, 2), np.float32)
+    ahead = (problem.goal[0] - problem.start[0, :2]) / 5 if model == "holonomic2d" else np.array([0, 1])
+    for step in range(problem.horizon):
+        controls[step, 0] = -ahead if step in braking else ahead
+    arrived = rollout(problem, controls).arrived[:, 0]
+    assert arrived.argmax() * problem.dt == pytest.approx(solve_rates.least_travel_time(problem))
 
 
 def test_lifelong_drives_are_summed_up_over_their_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
