@@ -13,11 +13,9 @@ import numpy as np
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.lazy import LazyModule
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import TrialGroup, wilson_interval
+from d4orm_planners.evaluation.summary import TrialGroup, mean_interval, wilson_interval
 
 stats: Any = LazyModule("scipy.stats")
-
-_RESAMPLES = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,10 +110,10 @@ class PairedPolicies:
         only_second: Those in which only the second did.
         p_value: That rates of success are equal, two-sided: :func:`mcnemar`.
         difference: Success rate of the first less that of the second.
-        lower: Lower end of its 95% confidence interval, by a paired bootstrap (percentiles).
+        lower: Lower end of its 95% confidence interval: :func:`newcombe_interval`.
         upper: Upper end.
         slower: Mean of how much longer the first travelled where both succeeded [s]; ``None`` without any.
-        slower_lower: Lower end of its interval, likewise; ``None`` with fewer than two.
+        slower_lower: Lower end of its 95% confidence interval (Student's t); ``None`` with fewer than two.
         slower_upper: Upper end.
     """
 
@@ -157,8 +155,10 @@ def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
     only_first, only_second = int((won[:, 0] > won[:, 1]).sum()), int((won[:, 0] < won[:, 1]).sum())
     both = [pair for pair in common if all(trial.success for trial in pair)]
     slower = [(one.travel_time or 0.0) - (other.travel_time or 0.0) for one, other in both]
-    trial, lower, upper = first.trials[0], *_bootstrap(won[:, 0] - won[:, 1])
-    slower_lower, slower_upper = _bootstrap(slower) if len(slower) > 1 else (None, None)
+    neither = len(common) - only_first - only_second - len(both)
+    lower, upper = newcombe_interval(len(both), only_first, only_second, neither)
+    mean_slower, slower_lower, slower_upper = mean_interval(slower)
+    trial = first.trials[0]
     return PairedPolicies(
         scenario=trial.scenario,
         num_robots=trial.num_robots,
@@ -175,21 +175,29 @@ def _compared(first: TrialGroup, second: TrialGroup) -> PairedPolicies | None:
         difference=float((won[:, 0] - won[:, 1]).mean()),
         lower=lower,
         upper=upper,
-        slower=float(np.mean(slower)) if slower else None,
+        slower=mean_slower,
         slower_lower=slower_lower,
         slower_upper=slower_upper,
     )
 
 
-def _bootstrap(differences: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """95% confidence interval of the mean of paired differences."""
-    values = np.asarray(differences, float)
-    if len(values) < 2 or not np.ptp(values):
-        return float(values[0]), float(values[0])
-    found = stats.bootstrap(
-        (values,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=np.random.default_rng(0)
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+def newcombe_interval(both: int, only_first: int, only_second: int, neither: int) -> tuple[float, float]:
+    """95% confidence interval of the difference of two policies' success rates on the same trials.
+
+    Method 10 of R. G. Newcombe, "Improved confidence intervals for the difference between binomial proportions based
+    on paired data", Statistics in Medicine 17, 1998. It has a width too where all trials agree.
+    """
+    n = both + only_first + only_second + neither
+    rates, lows, highs = zip(*((k / n, *wilson_interval(k, n)) for k in (both + only_first, both + only_second)))
+    cross = both * neither - only_first * only_second
+    spread = np.prod([rate * (1 - rate) for rate in rates]) ** 0.5 * n**2
+    phi = (max(cross - n / 2, 0) if cross > 0 else cross) / spread if spread else 0.0
+    difference, below, above = rates[0] - rates[1], np.subtract(rates, lows), np.subtract(highs, rates)
+
+    def half_width(one: float, other: float) -> float:
+        return max(one**2 - 2 * phi * one * other + other**2, 0) ** 0.5
+
+    return float(difference - half_width(below[0], above[1])), float(difference + half_width(above[0], below[1]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ THRESHOLD = 0.9
 
 _PAIRS = """\
 Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
-succeeded; p is that of McNemar's exact test. Differences have 95% intervals by a paired bootstrap."""
+succeeded; p is that of McNemar's exact test. Differences have 95% intervals: Newcombe's, of times Student's."""
 _NOT_RUN = "Success without a disturbance was *not run*: give one a level without effect, as in `push.speed=0,0.5`."
 _FIGURES = "Success against level with 95% intervals, and success in percent."
 

@@ -10,7 +10,7 @@ from examples.common import holm, penalised_steps, steps_to_solution
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d4orm_planners.evaluation.comparison import paired, survival
+from d4orm_planners.evaluation.comparison import newcombe_interval, paired, survival
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.summary import wilson_interval
 
@@ -43,6 +43,25 @@ def test_the_tests_are_mcnemars_and_wilcoxons() -> None:
     turned = paired(second, first, spent)
     assert (turned.only_first, turned.only_second, turned.difference) == (0, 2, 3)
     assert (turned.success_p, turned.cost_p) == (found.success_p, found.cost_p)
+
+
+def test_the_interval_of_a_difference_is_newcombes() -> None:
+    # Worked out by hand: Wilson's 0.8654 to 0.9890 round 0.96 and 0.6259 to 0.8570 round 0.76; phi = -24 / 209.2
+    assert newcombe_interval(36, 12, 2, 0) == pytest.approx((0.05690, 0.34040), abs=1e-4)
+    # Without a pair that differs both rates are the same: as wide as Wilson's two, added as squares.
+    low, high = newcombe_interval(4, 0, 0, 0)
+    assert (low, high) == pytest.approx((wilson_interval(4, 4)[0] - 1, 1 - wilson_interval(4, 4)[0]))
+    low, high = newcombe_interval(0, 4, 0, 0)
+    assert 0 < low < 1
+    assert high == 1
+
+
+@given(st.lists(st.integers(0, 30), min_size=4, max_size=4).filter(any))
+def test_the_interval_of_a_difference_holds_it_and_turns_with_it(counts: list[int]) -> None:
+    both, first, second, neither = counts
+    low, high = newcombe_interval(*counts)
+    assert -1 - 1e-9 <= low <= (first - second) / sum(counts) + 1e-12
+    assert newcombe_interval(both, second, first, neither) == pytest.approx((-high, -low))
 
 
 def test_what_success_is_may_be_said() -> None:

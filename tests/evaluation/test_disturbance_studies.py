@@ -21,7 +21,7 @@ from test_robustness import trial
 from d4orm_env import mujoco, navigation_v0
 from d4orm_env.disturbances import Delay, Intruder, LimitMismatch, Push, Stall
 from d4orm_planners import evaluate, run_episode
-from d4orm_planners.evaluation.comparison import compare_pairs
+from d4orm_planners.evaluation.comparison import compare_pairs, newcombe_interval
 from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map
 from d4orm_planners.evaluation.evaluate import run_shard, run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
@@ -216,7 +216,7 @@ def test_pairs_are_compared_by_seed() -> None:
     assert (pair.only_first, pair.only_second) == (7, 0)
     assert pair.p_value == pytest.approx(2 * 0.5**7)  # the exact binomial test of 7 out of 7
     assert pair.difference == pytest.approx(7 / 12)
-    assert 0.2 < pair.lower < pair.difference < pair.upper < 0.95
+    assert (pair.lower, pair.upper) == newcombe_interval(2, 7, 0, 3)
     assert (pair.slower, pair.slower_lower, pair.slower_upper) == (-1, -1, -1)
     # Other problems, conditions and single policies have no pairs.
     assert compare_pairs([group("a", 1, "+"), group("b", 2, "+"), group("c", 1, "+", problem="other")]) == []
