@@ -21,6 +21,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 
 ROBOTS = (
     "#0072B2", "#D98E00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#000000", "#8F8A00",
@@ -207,6 +208,14 @@ def _draw_solids(panel: Axes2D, problem: Problem) -> None:
     panel.polygons(rings, **(style | {"facecolors": "none", "linewidths": 0.4}))
 
 
+def _front_radius(team: Team) -> Array:
+    """``(K,)`` radii of the discs round the robots, without trailers [m]."""
+    if not team.shapes or team.dimension == 3:
+        return np.asarray(team.radius, np.float64)
+    fronts = team.bodies[: team.num_robots]
+    return np.array([np.linalg.norm(body.footprint.outline(), axis=1).max() for body in fronts])
+
+
 class TeamLayer:
     """The robots of one panel: goals, trails, bodies, headings and contacts, drawn once and then moved.
 
@@ -217,7 +226,7 @@ class TeamLayer:
     def __init__(self, panel: Axes2D, problem: Problem) -> None:
         self.panel, self.problem = panel, problem
         self.colors = robot_colors(problem.num_robots)
-        self.radius = np.asarray(problem.team.radius, np.float64)
+        self.radius = _front_radius(problem.team)
         self.drives = [k for k, model in enumerate(problem.team.robot_models) if model.heading_index is not None]
         span = float(np.max(panel.limits[1] - panel.limits[0]))
         self.mark_size = float(np.clip(self.radius.mean(), 0.015 * span, 0.03 * span))
@@ -226,6 +235,7 @@ class TeamLayer:
         self.dark = self.colors[self.drives] @ [0.299, 0.587, 0.114] < 0.6
         # One transparent face each: mplot3d sorts edge colours by depth together with the faces, or not at all.
         self.hollow = {"facecolors": [CLEAR] * problem.num_robots, "edgecolors": self.colors}
+        self.robots = [body.robot for body in problem.team.bodies]
         empty = np.empty((0, 4, len(panel.right)))
         self.shadows = panel.segments(empty, colors=SHADOW, linewidths=trail, zorder=1.5)
         self.goals = panel.polygons(empty, **self.hollow, linewidths=lines, zorder=3)
@@ -246,8 +256,7 @@ class TeamLayer:
         self.goals.set_verts(panel.outlines(goals, 1.5 * self.radius, _DIAMOND))
         self.bodies.set_verts(self.body_outlines(states))
         shade = np.where(arrived[:, None], ARRIVED_SHADE, 1.0)
-        robots = [body.robot for body in self.problem.team.bodies]
-        self.bodies.set_facecolor((shade * self.colors + 1 - shade)[robots])
+        self.bodies.set_facecolor((shade * self.colors + 1 - shade)[self.robots])
         self.headings.set_segments(self.heading_lines(states))
         white = self.dark & ~arrived[self.drives]
         self.headings.set_color(["white" if on_dark else INK for on_dark in white])

@@ -133,8 +133,8 @@ def _draw_history(layer: TeamLayer, trajectory: Trajectory) -> None:
 
 def _draw_starts(layer: TeamLayer) -> None:
     panel, start = layer.panel, layer.problem.start
-    outlines, width = layer.body_outlines(start), layer.goals.get_linewidth()
-    panel.polygons(outlines, **layer.hollow, linewidths=width, zorder=2.5)
+    style = {name: np.asarray(value)[layer.robots] for name, value in layer.hollow.items()}
+    panel.polygons(layer.body_outlines(start), **style, linewidths=layer.goals.get_linewidth(), zorder=2.5)
     panel.segments(layer.heading_lines(start), colors=layer.colors[layer.drives], linewidths=1.2, zorder=2.5)
 
 

@@ -41,6 +41,7 @@ def build(settings: Settings, layout: Layout) -> Problem:
     team, horizon = settings.team, settings.horizon
     if settings.height is not None:
         layout = _lifted(layout, settings.height)
+    require_scale(settings, layout.travel)
     positions = np.vstack([layout.starts, layout.goals])
     world = with_bounds(settings, layout.world, layout.area)
     require_inside(settings, world, layout.starts, layout.goals)
@@ -116,6 +117,20 @@ def in_space(points: ArrayLike, dimension: int) -> Points:
     """``(., 2)`` points of the plane as ``(., dimension)``: in space, at z = 0."""
     planar: Points = np.asarray(points, np.float64).reshape(-1, 2)
     return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])
+
+
+def require_scale(settings: Settings, travel: float) -> None:
+    """Refuse a step in which all robots pass the whole scenario, or a goal radius as large: numbers in other units."""
+    stride = float(settings.team.max_speed.min()) * settings.dt
+    for what, length in (
+        (f"dt is {settings.dt:g} s, in which the slowest robot may move by {stride:g} m", stride),
+        (f"goal_radius is {settings.goal_radius:g} m", settings.goal_radius),
+    ):
+        if length > travel:
+            raise ValueError(
+                f"{what}, farther than the {travel:.3g} m that scenario {settings.scenario!r} is made for; give metres "
+                "and seconds"
+            )
 
 
 def require_margin(settings: Settings, world: World, starts: Points, goals: Points) -> None:

@@ -18,7 +18,7 @@ from d4orm_planners.d4orm_c2f.estimators import (
     StallEstimator,
 )
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round
+from d4orm_planners.tracking.steering import by_model, limit_controls, present_velocities, short_way_round
 
 MIN_DIFFERENCES = 40
 """Number of differences needed to estimate how noisy a component is."""
@@ -120,7 +120,8 @@ class Deviation:
     """
 
     def __init__(self, problem: Problem, engine: Engine, config: D4ormC2FConfig, docks: bool) -> None:
-        self.problem, self._engine, self._docks = problem, engine, docks
+        self.problem = self._first = problem
+        self._engine, self._docks = engine, docks
         self.latency = LatencyEstimator(problem.team, config.delay)
         self.packet_loss = PacketLossEstimator(problem) if config.expect_losses else None
         self._gain = ActuatorGainEstimator(problem) if config.learn_limits else None
@@ -150,8 +151,12 @@ class Deviation:
             self._compare(joint, *self._expected)
         self._seen = joint
         for controls in self.latency.under_way:
-            joint = self._moved(joint, controls)
+            joint = self._moved(joint, controls + self._added)
         return joint
+
+    @property
+    def _added(self) -> FloatArray:
+        return np.zeros_like(self._seen.controls) if self._gain is None else self._gain.added
 
     def _compare(self, joint: JointState, positions: FloatArray, velocities: FloatArray) -> None:
         """Note how far robots are from the ``positions`` and the ``velocities`` ``(K, d)`` that were expected."""
@@ -179,12 +184,22 @@ class Deviation:
         self._measured, self._estimated = joint, estimated
         return estimated
 
-    def expect(self, controls: FloatArray) -> None:
-        """Remember where the robots should be in a time step, now that these controls ``(K, m)`` are sent."""
+    def send(self, controls: FloatArray) -> FloatArray:
+        """The commands ``(K, m)`` by which robots do these controls ``(K, m)``, against what is added to commands.
+
+        Remembered is where that should lead in a time step.
+        """
         step = self._engine.step(self.arrays(self._seen), self._seen.states, self._seen.arrived, controls)
-        now = self.latency.send(step.controls)
-        states = step.states if now is step.controls else self._moved(self._seen, now).states
-        self._expected = states[:, : self.problem.dimension], present_velocities(self.problem, states, now)
+        commands, added = step.controls, self._added
+        if added.any():
+            controls = commands = limit_controls(self._first, step.controls - added)
+        now = self.latency.send(commands)
+        states, done = step.states, step.controls
+        if now is not commands:
+            done = now + added
+            states = self._moved(self._seen, done).states
+        self._expected = states[:, : self.problem.dimension], present_velocities(self.problem, states, done)
+        return controls
 
     def arrays(self, joint: JointState) -> ProblemArrays:
         """The problem from this state on, with the limits that robots are believed to have now, as arrays."""

@@ -42,16 +42,17 @@ class ActuatorGainEstimator:
     """Estimates the limits of robots that never do as much as they are asked to, or are held back.
 
     What they do at most of what they are asked to is what they are able to. Something that is added to commands for
-    some time, such as a bias, takes away from that against its direction; so much is kept back, as tightened limits of
-    control do in robust predictive control (Chisci, Rossiter, Zappa, Systems with persistent disturbances: predictive
-    control with restricted constraints, Automatica 37, 2001). Noise comes to nothing on average: a mean that may be
-    chance is not kept back.
+    some time, such as a bias, takes away from that against its direction; so much is kept back to make up for it, as
+    tightened limits of control do in robust predictive control (Chisci, Rossiter, Zappa, Systems with persistent
+    disturbances: predictive control with restricted constraints, Automatica 37, 2001). Noise comes to nothing on
+    average: a mean that may be chance is not kept back.
 
     Args:
         problem: The robots, with the limits that are believed at first.
 
     Attributes:
         problem: The same with the limits of speed, acceleration and turn rate that are believed now.
+        added: ``(K, m)`` what is added to commands for some time; zero where it may be chance.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -60,6 +61,7 @@ class ActuatorGainEstimator:
         self._asked = np.zeros(problem.num_robots, int)
         self._seen, self._added = 0, np.zeros((problem.num_robots, problem.control_size))
         self._variance = np.zeros_like(self._added)
+        self.added = np.zeros((problem.num_robots, problem.control_size), np.float32)
 
     def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> None:
         """Compare commands ``(K, m)`` with what those ``going`` ``(K,)`` executed of them."""
@@ -76,21 +78,22 @@ class ActuatorGainEstimator:
         nearer = effort(self._first, cut) < effort(self._first, scaled)
         added = np.where(nearer[:, None], cut, scaled) * going[:, None]
         self._seen += 1
-        held_back = GAIN_STEP * np.floor(self._persistent(added) / GAIN_STEP)
+        self.added = self._persistent(added)
+        held_back = GAIN_STEP * np.floor(effort(self._first, self.added) / GAIN_STEP)
         share = np.maximum(share - held_back, MIN_GAIN)
         if (share != self._share).any():
             self._share = share
             self.problem = self._first.with_state(self._first.start, self._first.goal, team=self._team(share))
 
-    def _persistent(self, added: Floats) -> Floats:
-        """``(K,)`` effort that is added for some time, now that ``added`` ``(K, m)`` is."""
+    def _persistent(self, added: Floats) -> FloatArray:
+        """``(K, m)`` what is added for some time, now that ``added`` ``(K, m)`` is."""
         rate = max(FORGETTING_RATE, 1 / (PRIOR_STEPS + self._seen))
         self._variance += rate * ((added - self._added) ** 2 - self._variance)
         self._added += rate * (added - self._added)
         # Of a mean that forgets exponentially, of independent values.
         error = np.sqrt(rate / (2 - rate) * self._variance)
-        mean = effort(self._first, self._added)
-        return np.where(mean > SIGNIFICANCE * effort(self._first, error), mean, 0.0)
+        significant = effort(self._first, self._added) > SIGNIFICANCE * effort(self._first, error)
+        return np.where(significant[:, None], self._added, 0.0).astype(np.float32)
 
     def _team(self, share: Floats) -> Team:
         """The team that does a share ``(K,)`` of what it was believed to do."""

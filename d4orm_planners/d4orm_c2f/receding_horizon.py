@@ -140,8 +140,7 @@ class D4ormC2F(StatePolicy):
         if self.config.control_noise_std:
             noise = self._random.normal(0, self.config.control_noise_std, controls.shape)
             controls = np.clip(controls + noise, *self.problem.team.control_bounds).astype(np.float32)
-        self._deviation.expect(controls)
-        return controls
+        return self._deviation.send(controls)
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
         """The controls ``(K, m)``, changed for robots that might come to touch something: these brake, or evade."""
@@ -168,6 +167,21 @@ class D4ormC2F(StatePolicy):
         self, joint: JointState, controls: FloatArray, gap: float, speed_slack: float, steps: int
     ) -> FloatArray:
         """The controls ``(K, m)``, changed for robots that after so many steps of them could not brake in time."""
+        problem = self._deviation.problem
+        evading, safe = self._evasion(joint, controls, gap, speed_slack, steps)
+        if steps > 1 and evading.any():
+            # A robot that starts gently is not far by then: near a wall it would otherwise never start.
+            gentle = np.where(evading[:, None], controls / np.float32(steps), controls)
+            unsafe, _ = self._evasion(joint, gentle, gap, speed_slack, steps)
+            controls, evading = np.where(unsafe[:, None], controls, gentle), evading & unsafe
+            velocities = present_velocities(problem, joint.states, joint.controls)
+            safe = velocities + (safe - velocities) / np.float32(steps)
+        return np.where(evading[:, None], track_velocities(self.problem, joint.states, safe), controls)
+
+    def _evasion(
+        self, joint: JointState, controls: FloatArray, gap: float, speed_slack: float, steps: int
+    ) -> tuple[BoolArray, FloatArray]:
+        """``(K,)`` robots that could not brake in time after so many steps, and velocities ``(K, d)`` that do."""
         problem, arrived, states = self._deviation.problem, self._arrived, joint.states
         arrays = self._deviation.arrays(joint)
         for _ in range(steps):
@@ -176,11 +190,7 @@ class D4ormC2F(StatePolicy):
         wanted = present_velocities(problem, states, ahead.controls)
         # Velocities take effect by the next step, so that positions after the present one count.
         safe = safe_velocities(problem, joint._replace(states=states), wanted, ~arrived, gap, speed_slack)
-        evading = np.abs(safe - wanted).max(axis=1) > NEARLY * problem.team.max_speed
-        if steps > 1:
-            velocities = present_velocities(problem, joint.states, joint.controls)
-            safe = velocities + (safe - velocities) / np.float32(steps)
-        return np.where(evading[:, None], track_velocities(self.problem, joint.states, safe), controls)
+        return np.abs(safe - wanted).max(axis=1) > NEARLY * problem.team.max_speed, safe
 
     def _loop(self, joint: JointState) -> None:
         """One control loop (Algorithm 4, lines 6 to 9)."""

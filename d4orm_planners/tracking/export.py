@@ -190,7 +190,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
     """Write a motion into a folder, which is made; files that are there stay, but for those of the same names.
 
     Raises:
-        ValueError: If there is no such format, or the motion does not fit it.
+        ValueError: If there is no such format, the motion does not fit it, or the folder has files of more robots.
         ModuleNotFoundError: If a library for it is missing; the message names it.
         OSError: If it cannot be written; nothing is left behind then.
     """
@@ -205,6 +205,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
     with TemporaryDirectory(dir=folder.parent, prefix=".export") as name:
         pieces = FORMATS[form](motion, setpoints, Path(name), height)
         names = sorted(path.name for path in Path(name).iterdir())
+        _refuse_others(folder, names)
         folder.mkdir(exist_ok=True)
         for entry in names:
             if (folder / entry).is_dir():
@@ -222,6 +223,17 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         (float(heights.min()), float(heights.max())),
         pieces,
     )
+
+
+def _refuse_others(folder: Path, names: list[str]) -> None:
+    """Refuse a folder with robots' files that would not be replaced: drones would fly another plan beside this one."""
+    if names[0].startswith("robot_"):
+        others = sorted(path.name for path in folder.glob("robot_*.csv") if path.name not in names)
+        if others:
+            raise ValueError(
+                f"{folder} has {others[0]} of another team, and this one has {len(names)} robots; delete these, "
+                "or name another folder"
+            )
 
 
 def _least_overhead(problem: Problem, positions: Floats) -> float:

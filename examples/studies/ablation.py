@@ -17,7 +17,7 @@ from operator import attrgetter
 from typing import Any
 
 from examples.common import mean_text, save_table, study_trials, trials_parser
-from examples.studies import FIRST_SEED
+from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 from examples.studies.disturbance_study import (
     DISTURBANCES,
     NOTHING,
@@ -71,6 +71,7 @@ def studies(scenarios: Sequence[str], disturbances: Sequence[str], seeds: int) -
                 for label in (ALL, MEANT_FOR[name], WITHOUT_ALL)
             },
             scenarios=scenarios, num_robots=ROBOTS, seeds=range(FIRST_SEED, FIRST_SEED + seeds),
+            scenario_settings=AS_IN_THE_PAPER,
             disturbances={name: [[] if name == NOTHING else [DISTURBANCES[name]]]},
         )
         for name in disturbances

@@ -16,12 +16,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from d4orm_env import render
+from d4orm_env import make_problem, render, rollout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
-from d4orm_env.render import FrameRenderer, WindowRenderer, plot_trajectory, save_animation, save_picture
+from d4orm_env.render import FrameRenderer, WindowRenderer, plot, plot_trajectory, save_animation, save_picture
 from d4orm_env.render.animation import frame_steps
 from d4orm_env.render.panels import CONTACT, robot_colors, view_limits
 from d4orm_env.render.pictures import contact_points
@@ -160,6 +160,17 @@ def test_colours_are_distinct_for_every_team_size() -> None:
     assert (1.05 / (lines @ [0.2126, 0.7152, 0.0722] + 0.05) > 2.2).all(), "contrast with white"
     apart = np.linalg.norm(colors[:16, None] - colors[:16], axis=-1) + np.eye(16)
     assert apart.min() > 0.15
+
+
+def test_trailers_have_their_cars_colour_and_goals_a_cars_size() -> None:
+    problem = make_problem("random", num_robots=3, seed=1, model="car_with_2_trailers", size=12.0)
+    trajectory = rollout(problem, np.zeros((problem.horizon, 3, 2), np.float32))
+    axes = plot(problem, trajectory)
+    (starts,) = (part for part in axes.collections if part.get_zorder() == 2.5 and len(part.get_paths()) == 9)
+    colors = robot_colors(3)[[body.robot for body in problem.team.bodies]]
+    np.testing.assert_allclose(starts.get_edgecolors()[:, :3], colors)
+    goals = next(part for part in axes.collections if part.get_zorder() == 3)
+    assert np.ptp(goals.get_paths()[0].vertices[:, 0]) < 2 * problem.team.bodies[0].footprint.outline().max() * 2
 
 
 def test_view_holds_every_robot_and_a_near_bound_but_not_a_far_one() -> None:

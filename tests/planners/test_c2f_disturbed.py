@@ -23,7 +23,7 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
-from d4orm_planners.d4orm_c2f.deviation import StateFilter
+from d4orm_planners.d4orm_c2f.deviation import Deviation, StateFilter
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.d4orm_c2f.estimators import (
     BRAKING_STEPS,
@@ -35,6 +35,7 @@ from d4orm_planners.d4orm_c2f.estimators import (
     StallEstimator,
 )
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import NEAR_VIA, drives, track_velocities
 
@@ -129,6 +130,29 @@ def test_what_is_added_to_commands_is_kept_back() -> None:
         told = random.uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
         actuator_gain.observe(told, told + np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32), ALL)
     np.testing.assert_allclose(actuator_gain.problem.team.max_acceleration, [1, 0.9, 0.8], rtol=1e-5)
+    np.testing.assert_allclose(actuator_gain.added, [[0, 0], [0.12, 0], [0, -0.22]], atol=0.005)
+
+
+def test_commands_make_up_for_what_is_added_to_them() -> None:
+    problem, random, engine = make_problem("circle", num_robots=3), np.random.default_rng(0), get_sampling_engine("cpu")
+    deviation, now, off = Deviation(problem, engine, D4ormC2FConfig(), docks=True), joint(problem, problem.start), []
+    added = np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32)
+    for _ in range(60):
+        now = deviation.observe(now)
+        told = random.uniform(-0.3, 0.3, (3, 2)).astype(np.float32)
+        step = engine.step(problem.arrays, now.states, now.arrived, deviation.send(told) + added)
+        now = now._replace(states=step.states, controls=step.controls)
+        off.append(step.controls - told)
+    np.testing.assert_allclose(off[0], added, atol=1e-6)
+    np.testing.assert_allclose(off[-1], 0, atol=0.005)
+
+
+@pytest.mark.slow
+def test_robots_that_lose_commands_start_gently_near_walls() -> None:
+    """With eight losses in a row to be reckoned with, a full start next to a wall is none that is safe."""
+    problem = make_problem("rooms", num_robots=8, seed=1004)
+    env = navigation_v0.parallel_env(problem=problem, disturbances=[Dropout(0.3)])
+    assert run_episode(env, make_policy("d4orm-c2f", refine="sync"), seed=1004).metrics["success"]
 
 
 @pytest.mark.parametrize(("bias", "believed"), [(0.0, 1.0), (0.3, 0.7)])

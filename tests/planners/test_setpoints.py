@@ -317,6 +317,13 @@ def test_bad_exports_are_refused_and_leave_nothing(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_with_files_of_more_robots_is_refused(plans: dict[str, Plan], tmp_path: Path) -> None:
+    (tmp_path / "robot_99.csv").write_text("flown before")
+    with pytest.raises(ValueError, match=r"has robot_99\.csv of another team, and this one has \d robots"):
+        plans["plane"].export("csv", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["robot_99.csv"]
+
+
 def test_heights_belong_to_teams_in_the_plane(plans: dict[str, Plan], tmp_path: Path) -> None:
     assert plans["plane"].export("csv", tmp_path / "plane").min_overhead == np.inf
     with pytest.raises(ValueError, match="height is 1 m, and this team has heights of its own; leave it out"):
