@@ -103,6 +103,8 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
     """
     if np.ndim(value) == 0:
         value = np.repeat(value, num_robots)
+    elif np.shape(value) != (num_robots,):
+        raise ValueError(f"{name} has shape {np.shape(value)}; expected one number, or ({num_robots},)")
     array = frozen_array(value, name, (num_robots,))
     outside = (array < np.float32(SMALLEST)) | (array > LARGEST)
     for wrong, wanted in ((array <= 0, "positive"), (outside, f"from {SMALLEST:g} to {LARGEST:g}")):

@@ -188,6 +188,7 @@ class Team(Frozen):
                 raise ValueError(
                     f"own_limits holds {short_repr(name)}, which no model of the team has; "
                     f"it has {', '.join(names) or 'none of its own'}"
+                    f"{'; YAML wants a space after a colon' if ':' in str(name) else ''}"
                 )
         return {name: _per_robot(name, given.get(name), [limits.get(name) for limits in known]) for name in names}
 

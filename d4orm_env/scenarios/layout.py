@@ -71,7 +71,7 @@ def _lifted(layout: Layout, height: float) -> Layout:
     positions = np.vstack([layout.starts, layout.goals])
     if positions.shape[1] != 3:
         raise ValueError(
-            f"height is {height:g} and the robots move in the plane; use model='holonomic3d', or leave it out"
+            f"height is {height:g} and the robots move in the plane; leave it out, or use model='holonomic3d'"
         )
     lift = np.array([0.0, 0.0, height - positions[:, 2].min()])
     area, world = layout.area, layout.world

@@ -140,6 +140,8 @@ class Planner(ABC):
         """
         if not isinstance(problem, Problem):
             raise ValueError(f"problem is {short_repr(problem)}; give a Problem, such as make_problem() returns")
+        if callback is not None and not callable(callback):
+            raise ValueError(f"callback is {short_repr(callback)}; give a function of an IterationRecord")
         limit = None if time_limit is None else duration(time_limit, "time_limit")
         most = (
             self.config.max_iterations if max_iterations is None else whole_number(max_iterations, "max_iterations", 1)

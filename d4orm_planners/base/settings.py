@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
 from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, LARGEST_WHOLE, short_repr
-from d4orm_env.core.errors import no_setting, unknown
+from d4orm_env.core.errors import UnknownKeywordError, no_setting, unknown
 from d4orm_env.engine.choice import ENGINES
 
 
@@ -123,6 +123,10 @@ class CheckedSettings:
         known = cls.setting_names(given)
         for name in given:
             if name not in known:
+                if name == "time_limit" and "max_iterations" in known:
+                    raise UnknownKeywordError(
+                        f"'time_limit' is no setting of {owner}; it goes to solve(), and --time-limit on the command line"
+                    )
                 raise no_setting(name, owner, known)
         return cls._made_of(given)
 

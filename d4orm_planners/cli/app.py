@@ -180,7 +180,7 @@ def main(arguments: list[str] | None = None) -> None:
             warnings.showwarning = _warn
             status = app(arguments, standalone_mode=False)
     except ClickException as error:
-        status = _complain(error.format_message() + _given(error))
+        status = _complain(_in_plain_words(error.format_message()) + _given(error))
     except (ValueError, OSError, ImportError) as error:  # ImportError: an extra that is not installed
         status = _complain(_message(error))
     except (KeyboardInterrupt, typer.Abort):
@@ -192,6 +192,13 @@ def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
+
+
+def _in_plain_words(message: str) -> str:
+    for kind, what in (("integer", "whole number"), ("number", "number")):
+        library = "an integer" if kind == "integer" else "a number"
+        message = message.replace(f"Input should be a valid {kind}, unable to parse string as {library}", f"must be a {what}")
+    return message
 
 
 def _given(error: Any) -> str:

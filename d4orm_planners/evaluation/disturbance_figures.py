@@ -12,6 +12,8 @@ import numpy as np
 
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.disturbances.disturbance_registry import find_level, name_of
+from d4orm_env.dynamics.models import MODELS
+from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.render.style import own_style
 from d4orm_planners.evaluation.summary import SuccessRate
 from d4orm_planners.evaluation.tables import target
@@ -28,6 +30,8 @@ COLUMN, PAGE = 3.5, 7.16
 """Width of a column and of a page of two [inches]."""
 _LETTERS = 28
 """Letters that fit over a map beside each other."""
+_LEGEND_LETTERS = 50
+"""Letters of a legend that fit in a column beside each other, five for each symbol."""
 
 _STYLE = {
     "text.parse_math": False,  # no name is a formula
@@ -154,7 +158,8 @@ def draw_lines(rates: Sequence[SuccessRate]) -> Figure:
 
 def _add_legend(figure: Figure, axes: Sequence[Axes], across: int) -> None:
     lines, labels = axes[0].get_legend_handles_labels()
-    columns = min(max(across, 2), len(labels))
+    in_one_row = sum(map(len, labels)) + 5 * len(labels) <= _LEGEND_LETTERS
+    columns = len(labels) if in_one_row else min(max(across, 2), len(labels))
     figure.legend(lines, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
@@ -170,9 +175,16 @@ def _draw_panel(ax: Axes, name: str, labels: Sequence[str], rates: Sequence[Succ
         ax.errorbar(x, y, ends, color=color, marker=marker, markersize=3, linewidth=1, elinewidth=0.6, label=label)
     quantity = quantity_of(name)
     ax.set_xticks(range(len(levels)), [_shown(level) for level in levels])
-    ax.set(title=quantity.name, xlabel=quantity.unit, ylim=(-0.03, 1.03), xlim=(-0.5, len(levels) - 0.5))
+    ax.set(title=quantity.name, xlabel=_unit(quantity, rates), ylim=(-0.06, 1.06), xlim=(-0.5, len(levels) - 0.5))
     ax.grid(axis="y", color="0.9", linewidth=0.5)
     ax.tick_params(length=2, width=0.5)
+
+
+def _unit(quantity: Quantity, rates: Sequence[SuccessRate]) -> str:
+    """The unit, of controls that of all robots where these are accelerated alike."""
+    known = [MODELS.get(rate.model) for rate in rates]
+    accelerated = all(model is not None and set(model.control_limits) == {ACCELERATION} for model in known)
+    return quantity.unit.replace("control units", "m/s²") if accelerated else quantity.unit
 
 
 @own_style(_STYLE)
@@ -199,6 +211,7 @@ def draw_map(rates: Sequence[SuccessRate]) -> Figure:
     ax.set_yticks(range(len(rows)), ["" if name == "" else _shown(level) for name, level in rows], fontsize=6)
     ax.set_xticks(range(len(labels)), labels, rotation=90 if upright else 0)
     ax.tick_params(length=0, top=False, labeltop=True, labelbottom=False)
+    ax.annotate("success [%]", (0, 1), (-4, 4), "axes fraction", "offset points", ha="right", fontsize=6)
     noise = rates[0].control_noise_std
     for name, first, last in stretches:
         alone = f"noise {noise:g} alone" if noise else "undisturbed"

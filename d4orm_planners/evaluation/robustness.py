@@ -22,7 +22,7 @@ _PAIRS = """\
 Trials with the same problem, seed and disturbance. *Only first* and *only second* count those in which one of the two
 succeeded; p is that of McNemar's exact test. Differences have 95% intervals: Newcombe's, of times Student's."""
 _NOT_RUN = "Success without a disturbance was *not run*: give one a level without effect, as in `push.speed=0,0.5`."
-_FIGURES = "Success against level with 95% intervals, and success in percent."
+_FIGURES = "Success against level, not to scale, with 95% intervals, and success in percent."
 
 
 def _check_given(given: object, kind: type, source: str) -> None:
@@ -186,10 +186,10 @@ class Tolerance:
 
     @property
     def text(self) -> str:
-        """Return the level as text: ``"4"``, ``"over 4"`` where it tolerates the last level, 4, or ``"-"`` for none."""
+        """Return the level as text: ``"4"``, ``"at least 4"`` where it tolerates the last level, 4, or ``"-"`` for none."""
         if self.fails is not None:
             return f"{self.fails:g}"
-        return "-" if self.passes is None else f"over {self.passes:g}"
+        return "-" if self.passes is None else f"at least {self.passes:g}"
 
 
 _LINE = ("label", "scenario", "num_robots", "model", "control_noise_std", "disturbance")

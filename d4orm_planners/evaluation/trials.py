@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 import json
 import time
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +32,7 @@ from d4orm_planners.evaluation.store import Trial, TrialKey
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
+PACKAGES = tuple(str(Path(__file__).parents[2] / name) for name in ("d4orm_env", "d4orm_planners"))
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco", "crazyflow")
 
 
@@ -157,7 +160,7 @@ class Job:
                 timed = timed or _TimedPolicy(make_policy(self.policy.source, **self.policy.settings))
                 outcome = _outcome(timed, self, condition)
             except Exception as problem:
-                error = describe(problem)
+                error = describe(problem) + _place(problem)
             libraries, machine = _origin()
             trial = replace(self.failed(condition, error), versions=libraries, machine=machine, **outcome)
             yield replace(trial, elapsed=time.perf_counter() - begin)
@@ -168,6 +171,13 @@ class Job:
         count = len(left) if done == 0 and self.policy.planned else 1
         rest = replace(self, conditions=left[count:]) if left[count:] else None
         return [self.failed(condition, reason) for condition in left[:count]], rest
+
+
+def _place(error: Exception) -> str:
+    """Where a user's code raised it; empty where a package did."""
+    file, line, *_ = traceback.extract_tb(error.__traceback__)[-1]
+    own = "site-packages" not in file and not file.startswith(PACKAGES)
+    return f" ({Path(file).name}, line {line})" if own else ""
 
 
 def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -196,8 +197,8 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
     """
     if form not in FORMATS:
         raise unknown("format", form, FORMATS)
-    if not np.isfinite(height):
-        raise ValueError(f"height is {height!r}; it must be finite")
+    if not isinstance(height, Real) or not np.isfinite(height):
+        raise ValueError(f"height is {height!r}; it must be a finite number")
     if height and motion.problem.dimension == 3:
         raise ValueError(f"height is {height:g} m, and this team has heights of its own; leave it out")
     setpoints = sample_motion(motion, rate)
