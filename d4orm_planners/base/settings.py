@@ -125,7 +125,7 @@ class CheckedSettings:
             if name not in known:
                 if name == "time_limit" and "max_iterations" in known:
                     raise UnknownKeywordError(
-                        f"'time_limit' is no setting of {owner}; it goes to solve(), and --time-limit on the command line"
+                        f"'time_limit' is no setting of {owner}; give it to solve(), or as --time-limit"
                     )
                 raise no_setting(name, owner, known)
         return cls._made_of(given)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import importlib.metadata
 import io
+import re
 import signal
 import sys
 import warnings
@@ -195,9 +196,11 @@ def _message(error: Exception) -> str:
 
 
 def _in_plain_words(message: str) -> str:
-    for kind, what in (("integer", "whole number"), ("number", "number")):
-        library = "an integer" if kind == "integer" else "a number"
-        message = message.replace(f"Input should be a valid {kind}, unable to parse string as {library}", f"must be a {what}")
+    """The message without the words of the library that reads numbers."""
+    for kind, what in (("integer", "a whole number"), ("number", "a number")):
+        message = re.sub(
+            f"Input should be a valid {kind}, unable to parse string as an? {kind}", f"must be {what}", message
+        )
     return message
 
 

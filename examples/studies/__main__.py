@@ -24,7 +24,7 @@ from d4orm_planners.cli.app import main as d4orm
 
 FOLDER = Path(__file__).parent
 DATA = FOLDER / "data"
-SHARED = ("least_times", "settings_studies")
+SHARED = ("settings_studies",)
 """Modules that are no studies."""
 NAMES = tuple(sorted({*COMPARISONS, "paper", *(path.stem for path in FOLDER.glob("[a-z]*.py"))} - {*SHARED}))
 TIMED = ("big-teams", "coarseness", "ipopt")

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from examples.common import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
-from examples.studies import FIRST_SEED
+from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 
 from d4orm_env.disturbances import (
     Bias,
@@ -70,6 +70,7 @@ def studies(scenarios: tuple[str, ...], policies: dict[str, dict[str, Any]], see
         policies=policies,
         scenarios=scenarios,
         num_robots=ROBOTS,
+        scenario_settings=AS_IN_THE_PAPER,
         seeds=range(FIRST_SEED, FIRST_SEED + seeds),
         disturbances={NOTHING: [[]], **{name: [[one]] for name, one in DISTURBANCES.items()}},
     )

@@ -4,9 +4,10 @@
     python -m examples.studies lifelong --minutes 10 --seeds 10
     python -m examples.studies lifelong --minutes 5 --scenario warehouse --num-robots 32
 
-The throughput is compared with a bound that robots cannot beat in the long run: without others in its way, a robot
-would accelerate to each of the goals that it was given, from the velocity that it had then, up to its top speed, and
-pass through. It would drive straight, or among walls along the shortest path, wherever it was heading before.
+The throughput is compared with that of straight drives at the speed limit, which a step goes beyond by a twentieth at
+most. Without others in its way, a robot would accelerate to each of the goals that it was given, from the velocity that
+it had then, up to its top speed, and pass through. It would drive straight, or among walls along the shortest path,
+wherever it was heading before.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from examples.common import count, film, save_gif, save_table, study_parser, study_rows
-from examples.studies.least_times import least_times
+from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_env.envs.joint_state import JointState, split_state
@@ -26,9 +27,10 @@ from d4orm_planners import make_policy
 from d4orm_planners.evaluation.summary import mean_interval
 
 
-def bounds_of(problem: Problem, joint: JointState) -> np.ndarray:
+def least_times(problem: Problem, joint: JointState) -> np.ndarray:
     """``(K,)`` seconds within which no double integrator gets from a joint state to its goal."""
     d = problem.dimension
+    speed, acceleration, _ = np.asarray(problem.team.limits, np.float64).T
     to_goal = joint.goals.astype(np.float64) - joint.states[:, :d]
     distance = np.linalg.norm(to_goal, axis=1)
     velocity = joint.states[:, d : 2 * d]
@@ -36,7 +38,10 @@ def bounds_of(problem: Problem, joint: JointState) -> np.ndarray:
     if problem.world.num_obstacles:
         distance = problem.with_state(joint.states, joint.goals).shortest_paths.length
         towards = np.linalg.norm(velocity, axis=1)
-    return least_times(problem, distance - problem.goal_radius, towards, np.full(problem.num_robots, np.inf))
+    distance = np.maximum(distance - problem.goal_radius, 0)
+    to_top_speed = (speed**2 - towards**2) / (2 * acceleration)
+    reached = np.sqrt(towards**2 + 2 * acceleration * np.minimum(distance, to_top_speed))
+    return (reached - towards) / acceleration + np.maximum(distance - to_top_speed, 0) / speed
 
 
 def drive(problem: Problem, seed: int, minutes: float, seconds: float) -> tuple[dict[str, Any], list[Any]]:
@@ -48,7 +53,7 @@ def drive(problem: Problem, seed: int, minutes: float, seconds: float) -> tuple[
     policy.reset(env, seed=seed)
 
     joint = split_state(problem, env.state())
-    bounds = list(bounds_of(problem, joint))
+    bounds = list(least_times(problem, joint))
     act_times, joints, goals_reached = [], [joint], [0]
     collided = [np.zeros(problem.num_robots, bool)]
     while env.agents:
@@ -57,7 +62,7 @@ def drive(problem: Problem, seed: int, minutes: float, seconds: float) -> tuple[
         act_times.append(time.perf_counter() - begin)
         observations, _, _, _, infos = env.step(actions)
         joint = split_state(problem, env.state())
-        bounds.extend(bounds_of(problem, joint)[(joint.goals != joints[-1].goals).any(axis=1)])
+        bounds.extend(least_times(problem, joint)[(joint.goals != joints[-1].goals).any(axis=1)])
         joints.append(joint)
         collided.append(np.array([infos[agent]["collided"] for agent in env.possible_agents]))
         goals_reached.append(len(bounds) - problem.num_robots)
@@ -122,7 +127,7 @@ def main() -> None:
     def measure() -> list[dict[str, Any]]:
         drives: list[dict[str, Any]] = []
         for seed in range(arguments.seed, arguments.seed + arguments.seeds):
-            problem = make_problem(arguments.scenario, num_robots=num_robots, seed=seed)
+            problem = make_problem(arguments.scenario, num_robots=num_robots, seed=seed, **AS_IN_THE_PAPER)
             row, frames = drive(problem, seed, minutes, 0.0 if drives else seconds)
             drives.append({"scenario": arguments.scenario, "seed": seed, **row})
             if seed == arguments.seed:

@@ -678,10 +678,10 @@ def test_scaling_example_solves_every_team(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("position", "velocity", "seconds"),
     [
-        (0.0, 0.0, 1 + 3.4),  # half a metre to reach 1 m/s, then 34 steps of 0.105 m
-        (0.0, 1.0, 3.9),
-        (0.0, -1.0, 2 + 3.9),  # two seconds to stop and come back at top speed
-        (3.92, 0.0, 0.4),  # 0.005 m, 0.015 m, ... add up to 0.08 m
+        (0.0, 0.0, 1 + (4 - 0.5)),  # half a metre to reach 1 m/s
+        (0.0, 1.0, 4.0),
+        (0.0, -1.0, 2 + 4.0),  # two seconds to stop and come back at top speed
+        (3.92, 0.0, np.sqrt(2 * 0.08)),
         (4.05, 0.0, 0.0),
     ],
     ids=["from rest", "at top speed", "backwards", "near", "there already"],
@@ -696,7 +696,7 @@ def test_lifelong_bound_is_the_time_of_a_straight_drive(
     goal = np.array([[4 + problem.goal_radius, 0]], np.float32)
     states = np.array([[position, 0, velocity, 0]], np.float32)
     joint = JointState(states, goal, np.zeros((1, 2), np.float32), np.zeros(1, bool), 0)
-    assert lifelong.bounds_of(problem, joint) == pytest.approx([seconds], abs=1e-5)
+    assert lifelong.least_times(problem, joint) == pytest.approx([seconds], abs=1e-5)
 
 
 @pytest.mark.parametrize("last_speed", [np.inf, 0.1])
