@@ -181,14 +181,18 @@ def approach_goals(
 
 
 def drive_further_in(search: SolveRun, candidate: Candidate, evaluate: Callable[[FloatArray], Candidate]) -> Candidate:
-    """The candidate, or one whose robots drive further in if rounding alone decides who has arrived."""
-    report = candidate.report
-    if report is None or report.ok or any(violation.kind != "not arrived" for violation in report.violations):
+    """The candidate, or one whose robots drive further in where rounding decides who has arrived.
+
+    Whoever has not in the report has in the trajectory, and might touch something as it drives on.
+    """
+    violations = () if candidate.report is None else candidate.report.violations
+    late = {robot for violation in violations if violation.kind == "not arrived" for robot in violation.robots}
+    if not late:
         return candidate
     with search.watch.paused():
         prepare_drives(search.problem)
     arrivals = arrival_steps(candidate.trajectory.arrived)
-    for robot in np.flatnonzero(candidate.unsolved).tolist():
+    for robot in sorted(late):
         for earlier, share in product(EARLIER, SHARES):
             step = int(arrivals[robot]) - earlier
             if step < 0 or search.should_stop():

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples.studies.solve_rates import instance
 from planner_support import cheap_planner
 
 from d4orm_env.core.arrays import FloatArray
@@ -103,6 +104,13 @@ def test_robots_that_drive_by_quarters_of_a_metre_arrive(model: str, goal_radius
     problem = quarters(model, goal_radius)
     problem = problem.replace(goal=problem.start[:, :2] + np.float32([[steps / 4, 0], [steps / 4, 0]]))
     assert given(straight(problem)).solve(problem, max_iterations=1).status == "solved"
+
+
+@pytest.mark.slow
+def test_robots_drive_further_in_where_they_would_touch_something_beyond() -> None:
+    """One docks at 0.1001 m/s; in the reading in which it does not, it drifts on into others and a wall."""
+    plan = make_planner().solve(instance("map", {"num_robots": 40, "cell": 0.6}, 11), seed=11, max_iterations=1)
+    assert plan.solved
 
 
 def test_a_plan_that_verify_refuses_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
