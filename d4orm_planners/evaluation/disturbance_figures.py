@@ -215,7 +215,8 @@ def draw_map(rates: Sequence[SuccessRate]) -> Figure:
     noise = rates[0].control_noise_std
     for name, first, last in stretches:
         alone = f"noise {noise:g} alone" if noise else "undisturbed"
-        text = quantity_of(name).text.replace(" [", "\n[") if name else alone
+        quantity = quantity_of(name)
+        text = quantity._replace(unit=_unit(quantity, rates)).text.replace(" [", "\n[") if name else alone
         ax.annotate(text, (0, (first + last) / 2), (-26 if name else -4, 0), ("axes fraction", "data"), "offset points",
                     ha="right", va="center", fontsize=6)  # fmt: skip
         ax.axhline(first - 0.5, color="white", linewidth=1.5)
