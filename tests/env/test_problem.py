@@ -53,7 +53,7 @@ def spatial(**changes: Any) -> Problem:
         ({"radius": 0}, "radius of robot_0 is 0; it must be positive"),
         ({"radius": [0.1, -0.5]}, "radius of robot_1 is -0.5; it must be positive"),
         ({"radius": [0.1, NAN]}, r"radius\[1\] is nan; every value must be finite"),
-        ({"radius": [0.1, 0.1, 0.1]}, r"radius has shape \(3,\); expected \(2\)"),
+        ({"radius": [0.1, 0.1, 0.1]}, r"radius has shape \(3,\); expected one number, or \(2,\)"),
         ({"radius": "wide"}, "radius must be an array of numbers"),
         ({"max_speed": [1, 0]}, "max_speed of robot_1 is 0; it must be positive"),
         ({"max_speed": INF}, r"max_speed\[0\] is inf; every value must be finite"),

@@ -277,7 +277,8 @@ def test_labels_of_the_map_do_not_overlap_and_fit(labels: list[str], levels: tup
     (ax,) = figure.axes
     names = [text for text in ax.texts if not text.get_text().isdecimal()]
     assert [name.get_text() for name in names] == [
-        "undisturbed", "control delay\n[time steps]", "speed of pushes\n[m/s]", "position noise\n[std, m]"
+        "success [%]", "undisturbed", "control delay\n[time steps]", "speed of pushes\n[m/s]",
+        "position noise\n[std, m]",
     ]  # fmt: skip
     for listed in (names, ax.get_xticklabels()):
         boxes = [text.get_window_extent() for text in listed]

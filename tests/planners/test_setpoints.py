@@ -306,7 +306,8 @@ def test_files_are_written_again_and_others_stay(plans: dict[str, Plan], tmp_pat
     [
         ("cvs", {}, "format 'cvs' is unknown; choose one of csv, crazyswarm2, rosbag2, mcap"),
         ("crazyswarm2", {}, "height is 0 m; a team that moves in the plane flies above 0: give height="),
-        ("csv", {"height": np.nan}, "height is nan; it must be finite"),
+        ("csv", {"height": np.nan}, "height is nan; it must be a finite number"),
+        ("csv", {"height": "1"}, "height is .1.; it must be a finite number"),
     ],
 )
 def test_bad_exports_are_refused_and_leave_nothing(
