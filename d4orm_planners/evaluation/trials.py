@@ -174,7 +174,7 @@ class Job:
 
 
 def _place(error: Exception) -> str:
-    """Where a user's code raised it; empty where a package did."""
+    """Place in a user's code that raised it, in brackets; empty where a package did."""
     file, line, *_ = traceback.extract_tb(error.__traceback__)[-1]
     own = "site-packages" not in file and not file.startswith(PACKAGES)
     return f" ({Path(file).name}, line {line})" if own else ""
