@@ -253,7 +253,7 @@ def test_what_crashes_dies_or_hangs_is_a_row_and_the_rest_goes_on(tmp_path: Path
         (seed, noise) for seed in (0, 4, 5) for noise in (0.0, 0.1)
     }
     for noise in (0.0, 0.1):
-        assert errors[1, noise] == "RuntimeError: out of luck"
+        assert errors[1, noise] == "RuntimeError: out of luck (program.py, line 10)"
         assert errors[2, noise] == "ChildProcessError: the worker process died (SIGKILL, perhaps for lack of memory)"
         assert errors[3, noise] == "TimeoutError: took longer than 8 s"
     assert {row.verified for row in stored if row.error} == {None}
