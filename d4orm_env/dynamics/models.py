@@ -134,6 +134,7 @@ def _check_attributes(model: Model) -> None:
         (all(0 <= index < n for index in indices), f"an index of a state component is not from 0 to {n - 1}"),
         (all(0 <= column < num_limits for column in columns), f"a column of limits is not from 0 to {num_limits - 1}"),
         (len({*model.limit_names, "radius"}) == num_limits + 1, "two limits have the same name; rename yours"),
+        ({*model.start_angles} <= {*model.own_angles}, "start_angles has an index that own_angles lacks"),
         (all(limit.default > 0 for limit in model.own_limits), "a default of own_limits is not positive"),
     )
     for holds, complaint in checks:

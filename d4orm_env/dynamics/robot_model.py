@@ -113,8 +113,7 @@ class ModelFunctions(NamedTuple):
     approach: ModelFunction
     """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
     track: ModelFunction
-    """``(x, velocity, limits, h, ops) -> u`` that would bring it to a velocity within a step; it may exceed the limits.
-    """
+    """``(x, velocity, limits, h, ops) -> u`` that would bring it to that within a step; it may exceed the limits."""
     integrate: Any = None
     """``(x, u, limits, h, ops) -> x`` after a :class:`TimeStep`: what classical Runge-Kutta makes of the derivative
     with the control held constant, written out without the terms that cancel. A model that leaves it out is integrated
@@ -193,8 +192,7 @@ class Model:
         dimension: Position dimensions ``d``, 2 or 3; the first ``d`` state components are the position [m].
         state_names: One name per state component; ``len`` is the model's state size ``n``, ``d`` to 6.
         control_names: One name per control component; ``len`` is the model's control size ``m``, 2 or 3.
-        control_limits: Column of the robot's limits that bounds each control component. Components with the same column
-            share it as the limit of their norm.
+        control_limits: Column of the limits that bounds each control component; those with one column by their norm.
         heading_index: State component holding the heading [rad], or ``None`` for a model without one.
         speed_indices: State components holding velocity or speed [m/s].
         functions: The scalar-style functions.
@@ -203,9 +201,10 @@ class Model:
             :attr:`ModelFunctions.limit_state` bounds; those with the same column by their norm.
         lower_limits: ``(column, column of its own)`` for limits that hold for positive values only, such as a speed
             forwards: the second one's bounds the magnitude of negative values, such as a speed backwards.
-        trailers: ``(state component of its hitch angle, column of its hitch's length)`` of each trailer, from the front
-            on; the angle is what its heading lags behind that of the body before it.
+        trailers: ``(state component of its hitch angle, column of its hitch's length)`` of each, from the front on; the
+            angle is what its heading lags behind that of the body before it.
         own_angles: State components other than the heading that are angles, which do not wind up either.
+        start_angles: Those of them that are the heading where a scenario starts the robot; others are 0.
     """
 
     name: str
@@ -221,6 +220,7 @@ class Model:
     lower_limits: tuple[tuple[int, int], ...] = ()
     trailers: tuple[tuple[int, int], ...] = ()
     own_angles: tuple[int, ...] = ()
+    start_angles: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         functions = self.functions

@@ -109,7 +109,7 @@ def start_states(team: Team, starts: Points, goals: Points) -> Points:
     offset = goals - starts
     for robot, model in enumerate(team.robot_models):
         if model.heading_index is not None:
-            states[robot, model.heading_index] = arctan2(offset[robot, 1], offset[robot, 0])
+            states[robot, [model.heading_index, *model.start_angles]] = arctan2(offset[robot, 1], offset[robot, 0])
     return states
 
 

@@ -53,6 +53,7 @@ class SharedPolicy(Policy):
             goal speed is limited, its robots then brake to dock as go-to-goal does, as those of the package's policies.
         trained: Shapes of the observations and actions of the training, where the model tells them. Those of a whole
             team are of a model that steers it at once, trained in the joint environment.
+        joint: Whether it is one, where it does not tell: it is asked for one row, of all robots one after the other.
     """
 
     def __init__(
@@ -62,11 +63,12 @@ class SharedPolicy(Policy):
         normalized: bool = False,
         egocentric: bool = False,
         trained: Shapes | None = None,
+        joint: bool = False,
     ) -> None:
         if weights is not None and not hasattr(weights, "state_dict"):
             raise ValueError(f"the model is {short_repr(weights)}; load it first, and give what acts")
         self._predict, self._weights, self._normalized, self._egocentric = predict, weights, normalized, egocentric
-        self._trained = trained
+        self._trained, self._joint = trained, joint
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         """See :meth:`Policy.reset`.
@@ -93,7 +95,7 @@ class SharedPolicy(Policy):
                 f"{acted}; make the environment as it was in training, with as many robots, or give "
                 f"egocentric=True for a model trained in egocentric ones"
             )
-        return self._trained == team and count > 1
+        return self._joint or (self._trained == team and count > 1)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         if not observations:
@@ -120,6 +122,7 @@ class SharedPolicy(Policy):
         except RuntimeError as error:  # torch's, of a module that takes something else
             raise ValueError(
                 f"the model fails on observations of shape {asked.shape}, which are those of this environment: {error}"
+                f"{'' if self._is_joint else '; give joint=True for one that steers the whole team at once'}"
             ) from error
         actions = _checked_actions(answer, len(asked)).reshape(len(seen), -1)
         if self._features is not None:
@@ -137,7 +140,7 @@ class SharedPolicy(Policy):
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).tobytes())
         settings = getattr(self._predict, "keywords", {})  # of a partial
-        own = {"egocentric": True} if self._egocentric else {}
+        own = {name: True for name in ("egocentric", "joint") if getattr(self, f"_{name}")}
         return {**settings, **own, "normalized": self._normalized, "weights": digest.hexdigest()}
 
 
@@ -179,19 +182,24 @@ def from_sb3(model: Model, deterministic: bool = True, egocentric: bool = False)
     return SharedPolicy(ask, weights, egocentric=egocentric, trained=trained)
 
 
-def from_torch(module: Model, normalized: bool = False, egocentric: bool = False) -> SharedPolicy:
+def from_torch(module: Model, normalized: bool = False, egocentric: bool = False, joint: bool = False) -> SharedPolicy:
     """A ``torch.nn.Module`` that maps observations ``(B, n)`` to actions ``(B, m)``, asked without gradients.
 
     Args:
         module: The module, on the CPU.
         normalized: Whether its actions are in ``[-1, 1]``.
         egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
+        joint: Whether it steers the whole team at once, see :class:`SharedPolicy`.
     """
-    return SharedPolicy(partial(_ask_torch, module), module, normalized, egocentric)
+    return SharedPolicy(partial(_ask_torch, module), module, normalized, egocentric, joint=joint)
 
 
 def from_torchrl(
-    module: Model, observation_key: Key = "observation", action_key: Key = "action", egocentric: bool = False
+    module: Model,
+    observation_key: Key = "observation",
+    action_key: Key = "action",
+    egocentric: bool = False,
+    joint: bool = False,
 ) -> SharedPolicy:
     """A module of TorchRL (or TensorDict), which is asked for its deterministic action, without gradients.
 
@@ -200,9 +208,10 @@ def from_torchrl(
         observation_key: Key of the observations.
         action_key: Key of the actions.
         egocentric: Whether it was trained in ``egocentric`` environments, see :class:`SharedPolicy`.
+        joint: Whether it steers the whole team at once, see :class:`SharedPolicy`.
     """
     ask = partial(_ask_torchrl, module, observation_key=observation_key, action_key=action_key)
-    return SharedPolicy(ask, module, egocentric=egocentric)
+    return SharedPolicy(ask, module, egocentric=egocentric, joint=joint)
 
 
 def from_rllib(module: Model, normalized: bool = True, egocentric: bool = False) -> SharedPolicy:

@@ -79,7 +79,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         delay: Steps late that commands are executed: control loops begin where those under way lead. ``None`` finds out
             from what the robots report to have executed.
         filter_states: Whether states that are seen to be noisy are filtered.
-        learn_limits: Whether robots that never do as much as they are asked to are taken to be that much weaker.
+        learn_limits: Whether robots that never do as much as they are asked to are taken to be that much weaker, and
+            commands make up for what is added to them for some time.
         expect_losses: Whether a robot that goes on with its last command is taken to have lost the new one: it is not
             weak, and others may do so too, as often in a row as must be reckoned with.
         stalls: Whether a robot that brakes or stays at rest whatever it is told is taken for an obstacle, which the

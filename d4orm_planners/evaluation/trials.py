@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import sysconfig
 import time
 import traceback
 from collections.abc import Iterator, Mapping
@@ -32,7 +33,11 @@ from d4orm_planners.evaluation.store import Trial, TrialKey
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
-PACKAGES = tuple(str(Path(__file__).parents[2] / name) for name in ("d4orm_env", "d4orm_planners"))
+PACKAGES = (
+    *(str(Path(__file__).parents[2] / name) for name in ("d4orm_env", "d4orm_planners")),
+    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+)
+"""Folders of code that is not a user's."""
 LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco", "crazyflow")
 
 
@@ -174,10 +179,10 @@ class Job:
 
 
 def _place(error: Exception) -> str:
-    """Place in a user's code that raised it, in brackets; empty where a package did."""
-    file, line, *_ = traceback.extract_tb(error.__traceback__)[-1]
-    own = "site-packages" not in file and not file.startswith(PACKAGES)
-    return f" ({Path(file).name}, line {line})" if own else ""
+    """Last place in a user's code on the way to it, in brackets; empty without one."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(("<", *PACKAGES))]
+    return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
 
 
 def _outcome(policy: _TimedPolicy, job: Job, condition: Condition) -> dict[str, Any]:

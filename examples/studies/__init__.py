@@ -5,6 +5,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 AS_IN_THE_PAPER: Mapping[str, float] = MappingProxyType({"goal_speed": math.inf})
-"""Scenarios' arguments in the paper's figures and what explains them: goals stop robots dead."""
+"""Scenarios' arguments in most studies: goals stop robots dead."""
 FIRST_SEED = 1000
 """No default was chosen by the seeds from here on."""

@@ -4,10 +4,10 @@
     python -m examples.studies lifelong --minutes 10 --seeds 10
     python -m examples.studies lifelong --minutes 5 --scenario warehouse --num-robots 32
 
-The throughput is compared with that of straight drives at the speed limit, which a step goes beyond by a twentieth at
-most. Without others in its way, a robot would accelerate to each of the goals that it was given, from the velocity that
-it had then, up to its top speed, and pass through. It would drive straight, or among walls along the shortest path,
-wherever it was heading before.
+The throughput is compared with that of straight drives at the speed limit, beyond which a step goes by a twentieth with
+the default limits. Without others in its way, a robot would accelerate to each of the goals that it was given, from the
+velocity that it had then, up to its top speed, and pass through. It would drive straight, or among walls along the
+shortest path, wherever it was heading before.
 """
 
 from __future__ import annotations

@@ -170,7 +170,7 @@ def test_trailers_have_their_cars_colour_and_goals_a_cars_size() -> None:
     colors = robot_colors(3)[[body.robot for body in problem.team.bodies]]
     np.testing.assert_allclose(starts.get_edgecolors()[:, :3], colors)
     goals = next(part for part in axes.collections if part.get_zorder() == 3)
-    assert np.ptp(goals.get_paths()[0].vertices[:, 0]) < 2 * problem.team.bodies[0].footprint.outline().max() * 2
+    assert np.ptp(goals.get_paths()[0].vertices[:, 0]) < 4 * problem.team.bodies[0].footprint.outline().max()
 
 
 def test_view_holds_every_robot_and_a_near_bound_but_not_a_far_one() -> None:

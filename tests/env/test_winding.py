@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from registry_support import forgetting
 
-from d4orm_env import mujoco, navigation_v0
+from d4orm_env import make_problem, mujoco, navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, unwound
@@ -196,12 +196,16 @@ def test_a_model_names_angles_of_its_own(engine: str) -> None:
         name="tractor",
         state_names=("px", "py", "heading", "trailer"),
         own_angles=(3,),
+        start_angles=(3,),
         functions=unicycle.functions._replace(
             derivative=_derivative, limit_state=_limit_state, rest=_rest, integrate=None
         ),
     )
     assert tractor.angles == (2, 3)
-    assert replace(tractor, own_angles=()).functions.limit_state((0, 0, 51.0, 51.0), (), PYTHON_OPS)[3] == 51.0
+    assert (
+        replace(tractor, own_angles=(), start_angles=()).functions.limit_state((0, 0, 51.0, 51.0), (), PYTHON_OPS)[3]
+        == 51.0
+    )
     with forgetting(MODELS):
         register_model(tractor)
         team = Team(("tractor",))
@@ -209,6 +213,10 @@ def test_a_model_names_angles_of_its_own(engine: str) -> None:
         states = rollout(problem, np.tile(np.float32([0.5, RATE]), (STEPS, 1, 1)), engine=engine).states
         env = navigation_v0.parallel_env(problem=problem)
         assert env.state_space.high[3] == pytest.approx(MAX_ANGLE, rel=0.01)
+        starts = make_problem("circle", num_robots=3, model="tractor").start
+        np.testing.assert_array_equal(starts[:, 3], starts[:, 2])
+        with pytest.raises(ValueError, match="start_angles has an index that own_angles lacks"):
+            register_model(replace(tractor, name="other", start_angles=(2,)))
     assert np.abs(states[..., 2:]).max() <= MAX_ANGLE
     assert states[-1, 0, 2] == pytest.approx(50 + 0.1 * RATE * STEPS - 16 * np.pi, abs=1e-4)
     assert 49 < states[-1, 0, 3] < 50.2

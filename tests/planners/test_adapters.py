@@ -59,6 +59,28 @@ def test_a_module_of_torch() -> None:
 SIZE = navigation_v0.parallel_env(problem=PROBLEM).observation_space("robot_0").shape[0]
 
 
+def joint_module() -> torch.nn.Module:
+    return torch.nn.Linear(PROBLEM.num_robots * SIZE, PROBLEM.num_robots * 2)
+
+
+def joint_torchrl(module: torch.nn.Module) -> SharedPolicy:
+    pytest.importorskip("torchrl")
+    from tensordict.nn import TensorDictModule
+
+    return from_torchrl(TensorDictModule(module, in_keys=["observation"], out_keys=["action"]), joint=True)
+
+
+@pytest.mark.parametrize("adapted", [lambda module: from_torch(module, joint=True), joint_torchrl])
+def test_a_module_of_the_whole_team(adapted: Any) -> None:
+    module = joint_module()
+    observed, actions, _ = first_actions(adapted(module))
+    wanted = module(torch.as_tensor(observed.reshape(1, -1))).detach().numpy().reshape(-1, 2)
+    np.testing.assert_allclose(actions, limit_controls(PROBLEM, wanted), rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match="give joint=True for one that steers the whole team at once"):
+        first_actions(from_torch(module))
+    assert from_torch(module, joint=True).identity() != from_torch(module).identity()
+
+
 class Also(torch.nn.Linear):
     """A module that returns more than actions, as a recurrent one does."""
 

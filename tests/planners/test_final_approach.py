@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from examples.studies.solve_rates import instance
 from planner_support import cheap_planner
 
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.dynamics.transition import SPEED_ALLOWANCE
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import list_planners, make_planner
@@ -106,11 +107,17 @@ def test_robots_that_drive_by_quarters_of_a_metre_arrive(model: str, goal_radius
     assert given(straight(problem)).solve(problem, max_iterations=1).status == "solved"
 
 
-@pytest.mark.slow
 def test_robots_drive_further_in_where_they_would_touch_something_beyond() -> None:
-    """One docks at 0.1001 m/s; in the reading in which it does not, it drifts on into others and a wall."""
-    plan = make_planner().solve(instance("map", {"num_robots": 40, "cell": 0.6}, 11), seed=11, max_iterations=1)
-    assert plan.solved
+    """It drifts by its goal as fast as it may dock; in the reading in which it does not, on into an obstacle."""
+    problem = Problem(
+        Team(("holonomic2d",)), [[-0.5, 0, 0.25, 0]], [[0, 0]], World(2, circles=[[0.6, 0, 0.1]]),
+        horizon=60, goal_speed=0.25 - SPEED_ALLOWANCE,
+    )  # fmt: skip
+    drifting = np.zeros((60, 1, 2), np.float32)
+    report = evaluated(problem, drifting).report
+    assert report is not None
+    assert {violation.kind for violation in report.violations} == {"not arrived", "obstacle contact"}
+    assert given(drifting).solve(problem, max_iterations=1).status == "solved"
 
 
 def test_a_plan_that_verify_refuses_says_why(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -701,7 +701,7 @@ def test_lifelong_bound_is_the_time_of_a_straight_drive(
 
 @pytest.mark.parametrize("last_speed", [np.inf, 0.1])
 @pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
-def test_no_drive_is_sooner_than_the_least_and_a_straight_one_is_as_soon(
+def test_a_straight_drive_is_as_soon_as_the_least(
     monkeypatch: pytest.MonkeyPatch, model: str, last_speed: float
 ) -> None:
     monkeypatch.syspath_prepend(ROOT)
