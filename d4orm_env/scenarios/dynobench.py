@@ -141,7 +141,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     distance = np.linalg.norm(goal[:, :d] - start[:, :d], axis=1)
     steps = math.ceil(SLOWEST * float((distance / team.max_speed).max()) / DT)
     return Problem(
-        team, start, goal[:, :d], _world(environment, team), DT, max(LEAST_STEPS, steps), margin=0.0,
+        team, start, goal[:, :d], _world(environment, team, goal[:, :d]), DT, max(LEAST_STEPS, steps), margin=0.0,
         goal_radius=GOAL_TOLERANCE, goal_speed=np.where(inertia, GOAL_TOLERANCE, np.inf), name=Path(path).stem,
         arrival="stay", goal_heading=np.where(turning, goal[:, min(2, team.state_size - 1)], np.nan),
         goal_heading_tolerance=GOAL_TOLERANCE,
@@ -230,9 +230,12 @@ def _footprint(own: Mapping[str, Any]) -> Footprint:
     return Train(footprint, [Box(*own["size_trailer"][:2])] * own["num_trailers"])
 
 
-def _world(environment: Mapping[str, Any], team: Team) -> World:
+def _world(environment: Mapping[str, Any], team: Team, goal: Floats) -> World:
     d, covered = team.dimension, min(footprint.inner_radius for footprint in team.footprint)
     lower, upper = (_numbers(environment[name], f"environment's {name}", d) for name in ("min", "max"))
+    # A robot whose goal lies on the bounds ends on either side of them; their checkers allow all of the tolerance there.
+    lower -= GOAL_TOLERANCE / 2 * (abs(goal - lower) < GOAL_TOLERANCE / 2).any(axis=0)
+    upper += GOAL_TOLERANCE / 2 * (abs(goal - upper) < GOAL_TOLERANCE / 2).any(axis=0)
     boxes, balls = [], []
     for number, obstacle in enumerate(environment.get("obstacles") or ()):
         centre = _numbers(obstacle["center"], f"center of obstacle {number}", d)

@@ -1,15 +1,17 @@
-"""Instances that others wrote: db-CBS's examples, as they are, planned by what `make_planner()` gives.
+"""Instances that others wrote: those of db-CBS and db-LaCAM, as they are, planned by what `make_planner()` gives.
 
     git clone https://github.com/IMRCLab/db-CBS
-    python -m examples.studies dynobench --folder db-CBS/example
+    git clone https://github.com/IMRCLab/db-lacam
+    python -m examples.studies dynobench --checkouts db-CBS db-lacam
 
-A row for each file: who solved it within a minute of planning, compilation not counted, and how long robots are under
-way; medians of the seeds that solved it.
-Files that `load_dynobench` refuses have the reason in their row.
+A row for each file, or for all that one generator drew of one size: how many runs solved them within a minute of
+planning, compilation not counted, how long that took, and how long robots are under way; medians of those that solved
+it. Files that `load_dynobench` refuses have the reason in their row of the trials.
 """
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -34,10 +36,17 @@ def loaded(path: Path) -> Problem | str:
         return str(error).removeprefix(f"{path}: ")
 
 
-def row_of(path: Path, seed: int) -> dict[str, Any]:
+def row_of(checkout: Path, path: Path, seed: int) -> dict[str, Any]:
     """The row of a file and a seed."""
     problem = loaded(path)
-    row: dict[str, Any] = {"instance": path.stem, "seed": seed, "robots": 0, "models": "", "refused": ""}
+    row: dict[str, Any] = {
+        "of": checkout.name,
+        "instance": path.stem,
+        "seed": seed,
+        "robots": 0,
+        "models": "",
+        "refused": "",
+    }
     row |= {"solved": False, "seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
     if isinstance(problem, str):
         return row | {"refused": problem}
@@ -52,27 +61,33 @@ def row_of(path: Path, seed: int) -> dict[str, Any]:
 def main() -> None:
     """Plan all instances and write the tables."""
     parser = study_parser(__doc__, seeds=5)
-    parser.add_argument("--folder", type=Path, help="folder with instances as YAML")
+    parser.add_argument("--checkouts", type=Path, nargs="+", default=(), help="checkouts with instances in example/")
     arguments = parser.parse_args()
-    paths = sorted(arguments.folder.glob("*.yaml")) if arguments.folder else []
+    paths = [(folder, path) for folder in arguments.checkouts for path in sorted((folder / "example").rglob("*.yaml"))]
     if not paths and arguments.trials is None:
-        parser.error("give --folder with instances, or --trials")
+        parser.error("give --checkouts with instances in example/, or --trials")
     rows = study_rows(
-        arguments, "dynobench", lambda: [row_of(path, seed) for path in paths for seed in range(arguments.seeds)]
+        arguments, "dynobench", lambda: [row_of(*found, seed) for found in paths for seed in range(arguments.seeds)]
     )
-    instances = grouped((row for row in rows if not row["refused"]), "instance")
-    save_table([described(own) for own in instances.values()], arguments.out / "dynobench.csv")
+    # Without the number of one that was drawn.
+    accepted = [row | {"kind": re.sub(r"(_n\d+)_\d+", r"\1", row["instance"])} for row in rows if not row["refused"]]
+    kinds = grouped(accepted, "of", "kind")
+    save_table([described(*kind, own) for kind, own in kinds.items()], arguments.out / "dynobench.csv")
 
 
-def described(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The table's row of an instance."""
+def described(of: str, kind: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The table's row of an instance, or of all of one size."""
     solved = [row for row in rows if row["solved"]]
 
     def median(column: str) -> str:
-        return f"{np.median([row[column] for row in solved]):.1f}" if solved else "-"
+        return f"{np.median([row[column] for row in solved]):.2f}" if solved else "-"
 
+    robots = sorted({row["robots"] for row in rows})
+    models = sorted({model for row in rows for model in row["models"].split(", ")})
     return {
-        "instance": rows[0]["instance"], "robots": rows[0]["robots"], "models": rows[0]["models"],
+        "of": of, "instances": kind, "files": len({row["instance"] for row in rows}),
+        "robots": " to ".join(map(str, robots[:: max(len(robots) - 1, 1)])), "models": ", ".join(models),
         "solved": f"{len(solved)} of {len(rows)}", "planning [s]": median("seconds"),
+        "longest [s]": f"{max(row['seconds'] for row in rows):.1f}",
         "makespan [s]": median("makespan"), "sum of costs [s]": median("sum_of_costs"),
     }  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from d4orm_env import load_dynobench, load_problem
+from d4orm_env import load_dynobench, load_problem, verify
 from d4orm_env.footprints import Box, Disc
 from d4orm_planners import make_planner
 
@@ -48,6 +48,16 @@ def test_an_instance_means_what_it_says(instance: Path) -> None:
     assert (problem.dt, problem.margin, problem.goal_radius) == (0.1, 0.0, 0.01)
     np.testing.assert_allclose(problem.team.max_acceleration[2], 2.0)
     np.testing.assert_allclose(problem.team.max_turn_rate[:2], 0.5)
+
+
+def test_a_robot_may_end_on_either_side_of_a_goal_on_the_bounds(instance: Path) -> None:
+    """No motion ends exactly there; the checkers let a state leave the bounds by 0.01."""
+    instance.write_text(INSTANCE.replace("goal: [4, 3, 0, 0]", "goal: [5, 3, 0, 0]"))
+    problem = load_dynobench(instance)
+    np.testing.assert_allclose(problem.world.bounds, [[-0.1, -0.1], [5.105, 4.1]], rtol=1e-6)
+    alone = problem.select([2])
+    plan = make_planner().solve(alone, seed=0, time_limit=60)
+    assert verify(alone, plan.controls).ok
 
 
 def test_a_solution_passes_a_check_of_their_kind(instance: Path, tmp_path: Path) -> None:
