@@ -29,10 +29,10 @@ NEARNESS = 10 / 3
 ONE_BY_ONE = (
     (1.6, False, 0.5),
     (1.6, True, 1.5),
-    (1.6, True, 1.5),
-    (4.0, True, 1.5),
-    (4.0, True, 1.5),
     (3.0, True, 1.5),
+    (1.6, True, 1.5),
+    (3.0, True, 1.5),
+    (4.0, True, 1.5),
 )
 """Searches for paths one by one: fineness of the roadmap, whether turns on the spot are counted, and paths per robot
 after which the next one is tried if no fewer wait for theirs. They differ by chance too: another one often succeeds."""

@@ -10,7 +10,6 @@ from typing import TypeAlias
 import numpy as np
 from numba import types
 
-from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
@@ -24,7 +23,7 @@ from d4orm_planners.mapf.replanning import find_path
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.mapf.safe_intervals import Reservations, make_reservations
 from d4orm_planners.mapf.straightening import straighten
-from d4orm_planners.mapf.trips import Trip
+from d4orm_planners.mapf.trips import Trip, turn_on_the_spot
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
@@ -43,6 +42,8 @@ BOUND_FACTOR, BOUND_EXTRA = 1.5, 60
 """Bounds of the first search for a path: so many times as long as alone, and so many steps more."""
 FAR = 1e9
 """Position of robots that are not there yet [m]."""
+MINDED = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
+"""Shares of the others that a robot without a path minds in turn, at random: the fewer it displaces, the better."""
 HOPELESS = 4
 """Paths that robots do not find even alone after which patience is over."""
 LATER = 30
@@ -183,7 +184,7 @@ class Replanning:
         while waiting and idle < patience and not should_stop():
             fewest, idle = min(fewest, len(waiting)), 0 if len(waiting) < fewest else idle + 1
             robot = int(waiting.pop())
-            for hard in (1.0, 0.5, 0.0):
+            for hard in MINDED:
                 minded = ~settled | (random.random(num_robots) < hard)
                 if self.replan_one(driven, occupancy, robot, steps, random, minded):
                     break
@@ -228,6 +229,7 @@ class Replanning:
         reservations = make_reservations(self.roadmap, self.bodies, others, robot, latest, self.dwell is None)
         close, usual = None, min(TOUCH * self.size, float(self.own_room[robot] - self.bodies.safety_distance[robot]))
         for cruise, cut in SPEED_PROFILES:
+            drive = None
             for drive in self.drives(reservations, robot, latest, cruise * haste, cut):
                 room = self.room_at_walls(others, robot, drive, latest)
                 if room > usual:
@@ -235,6 +237,8 @@ class Replanning:
                     return True
                 if close is None and room > self.problem.rounding:
                     close = drive
+            if drive is None:  # no path, and none for a slower robot
+                break
         if close is not None:
             self.take(driven, occupancy, robot, close)
         return close is not None
@@ -280,15 +284,6 @@ class Replanning:
             return np.inf
         room = self.problem.world.clearance(positions[1 : arrival + 1, : self.problem.dimension])
         return float(room.min() - self.bodies.safety_distance[robot])
-
-
-def turn_on_the_spot(problem: Problem, robot: int) -> tuple[float, tuple[float, float]]:
-    """Steps in which a robot turns by a radian, zero if it need not or cannot, and where it faces at its start."""
-    model = problem.team.robot_models[robot]
-    if model.heading_index is None or not model.turns_in_place or model.dimension != 2:
-        return 0.0, (1.0, 0.0)
-    sine, cosine = portable.sin_cos_of(float(problem.start[robot, model.heading_index]))
-    return 1 / (problem.dt * model.turn_rate(problem.team.limits[robot])), (float(cosine), float(sine))
 
 
 def is_compiled(problem: Problem) -> bool:

@@ -6,7 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import Floats, Whole
+from d4orm_env.core.problem import Problem
 from d4orm_env.engine.compiling import compiled
 from d4orm_planners.tracking.pursuit import FACING
 
@@ -53,3 +55,12 @@ def steps_to_turn(nodes: Floats, trip: Trip, before: Whole, node: Whole, head: W
     chord = np.sqrt(2.0 - 2.0 * (x * from_x + y * from_y) / lengths)
     braking = trip.launch if before >= 0 else np.int64(0)
     return np.int64(trip.turn * (chord * (1.0 + chord * chord / 7.0) - TURNED_IN_DRIVING) + 0.5) + braking
+
+
+def turn_on_the_spot(problem: Problem, robot: int) -> tuple[float, tuple[float, float]]:
+    """Steps in which a robot turns by a radian, zero if it need not or cannot, and where it faces at its start."""
+    model = problem.team.robot_models[robot]
+    if model.heading_index is None or not model.turns_in_place or model.dimension != 2:
+        return 0.0, (1.0, 0.0)
+    sine, cosine = portable.sin_cos_of(float(problem.start[robot, model.heading_index]))
+    return 1 / (problem.dt * model.turn_rate(problem.team.limits[robot])), (float(cosine), float(sine))

@@ -333,6 +333,14 @@ def test_a_crowd_of_robots_that_turn_on_the_spot_is_planned() -> None:
     assert verify(problem, plan.controls).ok
 
 
+@pytest.mark.slow
+def test_a_crowd_of_boxes_is_planned_one_by_one() -> None:
+    """Not where a robot that minds all others in vain goes on to mind half of them: it displaces too many."""
+    problem = make_problem("warehouse", num_robots=100, seed=1, footprint=Box(0.36, 0.24))
+    replanning = Replanning(problem, lay_roadmap(problem, 3.0), counts_turns=True)
+    assert replanning.one_by_one(np.random.default_rng(1), lambda: False, 200) is not None
+
+
 def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
     problem = make_problem("rooms", num_robots=8, seed=0)
     roadmap, moves = found(problem, 1.25)
