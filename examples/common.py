@@ -136,10 +136,16 @@ def steps_spent(trial: Trial) -> int | None:
     return None if steps is None or not trial.iterations else trial.iterations * steps
 
 
-def penalised_steps(trial: Trial) -> int:
-    """:func:`steps_to_solution`, and twice all the steps that there were where it found none (PAR-2)."""
+def penalised_steps(trial: Trial, factor: int = 2) -> int:
+    """:func:`steps_to_solution`, and so many times all the steps that there were where it found none (PAR-2)."""
     steps, config = steps_to_solution(trial), json.loads(trial.config)
-    return 2 * (_iteration_steps(config) or 0) * int(config["max_iterations"]) if steps is None else steps
+    return factor * (_iteration_steps(config) or 0) * int(config["max_iterations"]) if steps is None else steps
+
+
+def step_columns(trials: Sequence[Trial]) -> dict[str, int]:
+    """Mean denoising steps, where a trial without a solution counts twice its budget (PAR-2) or once (restricted)."""
+    means = [round(float(np.mean([penalised_steps(trial, factor) for trial in trials]))) for factor in (2, 1)]
+    return {"steps": means[0], "restricted": means[1]}
 
 
 def _iteration_steps(config: Mapping[str, Any]) -> int | None:
@@ -155,6 +161,17 @@ def holm(p_values: Sequence[float]) -> list[float]:
     corrected = np.empty(len(p_values))
     corrected[order] = np.minimum(np.maximum.accumulate(np.asarray(p_values, float)[order] * left), 1)
     return [float(value) for value in corrected]
+
+
+def _with_corrected_tests(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows whose p values, numbers or ``None`` in columns that "p" begins, are corrected for how many there are."""
+    tests = [(number, name) for number, row in enumerate(rows) for name in row if name.partition(" ")[0] == "p"]
+    values = [rows[number][name] for number, name in tests]
+    corrected = iter(holm([value for value in values if value is not None]))
+    found = {
+        place: "-" if value is None else f"{next(corrected):.2g}" for place, value in zip(tests, values, strict=True)
+    }
+    return [{name: found.get((number, name), value) for name, value in row.items()} for number, row in enumerate(rows)]
 
 
 def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:
@@ -188,18 +205,16 @@ def mean_text(values: Sequence[float], form: str = ".2f", none: str = "-") -> st
 def first_solutions(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
     """A row for each label of ``groups``, in ``column``: success, denoising steps, travel time, and tests.
 
-    Tests are against the label ``reference``: McNemar on solutions, Wilcoxon on steps, paired by seed. A trial without
-    a solution counts twice its budget of steps (PAR-2).
+    Tests are against the label ``reference``: McNemar on solutions, Wilcoxon on steps (PAR-2), paired by seed.
     """
     rows = []
     for label, trials in groups.items():
         travel = [trial.travel_time for trial in trials if is_solved(trial) and trial.travel_time is not None]
-        test = paired(trials, groups[reference], penalised_steps, is_solved)
+        test = None if label == reference else paired(trials, groups[reference], penalised_steps, is_solved)
         rows.append(
-            {"team": team, column: label, **solved_columns(trials),
-             "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
+            {"team": team, column: label, **solved_columns(trials), **step_columns(trials),
              "travel time [s]": mean_text(travel),
-             "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
+             "p (solved)": test and test.success_p, "p (steps)": test and test.cost_p}
         )  # fmt: skip
     return rows
 
@@ -280,7 +295,11 @@ def save_gif(frames: Sequence[Any], path: Path, interval: float) -> None:
 
 
 def save_table(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write rows of equal keys to ``path`` (``.csv``) and beside it as Markdown, and print the latter."""
+    """Write rows of equal keys to ``path`` (``.csv``) and beside it as Markdown, and print the latter.
+
+    P values are corrected for the number of tests in the table (Holm).
+    """
+    rows = _with_corrected_tests(rows)
     path.parent.mkdir(parents=True, exist_ok=True)
     names = list(rows[0])
     markdown = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]

@@ -101,9 +101,9 @@ def rows_of(cells: Cells) -> list[dict[str, Any]]:
             rows.append(
                 {"disturbance": disturbance, "scenario": scenario, "left out": label, "trials": len(pairs),
                  "with": successes([other for _, other in pairs]), "without": successes([one for one, _ in pairs]),
-                 "p (succeeded)": f"{test.success_p:.2g}",
+                 "p (succeeded)": test.success_p,
                  "travel time without [s]": mean_text(longer, "+.2f"),
-                 "p (travel time)": f"{cost.cost_p:.2g}" if cost else "-"}
+                 "p (travel time)": cost and cost.cost_p}
             )  # fmt: skip
     return rows
 

@@ -26,6 +26,7 @@ from examples.common import (
     save_figure,
     save_table,
     solved_columns,
+    step_columns,
     steps_to_solution,
     study_trials,
     trials_parser,
@@ -93,11 +94,11 @@ def rows_of(team: str, cells: Cells) -> list[dict[str, Any]]:
     rows = []
     for update, credit in product(UPDATES, CREDITS):
         trials = cells[update, credit]
-        test = paired(trials, cells[REFERENCE, credit], penalised_steps, is_solved)
+        reference = None if update == REFERENCE else cells[REFERENCE, credit]
+        test = reference and paired(trials, reference, penalised_steps, is_solved)
         rows.append(
-            {"team": team, "update": update, "credit": credit, **solved_columns(trials),
-             "steps": round(float(np.mean([*map(penalised_steps, trials)]))),
-             "p (solved)": f"{test.success_p:.2g}", "p (steps)": f"{test.cost_p:.2g}"}
+            {"team": team, "update": update, "credit": credit, **solved_columns(trials), **step_columns(trials),
+             "p (solved)": test and test.success_p, "p (steps)": test and test.cost_p}
         )  # fmt: skip
     return rows
 

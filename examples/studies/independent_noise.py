@@ -67,7 +67,7 @@ def summary(rows: Rows) -> Rows:
         for draw, values in rewards.items():
             mean, lower, upper = mean_interval(values)
             shown[f"reward, {draw}"] = f"{mean:.3f}" + (f" ({lower:.3f} to {upper:.3f})" if lower is not None else "")
-        table.append(shown | {"p": f"{mannwhitneyu(rewards['turned'], rewards['apart']).pvalue:.2g}"})
+        table.append(shown | {"p": mannwhitneyu(rewards["turned"], rewards["apart"]).pvalue})
     return table
 
 

@@ -21,6 +21,8 @@ from types import ModuleType
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from examples.common import save_table
+from examples.studies.settings_studies import irregular_circle
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -242,7 +244,7 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
     completed("credit_by_update", out)
     rows = table(out / "credit_by_update.csv")
     assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 25
-    assert all(row["p (steps)"] == "1" for row in rows if row["update"] == "d4orm")
+    assert all((row["p (steps)"] == "-") == (row["update"] == "d4orm") for row in rows)
     assert (out / "credit_by_update.png").read_bytes().startswith(PNG)
     for option in ("--trials", "--go-on-from"):
         again = tmp_path / option
@@ -278,6 +280,24 @@ def test_turned_samples_are_compared_with_others(tmp_path: Path) -> None:
     (row,) = table(tmp_path / "out" / "independent_noise.csv")
     assert (row["robots"], row["samples"], row["p"]) == ("2", "64", "1")
     assert row["reward, turned"] != row["reward, apart"]
+
+
+def test_irregular_circles_differ_from_seed_to_seed(tmp_path: Path) -> None:
+    completed("irregular_circles", tmp_path / "out")
+    rows = table(tmp_path / "out" / "irregular_circles.csv")
+    assert [(row["team"], row["planner"]) for row in rows] == [("2 robots", name) for name in ("d4orm", "mppi", "cem")]
+    assert (rows[0]["solved"], rows[0]["steps"], rows[0]["p (steps)"]) == ("1 of 1", "20", "-")
+    assert int(rows[2]["steps"]) == 2 * int(rows[2]["restricted"]), "one without a solution counts twice its budget"
+    positions = [irregular_circle(seed, 6).start[:, :2] for seed in (0, 0, 1)]
+    assert (positions[0] == positions[1]).all()
+    assert (positions[0] != positions[2]).all()
+    assert np.linalg.norm(positions[0], axis=1) == pytest.approx(2.5, abs=0.15)
+
+
+def test_p_values_are_corrected_for_their_number_in_the_table(tmp_path: Path) -> None:
+    rows = [{"a": 1, "p (x)": 0.01, "p (y)": 0.04}, {"a": 2, "p (x)": None, "p (y)": 0.02}]
+    save_table(rows, tmp_path / "rows.csv")
+    assert [(row["p (x)"], row["p (y)"]) for row in table(tmp_path / "rows.csv")] == [("0.03", "0.04"), ("-", "0.04")]
 
 
 def test_jerk_is_smaller_where_it_is_limited(tmp_path: Path) -> None:
