@@ -25,8 +25,8 @@ CONTACT, CONTACT_GROWTH = 1.25, 2.0
 DEDUP_DISTANCE = 1.0
 """Least distance between paths that are kept, in radii of the largest robot; or in speed, twice as much [1/s]."""
 EARLIER = (2, 5)
-"""Least and largest number of blocks before a robot's first fault at which its new path begins; the largest doubles
-with each sweep."""
+"""Least and largest number of blocks before a robot's first fault, or before it docks, at which its new path begins; the
+largest doubles with each sweep."""
 ANGLES, SWING = np.array([30.0, 60.0, 90.0, 135.0, 180.0]), 14.0
 """Angles between a robot's heading and the direction of its goal, in space up and down as well, and their largest
 common change from sweep to sweep [degrees]."""
@@ -65,7 +65,7 @@ def reroute(team: WorkingPlan) -> None:
             faults, begin = team.faults(robots)
             least, most = EARLIER
             earlier = random.integers(least, most << sweep, len(robots), endpoint=True)
-            blocks = np.maximum((begin - 1) // BLOCK - earlier, 0)
+            blocks = np.maximum((np.minimum(begin, _docked(team, robots)) - 1) // BLOCK - earlier, 0)
             robots, blocks = robots[faults > 0], blocks[faults > 0]
             if len(robots):
                 paths = find_paths(team, robots, blocks, primitives, rules)
@@ -78,6 +78,15 @@ def reroute(team: WorkingPlan) -> None:
     for pair in components(team.conflicts()):
         if len(pair) == 2 and not team.search.should_stop():
             _reroute_pair(team, np.array(pair), primitives, rules)
+
+
+def _docked(team: WorkingPlan, robots: IntArray) -> IntArray:
+    """``(R,)`` steps from which on robots stay where they are for good; beyond the last where goals let them go on."""
+    if not team.problem.docks:
+        return np.full(len(robots), team.problem.horizon + 1)
+    moves = (np.diff(team.positions[:, robots], axis=0) != 0).any(axis=2)
+    steps: IntArray = len(moves) - moves[::-1].argmax(axis=0)
+    return steps
 
 
 def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitives, rules: BeamRules) -> None:

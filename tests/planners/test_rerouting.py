@@ -78,6 +78,19 @@ def test_who_cannot_pass_waits() -> None:
     assert team.faults([0, 1])[0].tolist() == [0, 0]
 
 
+@pytest.mark.parametrize("seed", [4, 8])
+def test_those_that_have_docked_for_long_dock_otherwise(seed: int) -> None:
+    """From where they rest they go nowhere any more, and there they leave the last one no room at its goal."""
+    start = [[0, -2, 0, 0], [0, 2.72, 0, 0], [24, 0.36, 0, 0]]
+    problem = Problem(Team(("holonomic2d",) * 3), start, [[0, 0], [0, 0.72], [0, 0.36]], horizon=384)
+    straight = straight_drives(problem).positions[:, :, 0]
+    assert (straight[60:, :2] == straight[60, :2]).all()
+    assert np.linalg.norm(straight[60, 1] - straight[60, 0]) < 0.65, "the last one needs 0.7 m"
+    team = rerouted(problem, seed)
+    assert_executed(team)
+    assert team.faults([0, 1, 2])[0].tolist() == [0, 0, 0]
+
+
 def test_two_that_face_each_other_make_way_together() -> None:
     """Robots 0 and 1 start 4 mm apart: nothing that one of them does helps while the other comes on at once."""
     problem = make_problem("random", num_robots=16, model="differential_drive", seed=4)
