@@ -25,7 +25,7 @@ CONTACT, CONTACT_GROWTH = 1.25, 2.0
 DEDUP_DISTANCE = 1.0
 """Least distance between paths that are kept, in radii of the largest robot; or in speed, twice as much [1/s]."""
 EARLIER = (2, 5)
-"""Least and largest number of blocks before a robot's first fault, or before it docks, at which its new path begins; the
+"""Least and largest number of blocks before a robot's first fault, or its docking, at which its new path begins; the
 largest doubles with each sweep."""
 ANGLES, SWING = np.array([30.0, 60.0, 90.0, 135.0, 180.0]), 14.0
 """Angles between a robot's heading and the direction of its goal, in space up and down as well, and their largest
