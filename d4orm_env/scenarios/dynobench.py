@@ -233,7 +233,7 @@ def _footprint(own: Mapping[str, Any]) -> Footprint:
 def _world(environment: Mapping[str, Any], team: Team, goal: Floats) -> World:
     d, covered = team.dimension, min(footprint.inner_radius for footprint in team.footprint)
     lower, upper = (_numbers(environment[name], f"environment's {name}", d) for name in ("min", "max"))
-    # A robot whose goal lies on the bounds ends on either side of them; their checkers allow all of the tolerance there.
+    # A robot whose goal lies on the bounds ends on either side of them; their checkers allow the whole tolerance there.
     lower -= GOAL_TOLERANCE / 2 * (abs(goal - lower) < GOAL_TOLERANCE / 2).any(axis=0)
     upper += GOAL_TOLERANCE / 2 * (abs(goal - upper) < GOAL_TOLERANCE / 2).any(axis=0)
     boxes, balls = [], []
