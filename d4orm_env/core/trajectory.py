@@ -91,6 +91,12 @@ def arrival_steps(arrived: BoolArray) -> NDArray[np.intp]:
     return np.where(arrived.all(axis=0), 0, np.minimum(last_away, len(arrived) - 1))
 
 
+def resting_steps(positions: FloatArray) -> NDArray[np.intp]:
+    """``(K,)`` step of positions ``(H+1, K, d)`` from which on a robot does not move."""
+    still = (positions[1:] == positions[:-1]).all(axis=2)
+    return arrival_steps(np.concatenate([still, np.ones_like(still[:1])]))
+
+
 def arrival_times(arrived: BoolArray, dt: float) -> NDArray[np.float64]:
     """``(K,)`` time from which on each robot is at its goal [s], of ``arrived`` ``(H+1, K)``; infinite without one."""
     return np.where(arrived[-1], arrival_steps(arrived) * dt, np.inf)

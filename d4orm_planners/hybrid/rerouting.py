@@ -7,6 +7,7 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
+from d4orm_env.core.trajectory import resting_steps
 from d4orm_planners.base.conflict_groups import components
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
@@ -65,7 +66,7 @@ def reroute(team: WorkingPlan) -> None:
             faults, begin = team.faults(robots)
             least, most = EARLIER
             earlier = random.integers(least, most << sweep, len(robots), endpoint=True)
-            blocks = np.maximum((np.minimum(begin, _docked(team, robots)) - 1) // BLOCK - earlier, 0)
+            blocks = np.maximum((np.minimum(begin, _docking_steps(team, robots)) - 1) // BLOCK - earlier, 0)
             robots, blocks = robots[faults > 0], blocks[faults > 0]
             if len(robots):
                 paths = find_paths(team, robots, blocks, primitives, rules)
@@ -80,13 +81,10 @@ def reroute(team: WorkingPlan) -> None:
             _reroute_pair(team, np.array(pair), primitives, rules)
 
 
-def _docked(team: WorkingPlan, robots: IntArray) -> IntArray:
-    """``(R,)`` steps from which on robots stay where they are for good; beyond the last where goals let them go on."""
-    if not team.problem.docks:
-        return np.full(len(robots), team.problem.horizon + 1)
-    moves = (np.diff(team.positions[:, robots], axis=0) != 0).any(axis=2)
-    steps: IntArray = len(moves) - moves[::-1].argmax(axis=0)
-    return steps
+def _docking_steps(team: WorkingPlan, robots: IntArray) -> IntArray:
+    """``(R,)`` steps from which on robots are held at their goals; beyond the last for those that may set out again."""
+    held = team.arrived[robots] & team.problem.docks
+    return np.where(held, resting_steps(team.positions[:, robots]), team.problem.horizon + 1)
 
 
 def _reroute_pair(team: WorkingPlan, pair: IntArray, primitives: MotionPrimitives, rules: BeamRules) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.portable import log
 from d4orm_env.core.seeds import Stream
-from d4orm_env.core.trajectory import Trajectory, arrival_steps
+from d4orm_env.core.trajectory import Trajectory, resting_steps
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
@@ -141,11 +141,9 @@ class _Motions:
 
     def costs(self, robots: IntArray, positions: FloatArray) -> tuple[Floats, Floats]:
         """``(R,)`` arrival times of robots at positions ``(H+1, R, d)``, and their distances left over time [s]."""
-        still = (positions[1:] == positions[:-1]).all(axis=2)
         gap = np.linalg.norm(positions[1:] - self.problem.goal[robots], axis=2).sum(axis=0, dtype=np.float64)
         lag: Floats = self.problem.dt * gap / np.maximum(self.distance[robots], self.problem.goal_radius)
-        # Who does not move from one step to the next has arrived by the first of the two.
-        return self.problem.dt * arrival_steps(np.concatenate([still, np.ones_like(still[:1])])).astype(float), lag
+        return self.problem.dt * resting_steps(positions).astype(float), lag
 
     def odds(self, random: np.random.Generator) -> Odds:
         """See :meth:`LowLevelPlanner.odds`."""

@@ -237,7 +237,7 @@ class Replanning:
                     return True
                 if close is None and room > self.problem.rounding:
                     close = drive
-            if drive is None:  # no path, and none for a slower robot
+            if drive is None:  # no path, and hardly one for a slower robot
                 break
         if close is not None:
             self.take(driven, occupancy, robot, close)

@@ -39,15 +39,9 @@ def loaded(path: Path) -> Problem | str:
 def row_of(checkout: Path, path: Path, seed: int) -> dict[str, Any]:
     """The row of a file and a seed."""
     problem = loaded(path)
-    row: dict[str, Any] = {
-        "of": checkout.name,
-        "instance": path.stem,
-        "seed": seed,
-        "robots": 0,
-        "models": "",
-        "refused": "",
-    }
-    row |= {"solved": False, "seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
+    row: dict[str, Any] = {"benchmark": checkout.name, "instance": path.stem, "seed": seed, "refused": ""}
+    row |= {"robots": 0, "models": "", "solved": False}
+    row |= {"seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
     if isinstance(problem, str):
         return row | {"refused": problem}
     row |= {"robots": problem.num_robots, "models": ", ".join(sorted(set(problem.team.models)))}
@@ -71,11 +65,11 @@ def main() -> None:
     )
     # Without the number of one that was drawn.
     accepted = [row | {"kind": re.sub(r"(_n\d+)_\d+", r"\1", row["instance"])} for row in rows if not row["refused"]]
-    kinds = grouped(accepted, "of", "kind")
+    kinds = grouped(accepted, "benchmark", "kind")
     save_table([described(*kind, own) for kind, own in kinds.items()], arguments.out / "dynobench.csv")
 
 
-def described(of: str, kind: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def described(benchmark: str, kind: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The table's row of an instance, or of all of one size."""
     solved = [row for row in rows if row["solved"]]
 
@@ -85,7 +79,7 @@ def described(of: str, kind: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     robots = sorted({row["robots"] for row in rows})
     models = sorted({model for row in rows for model in row["models"].split(", ")})
     return {
-        "of": of, "instances": kind, "files": len({row["instance"] for row in rows}),
+        "benchmark": benchmark, "instances": kind, "files": len({row["instance"] for row in rows}),
         "robots": " to ".join(map(str, robots[:: max(len(robots) - 1, 1)])), "models": ", ".join(models),
         "solved": f"{len(solved)} of {len(rows)}", "planning [s]": median("seconds"),
         "longest [s]": f"{max(row['seconds'] for row in rows):.1f}",
