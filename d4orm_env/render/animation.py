@@ -141,9 +141,7 @@ def _write_gif(path: Path, frames: _Frames, fps: float) -> None:
     # GIF counts in hundredths of a second, so the times are rounded, not the durations: they must not drift.
     times = np.round(100 * np.arange(len(frames)) / fps).astype(int)
     durations = [10 * int(d) for d in np.diff(times)] + [int(1000 * _LAST_FRAME)]
-    next(images).save(
-        path, format="GIF", save_all=True, append_images=images, duration=durations, loop=0, optimize=False, disposal=1
-    )
+    next(images).save(path, format="GIF", save_all=True, append_images=images, duration=durations, loop=0, disposal=1)
 
 
 def _write_mp4(path: Path, frames: _Frames, fps: float) -> None:
