@@ -1,9 +1,10 @@
-"""Cars with one to three trailers: ``x = [px, py, heading, hitch_1, ...]``, ``u = [speed, steering]``, at once.
+"""Cars with up to three trailers: ``x = [px, py, heading, hitch_1, ...]``, ``u = [speed, steering]``, at once.
 
-The position is the middle of the rear axle, where the first trailer is hitched; each further one is hitched to the axle
-of the one before it. A hitch angle is what a trailer's heading lags behind that of the body before it, and a trailer
-turns at ``speed sin(hitch) / length``, with the speed of the axle before it. Source: S. M. LaValle, *Planning
-Algorithms*, section 13.1.2.4. At its largest hitch angle a trailer is dragged along.
+One without trailers is ``car_first_order``. The position is the middle of the rear axle, where the first trailer is
+hitched; each further one is hitched to the axle of the one before it. A hitch angle is what a trailer's heading lags
+behind that of the body before it, and a trailer turns at ``speed sin(hitch) / length``, with the speed of the axle
+before it. Source: S. M. LaValle, *Planning Algorithms*, section 13.1.2.4. At its largest hitch angle a trailer is
+dragged along.
 """
 
 from __future__ import annotations
@@ -26,6 +27,11 @@ from d4orm_env.dynamics.robot_model import (
 
 MAX_STEERING, MAX_REVERSE_SPEED, WHEELBASE, HITCH_1, HITCH_2, HITCH_3 = (OWN_LIMITS + i for i in (0, 1, 2, 3, 5, 7))
 """Of a hitch the largest angle, in the next column its length."""
+
+
+def _derivative_0(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
+    turn_rate = u[0] * ops.sin(u[1]) / (ops.cos(u[1]) * limits[WHEELBASE])
+    return (u[0] * ops.cos(x[2]), u[0] * ops.sin(x[2]), turn_rate)
 
 
 def _derivative_1(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
@@ -53,6 +59,10 @@ def _derivative_3(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
 def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
     reverse = ops.minimum(limits[MAX_REVERSE_SPEED], limits[SPEED])
     return (between(u[0], -reverse, limits[SPEED], ops), clip(u[1], limits[MAX_STEERING], ops))
+
+
+def _limit_state_0(x: Vector, limits: Vector, ops: Ops) -> Vector:
+    return x
 
 
 def _limit_state_1(x: Vector, limits: Vector, ops: Ops) -> Vector:
@@ -89,7 +99,7 @@ def _hitch_limits(number: int) -> tuple[Limit, Limit]:
 def _car(derivative: Callable[..., Vector], limit_state: Callable[..., Vector], count: int) -> Model:
     numbers, columns = range(1, count + 1), (HITCH_1, HITCH_2, HITCH_3)[:count]
     return Model(
-        name=f"car_with_{count}_trailer" + "s" * (count > 1),
+        name=f"car_with_{count}_trailer" + "s" * (count > 1) if count else "car_first_order",
         dimension=2,
         state_names=("px", "py", "heading", *(f"hitch_{number}" for number in numbers)),
         control_names=("speed", "steering"),
@@ -111,9 +121,10 @@ def _car(derivative: Callable[..., Vector], limit_state: Callable[..., Vector], 
     )
 
 
-CARS_WITH_TRAILERS = (
+FIRST_ORDER_CARS = (
     _car(_derivative_1, _limit_state_1, 1),
     _car(_derivative_2, _limit_state_2, 2),
     _car(_derivative_3, _limit_state_3, 3),
+    _car(_derivative_0, _limit_state_0, 0),
 )
-"""With one, two and three."""
+"""With one, two and three trailers, and with none."""

@@ -14,7 +14,7 @@ from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
-from d4orm_env.dynamics.car_with_trailers import CARS_WITH_TRAILERS
+from d4orm_env.dynamics.car_with_trailers import FIRST_ORDER_CARS
 from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
 from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
@@ -30,7 +30,7 @@ from d4orm_env.dynamics.velocity2d import VELOCITY2D
 
 _BUILT_IN = (
     HOLONOMIC2D, HOLONOMIC3D, VELOCITY2D, DIFFERENTIAL_DRIVE, UNICYCLE, CAR, UNICYCLE1, UNICYCLE2, HOLONOMIC2D_JERK,
-    HOLONOMIC3D_DRAG, *CARS_WITH_TRAILERS,
+    HOLONOMIC3D_DRAG, *FIRST_ORDER_CARS,
 )  # fmt: skip
 
 MODEL_CODES: dict[str, int] = {model.name: code for code, model in enumerate(_BUILT_IN)}

@@ -130,7 +130,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     start, goal = np.zeros((2, team.num_robots, team.state_size))
     for robot, (entry, model) in enumerate(zip(robots, team.robot_models, strict=True)):
         for what, states in (("start", start), ("goal", goal)):
-            state = _numbers(entry[what], f"{what} of robot_{robot}")
+            state = numbers(entry[what], f"{what} of robot_{robot}")
             if len(state) != model.state_size:
                 given, kind = short_repr(entry[what]), entry["type"]
                 raise ValueError(f"{what} of robot_{robot} is {given}; a {kind} has {model.state_size} components")
@@ -207,7 +207,7 @@ def _state(model: Model, theirs: Floats) -> Floats:
     return np.append(theirs[:3], _wrapped(theirs[2:-1] - theirs[3:])) if model.trailers else theirs
 
 
-def _numbers(given: object, name: str, count: int | None = None) -> Floats:
+def numbers(given: object, name: str, count: int | None = None) -> Floats:
     """A list of numbers in a file, or one number; the first ``count`` of them, where so many are wanted."""
     try:
         numbers = np.atleast_1d(np.array(given, np.float64))
@@ -232,14 +232,14 @@ def _footprint(own: Mapping[str, Any]) -> Footprint:
 
 def _world(environment: Mapping[str, Any], team: Team, goal: Floats) -> World:
     d, covered = team.dimension, min(footprint.inner_radius for footprint in team.footprint)
-    lower, upper = (_numbers(environment[name], f"environment's {name}", d) for name in ("min", "max"))
+    lower, upper = (numbers(environment[name], f"environment's {name}", d) for name in ("min", "max"))
     # A robot whose goal lies on the bounds ends on either side of them; their checkers allow the whole tolerance there.
     lower -= GOAL_TOLERANCE / 2 * (abs(goal - lower) < GOAL_TOLERANCE / 2).any(axis=0)
     upper += GOAL_TOLERANCE / 2 * (abs(goal - upper) < GOAL_TOLERANCE / 2).any(axis=0)
     boxes, balls = [], []
     for number, obstacle in enumerate(environment.get("obstacles") or ()):
-        centre = _numbers(obstacle["center"], f"center of obstacle {number}", d)
-        size = _numbers(obstacle["size"], f"size of obstacle {number}", 1 if obstacle["type"] == "sphere" else d)
+        centre = numbers(obstacle["center"], f"center of obstacle {number}", d)
+        size = numbers(obstacle["size"], f"size of obstacle {number}", 1 if obstacle["type"] == "sphere" else d)
         if obstacle["type"] == "sphere":
             balls.append([*centre, *size])
             continue

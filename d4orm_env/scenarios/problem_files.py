@@ -17,6 +17,7 @@ from d4orm_env.core.files import naming, read_yaml, replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.footprints import Disc
+from d4orm_env.scenarios.cl_mapf import load_cl_mapf
 from d4orm_env.scenarios.dynobench import load_dynobench
 from d4orm_env.scenarios.schema import VERSION, parse, start_fields
 from d4orm_env.scenarios.settings import described
@@ -28,7 +29,8 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     Args:
         path: A YAML file of at most 10 MB, 10,000 robots and 5 * 10^7 robots times steps, in the explicit form (every
             robot listed) or the short form (a scenario and its arguments); or an instance of dynobench or db-CBS, see
-            :func:`~d4orm_env.scenarios.dynobench.load_dynobench`.
+            :func:`~d4orm_env.scenarios.dynobench.load_dynobench`, or of CL-CBS or CSDO, see
+            :func:`~d4orm_env.scenarios.cl_mapf.load_cl_mapf`.
 
     Warns:
         UserWarning: If it is proved that nothing solves the problem, with the robots and why.
@@ -41,9 +43,14 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
         raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
     with naming(path):
         content = read_yaml(path)
-        is_dynobench = isinstance(content, dict) and "environment" in content
-        problem = None if is_dynobench else parse(content)
-    problem = load_dynobench(path) if problem is None else problem
+    keys = set(content) if isinstance(content, dict) else set()
+    if "environment" in keys:
+        problem = load_dynobench(path)
+    elif {"agents", "map"} <= keys:
+        problem = load_cl_mapf(path)
+    else:
+        with naming(path):
+            problem = parse(content)
     proofs = [f"robot_{robot} {proof}" for robot, proof in prove_infeasible(problem).items()]
     if proofs:
         more = f", and {len(proofs) - 1} more" if len(proofs) > 1 else ""

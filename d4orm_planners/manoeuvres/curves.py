@@ -1,6 +1,6 @@
-"""The last stretch of a car with trailers: a curve, a straight and another curve, exactly to its goal.
+"""The last stretch of a first-order car: a curve, a straight and another curve, exactly to its goal.
 
-As L. E. Dubins' paths (1957), but a circle begins and ends with a swing of the trailers, worked out beforehand. Since a
+As L. E. Dubins' paths (1957), but with trailers a circle begins and ends with a swing, worked out beforehand. Since a
 swing leads as far wherever it begins, the centres of both circles are known, and with them the straight between. Where
 there is no room for trailers in line at the goal, the last swing is left out: they stay in a bend.
 """
@@ -17,7 +17,7 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
 from d4orm_env.engine.elementary import arctan2, cosine, sine
-from d4orm_planners.manoeuvres.kinds import Kind, held
+from d4orm_planners.manoeuvres.kinds import Kind, Mode, held
 from d4orm_planners.manoeuvres.lattice import TURN, moved, turned_by, write_pose
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, drive
 from d4orm_planners.manoeuvres.snapping import Goal
@@ -31,8 +31,8 @@ CIRCLES = len(LEVELS) * len(SIDES)
 
 
 class Curves(NamedTuple):
-    """Circles that trailers follow: forwards to the left and to the right by levels, then in reverse; and once more
-    without the swings out of them, if curves end in a bend. ``W`` in all.
+    """Circles of a car with its trailers: forwards to the left and to the right by levels, then in reverse; and once
+    more without the swings out of them, if curves end in a bend. ``W`` in all.
 
     Attributes:
         last: Number of the first one that may be a curve's last.
@@ -72,12 +72,12 @@ NO_CURVES = Curves(
     np.zeros((0, 2)),
     *np.zeros((4, 0)),
 )
-"""Of robots without trailers."""
+"""Of all other robots."""
 
 
 @cache
 def curves_of(kind: Kind, bent: bool) -> Curves:
-    """Circles of a car with trailers, and the swings between them and straight on; ``bent`` if curves end in a bend."""
+    """Circles of a first-order car, and the swings between them and straight on; ``bent`` if curves end in a bend."""
     swings, rows, straight, tightest = [], [], (0.0,) * len(kind.model.trailers), tightest_curvature(kind)
     if tightest is None:
         return NO_CURVES
@@ -89,10 +89,10 @@ def curves_of(kind: Kind, bent: bool) -> Curves:
         into, out = swing(kind, straight, mode, way), swing(kind, mode, straight, way)
         if into is None or out is None:
             return NO_CURVES
-        first, last = drive(kind, straight, into)[0][1:], drive(kind, mode, out)[0][1:]
         if ends:
-            out, last = out[:0], np.zeros((1, POSE_SIZE))
-        swings += [(into, first), (out, last[: len(out)])]
+            out = out[:0]
+        first, last = _driven(kind, straight, into), _driven(kind, mode, out)
+        swings += [(into, first[1:]), (out, last[1:])]
         (x, y, turn), (its_x, its_y, its_turn) = first[-1, :3].tolist(), last[-1, :3].tolist()
         sine, cosine = portable.sin_cos_of(turn)
         ahead = (x - sine / curvature, y + cosine / curvature)
@@ -104,6 +104,11 @@ def curves_of(kind: Kind, bent: bool) -> Curves:
     begin = np.cumsum([0, *map(len, controls)])
     columns = (np.array(column) for column in zip(*rows, strict=True))
     return Curves(2 * CIRCLES * bent, begin, np.concatenate(poses), np.concatenate(controls), *columns)
+
+
+def _driven(kind: Kind, mode: Mode, controls: FloatArray) -> Floats:
+    """``(n + 1, 6)`` poses from the origin on; without any controls it is there that a car stays."""
+    return drive(kind, mode, controls)[0] if len(controls) else np.zeros((1, POSE_SIZE))
 
 
 @compiled
@@ -151,7 +156,7 @@ def _joined(curves: Curves, goal: Goal, x: float, y: float, heading: float, firs
 
 @compiled
 def curve_of(curves: Curves, goal: Goal, x: float, y: float, heading: float, way: float) -> Curve:
-    """The quickest curve from a pose with trailers in line, forwards (``way`` is 1) or in reverse (-1)."""
+    """The quickest curve from a pose, trailers in line, forwards (``way`` is 1) or in reverse (-1)."""
     begin, best = 0 if way > 0 else CIRCLES, NO_CURVE
     along, across = _turned(goal.x - x, goal.y - y, -heading)
     if curves.curvature.shape[0] == 0 or np.isnan(goal.heading):

@@ -12,7 +12,7 @@ from d4orm_env.core import portable
 from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION
 from d4orm_planners.manoeuvres.kinds import SECTOR, Kind, Move, held
-from d4orm_planners.manoeuvres.trailer_moves import trailer_moves
+from d4orm_planners.manoeuvres.trailer_moves import first_order_car_moves
 
 TURNS = (1, 2)
 """Sectors by which an arc turns, to either side."""
@@ -160,8 +160,9 @@ MOVES: dict[str, Callable[[Kind], Iterator[Move]]] = {
     "car": _car,
     "velocity2d": _velocity2d,
     "holonomic2d": _holonomic2d,
-    "car_with_1_trailer": trailer_moves,
-    "car_with_2_trailers": trailer_moves,
-    "car_with_3_trailers": trailer_moves,
+    "car_with_1_trailer": first_order_car_moves,
+    "car_with_2_trailers": first_order_car_moves,
+    "car_with_3_trailers": first_order_car_moves,
+    "car_first_order": first_order_car_moves,
 }
 """Models that there are primitives for."""

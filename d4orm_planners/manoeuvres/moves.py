@@ -19,7 +19,7 @@ from d4orm_planners.manoeuvres.lattice import (
 )
 from d4orm_planners.manoeuvres.nodes import Nodes, Task
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
-from d4orm_planners.manoeuvres.snapping import TOWING, Goal, snap_of, snap_pose, snap_steps
+from d4orm_planners.manoeuvres.snapping import CURVING, Goal, snap_of, snap_pose, snap_steps
 
 AHEAD, BEHIND = -2, -3
 """Moves that are no primitives: the last stretch, forwards and backwards."""
@@ -48,7 +48,7 @@ def sweep(task: Task, nodes: Nodes, node: int, move: int) -> int:
             swept[step + 1, POSE_SIZE] = task.primitives.speed[first + step]
         return end - first
     way = -1.0 if move == BEHIND else 1.0
-    if limits.way == TOWING:
+    if limits.way == CURVING:
         curve = curve_of(task.curves, task.goal, pose[0], pose[1], pose[2], way)
         if curve[0] == 0 or curve[0] >= MAX_STEPS:
             return 0
@@ -71,7 +71,7 @@ def sweep(task: Task, nodes: Nodes, node: int, move: int) -> int:
 def stretch_steps(task: Task, x: float, y: float, heading: float, move: int) -> int:
     """Steps of the last stretch, forwards or backwards; zero for none."""
     way = -1.0 if move == BEHIND else 1.0
-    if task.limits.way == TOWING:
+    if task.limits.way == CURVING:
         return curve_of(task.curves, task.goal, x, y, heading, way)[0]
     return snap_steps(snap_of(task.limits, task.goal, x, y, heading, way))
 

@@ -78,7 +78,7 @@ class Task(NamedTuple):
         body: The robot.
         primitives: What it can do.
         limits: For the last stretch, ...
-        curves: ... and those of a robot with trailers.
+        curves: ... and those of a first-order car.
         goal: Where to.
         lattice: Cells and sectors.
         costs: Steps to the goal; none in a world without obstacles.

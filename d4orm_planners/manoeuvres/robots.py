@@ -19,7 +19,8 @@ from d4orm_planners.manoeuvres.kinds import SECTORS, Kind
 from d4orm_planners.manoeuvres.lattice import PoseLattice, RobotBody
 from d4orm_planners.manoeuvres.model_moves import MOVES
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives, primitives_of
-from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TOWING, TURNING, Goal, Limits
+from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, TURNING, Goal, Limits
+from d4orm_planners.manoeuvres.trailer_moves import first_order_car_moves
 
 CELLS_PER_RADIUS = 3
 """Cells in the outer radius of the largest robot."""
@@ -168,7 +169,7 @@ class Robot:
         mode: That it starts in.
         goal: Where to.
         limits: For the last stretch.
-        curves: For that of a robot with trailers.
+        curves: For that of a first-order car.
         body: Among the obstacles.
         primitives: What it can do.
         lattice: Cells and sectors round its start's heading.
@@ -204,9 +205,9 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     lattice = area.lattice(area.cell, float(start[2]), sectors, len(modes))
     bent = bool(scene.bent[number])
     costs = Costs(lattice, np.zeros(0, np.float32), np.inf, 0.0, (0.0, 0.0))
-    if problem.world.num_obstacles or last.way in (NOWHERE, TOWING):
+    if problem.world.num_obstacles or last.way in (NOWHERE, CURVING):
         costs = costs_of(kind, area, body, start, goal, problem.num_robots, bent)
-    curves = curves_of(kind.base, bent) if model.trailers else NO_CURVES
+    curves = curves_of(kind.base, bent) if last.way == CURVING else NO_CURVES
     mode = modes.index(kind.start)
     return Robot(model, start, mode, goal, last, curves, body, primitives, lattice, costs)
 
@@ -214,9 +215,11 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
 def _limits(kind: Kind) -> Limits:
     model, own, lower = kind.model, kind.limits, kind.lower
     way = SIDEWAYS if model.heading_index is None else TURNING if model.turns_in_place else NOWHERE
+    if MOVES[model.name] is first_order_car_moves:
+        way = CURVING
     swing = own[MAX_TURN_ACCELERATION] if model.name == UNICYCLE2.name else np.inf
     return Limits(
-        TOWING if model.trailers else way, own[SPEED], lower[SPEED],
+        way, own[SPEED], lower[SPEED],
         np.inf if model.first_order else own[ACCELERATION], own[TURN_RATE], lower[TURN_RATE], swing,
         float(np.float32(kind.dt)),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from d4orm_planners.manoeuvres.lattice import cell_of, is_far_from_all, moved, p
 from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, arrives_after, is_sweep_free, reaches, stretch_steps, sweep
 from d4orm_planners.manoeuvres.nodes import Nodes, Task, add, cost_to_go, is_dominated, slot_of
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
-from d4orm_planners.manoeuvres.snapping import NOWHERE, SIDEWAYS, TOWING, Goal, Limits, Snap, snap_of
+from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, Goal, Limits, Snap, snap_of
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_since, safe_until, visits_of
 
 NOTHING, PAUSED = -1, -2
@@ -123,7 +123,7 @@ def _follow(task: Task, nodes: Nodes, traffic: Traffic, node: int, move: int) ->
 def _snaps(task: Task, nodes: Nodes, traffic: Traffic, node: int) -> None:
     """Try the last stretch, where it takes about as few steps as the costs promise."""
     pose, mode = nodes.pose[node], nodes.mode[node]
-    if task.limits.way == NOWHERE or not task.primitives.rests[mode] or (task.limits.way == TOWING and mode > 0):
+    if task.limits.way == NOWHERE or not task.primitives.rests[mode] or (task.limits.way == CURVING and mode > 0):
         return
     remaining = cost_to_go(task, pose[0], pose[1], pose[2], mode)
     for move in range(AHEAD, BEHIND - 1 if task.limits.way != SIDEWAYS else BEHIND, -1):
@@ -175,7 +175,7 @@ def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode:
         if is_dominated(nodes, slot_of(nodes, cell, task.number), task.number, node, nodes.time[node] - 1):
             continue
         ends = task.primitives.rests[nodes.mode[node]] and nodes.until[node] == NEVER
-        if task.limits.way == TOWING and task.curves.last == 0:
+        if task.limits.way == CURVING and task.curves.last == 0:
             ends = ends and nodes.mode[node] == 0
         if ends and reaches(task.goal, x, y, heading, 0.0, 1.0):
             return node
@@ -215,5 +215,5 @@ def snap_from(limits: Limits, goal: Goal, x: float, y: float, heading: float, mo
 
 @cached_kernel(**OPTIONS)
 def curve_from(curves: Curves, goal: Goal, x: float, y: float, heading: float, move: int) -> Curve:
-    """The last stretch of a robot with trailers from a pose, as one of the moves."""
+    """The last stretch of a first-order car from a pose, as one of the moves."""
     return curve_of(curves, goal, x, y, heading, -1.0 if move == BEHIND else 1.0)

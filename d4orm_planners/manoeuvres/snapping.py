@@ -11,9 +11,9 @@ from d4orm_env.engine.compiling import compiled
 from d4orm_env.engine.elementary import arctan2
 from d4orm_planners.manoeuvres.lattice import turned_by
 
-NOWHERE, TURNING, SIDEWAYS, TOWING = range(4)
-"""Robots that cannot turn on the spot and have no last stretch; those that can; those that need not; those that pull
-trailers, whose last stretch is in :mod:`~d4orm_planners.manoeuvres.curves`."""
+NOWHERE, TURNING, SIDEWAYS, CURVING = range(4)
+"""Robots that cannot turn on the spot and have no last stretch; those that can; those that need not; and first-order
+cars, whose last stretch is in :mod:`~d4orm_planners.manoeuvres.curves`."""
 NEAR = 1e-3
 """Distance from the goal that needs no drive, as a share of the goal radius."""
 
@@ -22,7 +22,7 @@ class Limits(NamedTuple):
     """Abilities of a robot.
 
     Attributes:
-        way: One of :data:`NOWHERE`, :data:`TURNING`, :data:`SIDEWAYS` and :data:`TOWING`.
+        way: One of :data:`NOWHERE`, :data:`TURNING`, :data:`SIDEWAYS` and :data:`CURVING`.
         speed: [m/s].
         reverse: Speed backwards [m/s].
         acceleration: [m/s^2], infinite for first-order robots.

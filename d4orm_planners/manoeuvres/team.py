@@ -16,7 +16,7 @@ from d4orm_planners.manoeuvres.nodes import Nodes, Task
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, curve_from, find_motion, snap_from, trace
-from d4orm_planners.manoeuvres.snapping import TOWING, snap_controls
+from d4orm_planners.manoeuvres.snapping import CURVING, snap_controls
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
 from d4orm_planners.mapf.lns import Odds
 
@@ -249,7 +249,7 @@ def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:
         first, end = robot.primitives.first[move : move + 2]
         return robot.primitives.controls[first:end]
     x, y, heading = pose[0], pose[1], pose[2]
-    if robot.limits.way == TOWING:
+    if robot.limits.way == CURVING:
         curve = curve_from(robot.curves, robot.goal, x, y, heading, move)
         return curve_controls(robot.curves, curve, robot.limits.dt)
     controls = snap_controls(robot.limits, snap_from(robot.limits, robot.goal, x, y, heading, move))

@@ -1,4 +1,4 @@
-"""Moves of cars with trailers, between hitch angles at which they go round in circles.
+"""Moves of first-order cars, with trailers between hitch angles at which they go round in circles.
 
 A mode is the hitch angles. At those of a circle trailers follow without swinging; from one circle to another they swing
 under steering angles that are found by shooting, with as many unknowns as there are hitches.
@@ -45,8 +45,9 @@ def _curvature(kind: Kind, angle: float) -> float:
 
 
 def _most_curved(kind: Kind) -> float:
-    """Curvature that the wheels can be turned to."""
-    return _curvature(kind, SHARE * kind.limits[MAX_STEERING])
+    """Curvature that the wheels can be turned to; trailers need a reserve."""
+    share = SHARE if kind.model.trailers else 1.0
+    return _curvature(kind, share * kind.limits[MAX_STEERING])
 
 
 def _largest(kind: Kind) -> Floats:
@@ -80,7 +81,7 @@ def tightest_curvature(kind: Kind) -> float | None:
     """The largest curvature of a circle that trailers can swing into and out of, in a grid of shares of that of the
     wheels or of the shortest hitch; ``None`` if hitch angles are bounded too narrowly for any.
     """
-    most = min(_most_curved(kind), 1 / min(kind.limits[column] for _, column in kind.model.trailers))
+    most = min([_most_curved(kind), *(1 / kind.limits[column] for _, column in kind.model.trailers)])
     shares = np.arange(1.0, 0.0, -FINER)
     return next((curvature for curvature in (shares * most).tolist() if _is_joined(kind, curvature)), None)
 
@@ -97,6 +98,8 @@ def _is_joined(kind: Kind, curvature: float) -> bool:
 @cache
 def swing(kind: Kind, before: Mode, after: Mode, way: int) -> FloatArray | None:
     """``(n, 2)`` controls from some hitch angles to others, forwards or backwards; ``None`` if none are found."""
+    if before == after:
+        return held(0, 0.0, 0.0)
     if (*before, *after) < (*np.negative(before), *np.negative(after)):  # to the right as to the left
         other = swing(kind, tuple(np.negative(before).tolist()), tuple(np.negative(after).tolist()), way)
         return None if other is None else other * np.array([1, -1], np.float32)
@@ -157,7 +160,7 @@ def _solved(matrix: Floats, right: Floats) -> Floats | None:
     return rows[:, -1]
 
 
-def trailer_moves(kind: Kind) -> Iterator[Move]:
+def first_order_car_moves(kind: Kind) -> Iterator[Move]:
     """Straight on, in the tightest circles if there are any, between these, and from the hitch angles at the start."""
     base, straight = kind.base, (0.0,) * len(kind.model.trailers)
     curvature = tightest_curvature(base)
@@ -178,5 +181,5 @@ def trailer_moves(kind: Kind) -> Iterator[Move]:
             changes += [(kind.start, mode) for mode in (straight, left, right)]
         for before, after in changes:
             controls = swing(base, before, after, way)
-            if controls is not None:
+            if controls is not None and len(controls):
                 yield before, after, controls

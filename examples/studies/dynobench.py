@@ -6,7 +6,7 @@
 
 A row for each file, or for all that one generator drew of one size: how many runs solved them within a minute of
 planning, compilation not counted, how long that took, and how long robots are under way; medians of those that solved
-it. Files that `load_dynobench` refuses have the reason in their row of the trials.
+it. Files that `load_problem` refuses have the reason in their row of the trials.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from examples.common import grouped, save_table, study_parser, study_rows
 
-from d4orm_env import Problem, load_dynobench
+from d4orm_env import Problem, load_problem
 from d4orm_planners import Plan, make_planner
 
 LIMIT = 60.0
@@ -31,7 +31,7 @@ def loaded(path: Path) -> Problem | str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # starts within the margin, which is zero there
-            return load_dynobench(path)
+            return load_problem(path)
     except ValueError as error:
         return str(error).removeprefix(f"{path}: ")
 

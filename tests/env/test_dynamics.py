@@ -43,6 +43,7 @@ def test_the_registry_is_consistent() -> None:
         "car_with_1_trailer": (2, 4, 2),
         "car_with_2_trailers": (2, 5, 2),
         "car_with_3_trailers": (2, 6, 2),
+        "car_first_order": (2, 3, 2),
     }
     assert tuple(MODELS) == tuple(MODEL_CODES) == tuple(sizes)
     assert list(MODEL_CODES.values()) == list(range(len(sizes)))
@@ -88,6 +89,7 @@ def test_an_unknown_model_is_named_with_those_there_are() -> None:
         ("unicycle1", (1, 2, math.pi / 6), (4, 5), (4 * math.sqrt(0.75), 2, 5), (4 * math.sqrt(0.75), 2)),
         ("unicycle2", (1, 2, math.pi / 2, 3, 4), (5, 6), (0, 3, 4, 5, 6), (0, 3)),
         ("holonomic2d_jerk", (1, 2, 3, 4, 5, 6), (7, 8), (3, 4, 5, 6, 7, 8), (3, 4)),
+        ("car_first_order", (1, 2, math.pi / 2), (-0.5, math.pi / 4), (0, -0.5, -2), (0, -0.5)),
         # Backwards at 0.5 m/s with sin(pi / 6) = 1/2, over 0.4 m.
         ("car_with_1_trailer", (1, 2, 0, math.pi / 6), (-0.5, 0), (-0.5, 0, 0, 0.625), (-0.5, 0)),
         ("car_with_1_trailer", (1, 2, 0, 0), (0.5, math.pi / 4), (0.5, 0, 2, 2), (0.5, 0)),

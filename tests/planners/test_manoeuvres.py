@@ -190,6 +190,19 @@ def test_a_trailer_that_would_not_fit_in_line_stays_in_a_bend() -> None:
     assert abs(plan.trajectory.states[-1, 0, 3]) > 0.05
 
 
+def test_a_first_order_car_parks_beside_a_wall_and_between_two_others() -> None:
+    """It cannot turn on the spot: it backs in, along a curve that ends exactly at its goal."""
+    own = {"max_steering": np.arctan(0.5)}
+    team = Team(("car_first_order",), own_limits=own, footprint=Box(0.5, 0.25, offset=0.12))
+    world = World(boxes=[[0.8, 0.0, 1.6, 0.3], [3.0, 0.0, 3.8, 0.3]], lower=(0.0, 0.0), upper=(5.0, 3.0))
+    problem = Problem(
+        team, [[0.8, 1.0, 0.0]], [[2.25, 0.16]], world, horizon=600, margin=0.0, goal_radius=0.01, goal_heading=0.0,
+        goal_heading_tolerance=0.01,
+    )  # fmt: skip
+    plan = solved(problem)
+    assert (plan.controls[..., 0] < 0).any()
+
+
 def test_discs_without_headings_are_planned_otherwise() -> None:
     """Others have the same plans as ever, and nothing new to compile."""
     team = Team(("unicycle", "unicycle"))
