@@ -153,6 +153,20 @@ def short_repr(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def number_list(given: object, name: str, count: int | None = None) -> Floats:
+    """A list of finite numbers in a file, or one number; the first ``count`` of them, where so many are wanted."""
+    try:
+        numbers = np.atleast_1d(np.array(given, np.float64))
+    except (TypeError, ValueError):
+        numbers = np.zeros((0, 0))
+    if numbers.ndim != 1 or len(numbers) < (count or 0):
+        wanted = "be a list of numbers, as [1.0, 2.5]" if count is None else f"have numbers, {count} of them"
+        raise ValueError(f"{name} is {short_repr(given)}; it must {wanted}")
+    if not (abs(numbers) <= LARGEST).all():
+        raise ValueError(f"{name} is {short_repr(given)}; all must be numbers of at most {LARGEST:g}")
+    return numbers[:count]
+
+
 def positive_number(
     value: object, name: str, *, zero_allowed: bool = False, least: float = 0.0, most: float = LARGEST_NUMBER
 ) -> float:

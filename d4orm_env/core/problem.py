@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from d4orm_env.core import goal_poses
 from d4orm_env.core import problem_checks as checks
 from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array, frozen_per_robot
 from d4orm_env.core.lazy import LazyModule
@@ -32,6 +33,7 @@ else:
 
 ROUNDING, GRAINS = 1 / 15_000, 4
 """Allowance for rounding, in radii of the largest robot, and in what float32 resolves at the farthest start or goal."""
+GOAL_POSE = ("goal_heading", "goal_heading_tolerance", "goal_hitches")
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -60,6 +62,7 @@ class Problem(Frozen):
             paper's convention: robots stop dead at their goals, as no real one can.
         goal_heading: ``(K,)`` heading with which each robot must arrive [rad], NaN for any; one number is for all.
         goal_heading_tolerance: ``(K,)`` by how much it may be missed [rad], from 0.001 to pi.
+        goal_hitches: ``(K, 3)`` hitch angles with which trailers must arrive, as exactly [rad]; NaN for any.
         name: Origin of the problem, for tables and pictures.
         collision_penalty: Taken off a robot's reward per step within the margin of another robot, and of an obstacle
             or a bound; 1 in the paper.
@@ -87,6 +90,7 @@ class Problem(Frozen):
     goal_speed: FloatArray
     goal_heading: FloatArray
     goal_heading_tolerance: FloatArray
+    goal_hitches: FloatArray
     name: str
     arrival: Arrival
     collision_penalty: float
@@ -107,6 +111,7 @@ class Problem(Frozen):
         collision_penalty: float = 1.0,
         goal_heading: ArrayLike | None = None,
         goal_heading_tolerance: ArrayLike = 0.1,
+        goal_hitches: ArrayLike | None = None,
     ) -> None:
         world = world_of(world, team.dimension)
         size = team.num_robots
@@ -119,8 +124,9 @@ class Problem(Frozen):
             goal=frozen_array(goal, "goal", (size, team.dimension), largest=LARGEST),
             world=world,
             goal_speed=checks.goal_speeds(team, numbers["dt"], goal_speed),
-            goal_heading=checks.goal_headings(team, goal_heading),
+            goal_heading=(headings := goal_poses.goal_headings(team, goal_heading)),
             goal_heading_tolerance=frozen_per_robot(goal_heading_tolerance, "goal_heading_tolerance", team.num_robots),
+            goal_hitches=goal_poses.goal_hitches(team, goal_hitches, headings),
             name=name,
             arrival=arrival,
         )
@@ -253,8 +259,9 @@ class Problem(Frozen):
         """
         if np.array_equal(self.goal_speed, checks.goal_speeds(self.team, self.dt, None)):
             changes = {"goal_speed": None} | changes
-        if np.isnan(self.goal_heading).all():
-            changes = {"goal_heading": None} | changes
+        for name in ("goal_heading", "goal_hitches"):
+            if np.isnan(getattr(self, name)).all():
+                changes = {name: None} | changes
         if (self.goal_heading_tolerance == self.goal_heading_tolerance[0]).all():
             changes = {"goal_heading_tolerance": self.goal_heading_tolerance[0]} | changes
         return super().replace(**changes)
@@ -283,10 +290,7 @@ class Problem(Frozen):
         return self._unchecked(
             team=team,
             start=self.start[index, : team.state_size],
-            goal=self.goal[index],
-            goal_speed=self.goal_speed[index],
-            goal_heading=self.goal_heading[index],
-            goal_heading_tolerance=self.goal_heading_tolerance[index],
+            **{name: getattr(self, name)[index] for name in ("goal", "goal_speed", *GOAL_POSE)},
         )
 
     def _unchecked(self, **changes: object) -> Problem:

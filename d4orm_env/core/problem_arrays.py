@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, read_only
 from d4orm_env.core.bodies import FootprintArrays
+from d4orm_env.core.goal_poses import goal_directions, squared_chords
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 from d4orm_env.dynamics.transition import docking_speed
 from d4orm_env.geometry.world_index import WorldIndex
@@ -41,25 +41,13 @@ class ProblemArrays(NamedTuple):
     collision_penalty: np.float32  #: ``()``
     #: ``()`` bool, true; ``None`` if no robot has a goal heading, and so are the next two
     turns_at_goals: np.bool_ | None
-    goal_direction: FloatArray | None  #: ``(K, 2)`` goal headings as unit vectors, zero for none
+    #: ``(K, 8)`` goal headings, and hitch angles of up to three trailers, as unit vectors, zero for none
+    goal_direction: FloatArray | None
     #: ``(K,)`` square of the chord by which they may be missed, infinite for none
     squared_goal_chord: FloatArray | None
     #: Of a team that is not all discs; the radii are then those of discs round them. Else ``None``: numba leaves out of
     #: a kernel what asks whether an argument is ``None`` and would go on if it were not.
     footprints: FootprintArrays | None
-
-
-def goal_directions(headings: FloatArray) -> FloatArray:
-    """``(K, 2)`` goal headings ``(K,)`` as unit vectors; zero for none."""
-    known = ~np.isnan(headings)
-    sine, cosine = portable.sin_cos(np.where(known, headings, 0).astype(np.float64))
-    return (np.stack([cosine, sine], axis=1) * known[:, None]).astype(np.float32)
-
-
-def squared_chords(headings: FloatArray, tolerance: FloatArray) -> FloatArray:
-    """``(K,)`` squares of the chords by which unit vectors may miss goal headings; infinite for none."""
-    half = portable.sin_cos(tolerance.astype(np.float64) / 2)[0]
-    return np.where(np.isnan(headings), np.inf, 4 * half * half).astype(np.float32)
 
 
 def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radius: float) -> FloatArray:
@@ -88,7 +76,7 @@ def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:
         docks=np.bool_(problem.docks),
         collision_penalty=np.float32(problem.collision_penalty),
         turns_at_goals=np.bool_(True) if turns else None,
-        goal_direction=goal_directions(problem.goal_heading) if turns else None,
+        goal_direction=goal_directions(problem.goal_heading, problem.goal_hitches) if turns else None,
         squared_goal_chord=squared_chords(problem.goal_heading, problem.goal_heading_tolerance) if turns else None,
         footprints=problem.team.footprint_arrays,
     )
@@ -118,7 +106,8 @@ def digest_of(problem: Problem) -> str:
     if not problem.docks:
         sha.update(problem.arrival.encode())
     if arrays.goal_direction is not None and arrays.squared_goal_chord is not None:
-        sha.update(arrays.goal_direction.tobytes() + arrays.squared_goal_chord.tobytes())
+        columns = 2 if np.isnan(problem.goal_hitches).all() else None
+        sha.update(arrays.goal_direction[:, :columns].tobytes() + arrays.squared_goal_chord.tobytes())
     if problem.team.shapes:
         sha.update(repr(problem.team.shapes).encode())
     if problem.collision_penalty != 1:

@@ -12,18 +12,18 @@ from d4orm_env.core.arrays import (
     SMALLEST,
     FloatArray,
     Floats,
-    as_float32,
     positive_number,
     short_repr,
     whole_number,
 )
 from d4orm_env.core.bodies import numbers_by_robot
 from d4orm_env.core.footprint_gaps import near_pairs, pair_gap, world_gap
+from d4orm_env.core.goal_poses import check_tolerances, one_or_each
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
 from d4orm_env.core.world import World
-from d4orm_env.dynamics.robot_model import SPEED, STANDARD_LIMITS, TURN_RATE, Model
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, SPEED, STANDARD_LIMITS, TURN_RATE, Model
 from d4orm_env.footprints import Disc
 
 if TYPE_CHECKING:
@@ -38,8 +38,6 @@ MIN_TIME_STEP, MAX_TIME_STEP = 1e-6, 1e3
 """Bounds of ``dt`` [s]."""
 MAX_HEADING = 1000.0
 """Largest heading that is measured [rad]; float32 resolves it to 6e-5 rad. What is taken is unwound."""
-LEAST_TOLERANCE = 1e-3
-"""Smallest tolerance of a goal heading [rad]."""
 RESOLUTION = 100
 """The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
 STEP_RESOLUTION = 10
@@ -93,7 +91,7 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
     if given is None:
         first_order = np.array([model.first_order for model in team.robot_models])
         return np.where(first_order, np.float32(np.inf), team.max_acceleration * np.float32(dt))
-    speeds = _one_or_each(given, "goal_speed", team.num_robots)
+    speeds = one_or_each(given, "goal_speed", team.num_robots)
     wrong = ~((speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf)))
     if wrong.any():
         robot = int(np.argmax(wrong))
@@ -101,42 +99,6 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
             f"goal_speed of robot_{robot} is {speeds[robot]:g}; it must be from 0 to {LARGEST:g}, or inf for no limit"
         )
     return speeds
-
-
-def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
-    """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
-    headings = _one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
-    for robot in np.flatnonzero(~np.isnan(headings)).tolist():
-        if team.robot_models[robot].heading_index is None:
-            raise ValueError(
-                f"goal_heading of robot_{robot} is {headings[robot]:g}, and a {team.models[robot]} has no heading; "
-                f"give NaN"
-            )
-        if not abs(headings[robot]) <= np.float32(2 * np.pi):
-            raise ValueError(
-                f"goal_heading of robot_{robot} is {headings[robot]:g} rad; it must be at most 2 pi in magnitude, so "
-                f"give radians, without whole turns"
-            )
-    return headings
-
-
-def _one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
-    """``(K,)`` numbers, given as one for all robots or one each."""
-    try:
-        values = as_float32(given)
-    except ValueError as error:
-        raise ValueError(f"{name} must be a number or one per robot, not {short_repr(given)}; {error}") from error
-    values = np.repeat(values, num_robots) if values.ndim == 0 else values
-    if values.shape != (num_robots,):
-        raise ValueError(f"{name} has shape {values.shape}; expected one number, or ({num_robots},){note}")
-    return values
-
-
-def check_tolerances(tolerance: FloatArray) -> None:
-    """Refuse tolerances of goal headings ``(K,)`` that float32 does not resolve, or that allow any."""
-    for robot in np.flatnonzero((tolerance < LEAST_TOLERANCE) | (tolerance > np.float32(np.pi)))[:1].tolist():
-        value = f"goal_heading_tolerance of robot_{robot} is {tolerance[robot]:g} rad"
-        raise ValueError(f"{value}; it must be from {LEAST_TOLERANCE:g} to pi")
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start", max_angle: float = float(MAX_ANGLE)) -> None:
@@ -286,7 +248,9 @@ def _turning_limits(model: Model) -> str:
     """The limits to lower where a robot turns too fast."""
     if TURN_RATE in model.control_limits:
         return STANDARD_LIMITS[TURN_RATE]
-    return ", ".join(model.limit_names[column] for _, column in model.state_limits) or "limits"
+    columns = [column for column in model.control_limits if column >= OWN_LIMITS] if model.first_order else []
+    columns = columns or [column for _, column in model.state_limits]
+    return ", ".join(model.limit_names[column] for column in columns) or "limits"
 
 
 def _point(position: FloatArray) -> str:

@@ -14,8 +14,8 @@ from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
-from d4orm_env.dynamics.car_with_trailers import FIRST_ORDER_CARS
 from d4orm_env.dynamics.differential_drive import DIFFERENTIAL_DRIVE
+from d4orm_env.dynamics.first_order_cars import FIRST_ORDER_CARS
 from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
 from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D

@@ -120,9 +120,11 @@ for _sizes in ((2, 2), (2, 3), (3, 3)):
     _add_size(*_sizes)
 
 
-GoalHeading: TypeAlias = tuple[np.bool_ | None, np.float32, np.float32, np.float32]
+Six: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]
+GoalHeading: TypeAlias = tuple[np.bool_ | None, np.float32, np.float32, np.float32, Six]
 """``None`` in a team without goal headings, which leaves what they ask for out of a kernel; a robot's own as a unit
-vector, and the square of the chord by which it may be missed, infinite for none."""
+vector; the square of the chord by which it may be missed, infinite for none; and likewise its trailers' hitch angles,
+zero for any."""
 Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_, GoalHeading]
 """Squares of the goal radius and of the goal speed, whether a robot that has arrived stays there for good, and its goal
 heading."""
@@ -136,15 +138,19 @@ def docking_of(arrays: ProblemArrays, k: Whole) -> Docking:
 
     Numbers only: a function without reference counts must not hand out arrays.
     """
-    x, y, chord2 = _goal_heading(arrays.goal_direction, arrays.squared_goal_chord, k)
-    return arrays.squared_goal_radius, arrays.squared_goal_speed[k], arrays.docks, (arrays.turns_at_goals, x, y, chord2)
+    x, y, chord2, hitches = _goal_heading(arrays.goal_direction, arrays.squared_goal_chord, k)
+    heading = arrays.turns_at_goals, x, y, chord2, hitches
+    return arrays.squared_goal_radius, arrays.squared_goal_speed[k], arrays.docks, heading
 
 
 @inlined
-def _goal_heading(directions: FloatArray | None, chords2: Any, k: Whole) -> tuple[np.float32, np.float32, np.float32]:
+def _goal_heading(
+    directions: FloatArray | None, chords2: Any, k: Whole
+) -> tuple[np.float32, np.float32, np.float32, Six]:
     if directions is None:
-        return ZERO, ZERO, ZERO
-    return directions[k, 0], directions[k, 1], chords2[k]
+        return ZERO, ZERO, ZERO, (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+    own = directions[k]
+    return own[0], own[1], chords2[k], (own[2], own[3], own[4], own[5], own[6], own[7])
 
 
 def models_of_kernel(models: tuple[str, ...]) -> tuple[str, ...]:
@@ -226,7 +232,22 @@ def _facing(model: Model) -> Callable[[np.bool_ | None, Row, GoalHeading], bool]
             return True
         return bool(transition.faces(cosine(x[index]), sine(x[index]), heading[1], heading[2], heading[3]))
 
-    return faces
+    if not model.trailers:
+        return faces
+    hitches, count = tuple(hitch for hitch, _ in model.trailers), len(model.trailers)
+
+    @inlined
+    def bends(turns: np.bool_ | None, x: Row, heading: GoalHeading) -> bool:
+        good = faces(turns, x, heading)
+        if turns is None:
+            return good
+        for i in range(count):
+            c, s, angle = heading[4][2 * i], heading[4][2 * i + 1], x[hitches[i]]
+            if c != ZERO or s != ZERO:
+                good = good and bool(transition.faces(cosine(angle), sine(angle), c, s, heading[3]))
+        return good
+
+    return bends
 
 
 def dispatch(branches: Mapping[str, Callable[..., None]]) -> Callable[..., None]:

@@ -191,6 +191,7 @@ def _arrays(problem: Problem) -> ProblemArrays:
         jnp.asarray(value, jnp.float32) for value in (problem.start, problem.goal, *numbers)
     )
     heading, tolerance = jnp.asarray(problem.goal_heading), jnp.asarray(problem.goal_heading_tolerance)
+    angles = jnp.column_stack([heading, jnp.asarray(problem.goal_hitches)])
     gap2 = ((start[:, : team.dimension] - goal) ** 2).sum(axis=-1)
     distance = jnp.sqrt(jnp.maximum(gap2, goal_radius**2))
     if world.lower is None:
@@ -215,7 +216,9 @@ def _arrays(problem: Problem) -> ProblemArrays:
         "docks": problem.arrival == "dock",
         "collision_penalty": penalty,
         "turns_at_goals": True,
-        "goal_direction": jnp.nan_to_num(jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)),
+        "goal_direction": jnp.nan_to_num(jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=2)).reshape(
+            len(angles), -1
+        ),
         "squared_goal_chord": jnp.where(jnp.isnan(heading), jnp.inf, 4 * jnp.sin(tolerance / 2) ** 2),
         "footprints": team.footprint_arrays,
     }

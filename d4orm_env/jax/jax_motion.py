@@ -45,7 +45,8 @@ class Numbers(NamedTuple):
     squared_goal_radius: Given  #: Arriving within its root
     squared_goal_speed: Given  #: And no faster than its root
     docks: Given  #: Positive if a robot that has arrived stays
-    #: Cosine and sine of the goal heading, and the squared chord by which it may be missed; empty without
+    #: Squared chord by which the goal heading may be missed, its cosine and sine, and those of three hitch angles, zero
+    #: for any; empty without
     facing: tuple[Given, ...]
 
 
@@ -58,7 +59,7 @@ def numbers_of(model: Model, robots: np.ndarray[Any, Any], arrays: ProblemArrays
     facing: tuple[Given, ...] = ()
     if model.heading_index is not None and arrays.goal_direction is not None:
         aim = jnp.asarray(arrays.goal_direction)[robots]
-        facing = aim[:, :1], aim[:, 1:], column(jnp.asarray(arrays.squared_goal_chord)[robots])
+        facing = (column(jnp.asarray(arrays.squared_goal_chord)[robots]), *map(column, aim.T))
     return Numbers(
         tuple(map(column, arrays.time_step)),
         tuple(column(arrays.limits[robots, i]) for i in range(len(model.limit_names))),
@@ -82,7 +83,11 @@ def advance_robots(
     arrives = transition.arrives(gap2, speed2, numbers.squared_goal_radius, numbers.squared_goal_speed)
     if numbers.facing and model.heading_index is not None:
         heading = y[model.heading_index]
-        arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), *numbers.facing)
+        chord2, aim_x, aim_y, *hitches = numbers.facing
+        arrives &= transition.faces(jnp.cos(heading), jnp.sin(heading), aim_x, aim_y, chord2)
+        for (hitch, _), c, s in zip(model.trailers, hitches[::2], hitches[1::2], strict=False):
+            bent = transition.faces(jnp.cos(y[hitch]), jnp.sin(y[hitch]), c, s, chord2)
+            arrives &= bent | ((c == 0) & (s == 0))
     at_rest = transition.absorbed(arrived, numbers.docks > 0)
     docks, zero = transition.absorbed(arrives, numbers.docks > 0), jnp.zeros_like(gap2)
     after = tuple(

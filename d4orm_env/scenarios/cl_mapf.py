@@ -1,8 +1,9 @@
 """Problems of cars (CL-MAPF) as CL-CBS and CSDO publish theirs, in YAML.
 
 Source of the format and of the vehicle: https://github.com/APRIL-ZJU/CL-CBS and
-https://github.com/YangSVM/CSDOTrajectoryPlanning. A car is as their searches take it: up to full speed and to the
-tightest turn at once. CSDO's optimiser bounds how fast wheels turn as well.
+https://github.com/YangSVM/CSDOTrajectoryPlanning. A car takes any speed, and any turn that its wheels allow, at once,
+as in their searches. CSDO's optimiser bounds how fast wheels turn as well. CL-CBS keeps rear axles within the bounds,
+CSDO two discs round a car, and we its body.
 """
 
 from __future__ import annotations
@@ -15,14 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import positive_number
-from d4orm_env.core.errors import first_line, unknown
+from d4orm_env.core.arrays import number_list, positive_number
+from d4orm_env.core.errors import did_you_mean, first_line, unknown
 from d4orm_env.core.files import naming, read_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.footprints import Box
-from d4orm_env.scenarios.dynobench import numbers
 
 DT = 0.25
 """Time step [s]; at 1 m/s a twelfth of a car's length."""
@@ -35,14 +35,18 @@ SLOWEST = 5
 LEAST_STEPS = 400
 VEHICLE = {"r": 3.0, "carWidth": 2.0, "LF": 2.0, "LB": 1.0, "obsRadius": 0.8}
 """Turning radius, width, rear axle to front and to back, radius of an obstacle without one [m]: ``config.yaml``."""
+MAP_KEYS = ("dimensions", "obstacles")
 
 
-def load_cl_mapf(path: str | os.PathLike[str], vehicle: Mapping[str, float] | None = None) -> Problem:
-    """Read a problem of cars from CL-CBS's or CSDO's benchmark.
+def load_cl_mapf(
+    path: str | os.PathLike[str], vehicle: Mapping[str, float] | None = None, *, clockwise: bool = False
+) -> Problem:
+    """Read a problem of cars from CSDO's or CL-CBS's benchmark.
 
     Args:
         path: Its YAML file, with ``agents`` and ``map``.
         vehicle: What replaces entries of :data:`VEHICLE`, such as ``{"obsRadius": 1.0}`` [m].
+        clockwise: Whether headings turn clockwise: true for CL-CBS's files, which do not say so themselves.
 
     Returns:
         The problem of ``car_first_order`` at 1 m/s, as rectangles with goal headings, in steps of 0.25 s and without a
@@ -52,14 +56,16 @@ def load_cl_mapf(path: str | os.PathLike[str], vehicle: Mapping[str, float] | No
         ValueError: If the file cannot be read or is no such problem, or an entry of the vehicle is unknown or not
             positive; the message names the file, or the entry.
     """
-    own = VEHICLE | dict(vehicle or {})
-    for name, value in own.items():
+    given = {} if vehicle is None else vehicle
+    if not isinstance(given, Mapping):
+        raise ValueError(f"vehicle must be a mapping such as {{'r': 3.0}}, not {given!r}")
+    for name in given:
         if name not in VEHICLE:
             raise unknown("vehicle's entry", name, VEHICLE)
-        positive_number(value, f"{name} of vehicle")
+    own = VEHICLE | {name: positive_number(value, f"{name} of vehicle") for name, value in given.items()}
     with naming(path):
         try:
-            return _problem(read_yaml(path), own, Path(path).stem)
+            return _problem(read_yaml(path), own, -1 if clockwise else 1, Path(path).stem)
         except (KeyError, TypeError, IndexError) as error:
             reason = f"it lacks {error}" if isinstance(error, KeyError) else first_line(error)
             raise ValueError(
@@ -67,27 +73,37 @@ def load_cl_mapf(path: str | os.PathLike[str], vehicle: Mapping[str, float] | No
             ) from error
 
 
-def _problem(content: Any, vehicle: Mapping[str, float], name: str) -> Problem:
-    agents, size = content["agents"], numbers(content["map"]["dimensions"], "dimensions of map", 2)
+def _problem(content: Any, vehicle: Mapping[str, float], way: int, name: str) -> Problem:
+    agents, world = content["agents"], _world(content["map"], vehicle["obsRadius"])
     starts, goals = (
-        np.array([numbers(agent[what], f"{what} of robot_{robot}", 3) for robot, agent in enumerate(agents)])
+        np.array([number_list(agent[what], f"{what} of robot_{robot}", 3) for robot, agent in enumerate(agents)])
+        * (1, 1, way)
         for what in ("start", "goal")
     )
-    obstacles = [
-        [*numbers(given, f"obstacle {number}", 2), *numbers(given, f"obstacle {number}")[2:3], vehicle["obsRadius"]][:3]
-        for number, given in enumerate(content["map"].get("obstacles") or ())
-    ]
     length = vehicle["LF"] + vehicle["LB"]
     team = Team(
         ("car_first_order",) * len(agents),
         max_speed=1.0,
-        own_limits={"max_steering": math.atan(1 / vehicle["r"]), "wheelbase": 1.0, "max_reverse_speed": 1.0},
+        # In the tightest turn wheels are turned by half a right angle.
+        own_limits={"max_steering": math.pi / 4, "wheelbase": vehicle["r"], "max_reverse_speed": 1.0},
         footprint=Box(length, vehicle["carWidth"], offset=vehicle["LF"] - length / 2),
     )
-    world = World(2, circles=obstacles, lower=(-ROUNDING, -ROUNDING), upper=size + ROUNDING)
     farthest = float(np.linalg.norm(goals[:, :2] - starts[:, :2], axis=1).max())
     return Problem(
         team, starts, goals[:, :2], world, DT, max(LEAST_STEPS, math.ceil(SLOWEST * farthest / DT)), margin=0.0,
         goal_radius=GOAL_TOLERANCE, name=name, arrival="stay", goal_heading=goals[:, 2],
         goal_heading_tolerance=GOAL_TOLERANCE,
     )  # fmt: skip
+
+
+def _world(given: Any, radius: float) -> World:
+    for name in given:
+        if name not in MAP_KEYS and (meant := did_you_mean(name, MAP_KEYS)):
+            raise ValueError(f"map has the key {name!r}{meant}")
+    size, circles = number_list(given["dimensions"], "dimensions of map", 2), []
+    for number, obstacle in enumerate(given.get("obstacles") or ()):
+        row = number_list(obstacle, f"obstacle {number}").tolist()
+        if len(row) not in (2, 3):
+            raise ValueError(f"obstacle {number} is {row}; it must have numbers, 2 or 3 of them")
+        circles.append([*row, radius][:3])
+    return World(2, circles=circles, lower=(-ROUNDING, -ROUNDING), upper=size + ROUNDING)

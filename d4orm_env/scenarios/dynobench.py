@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import Floats, short_repr
+from d4orm_env.core.arrays import Floats, number_list, short_repr
 from d4orm_env.core.errors import did_you_mean, first_line
 from d4orm_env.core.files import naming, read_yaml
 from d4orm_env.core.problem import Problem
@@ -130,7 +130,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     start, goal = np.zeros((2, team.num_robots, team.state_size))
     for robot, (entry, model) in enumerate(zip(robots, team.robot_models, strict=True)):
         for what, states in (("start", start), ("goal", goal)):
-            state = numbers(entry[what], f"{what} of robot_{robot}")
+            state = number_list(entry[what], f"{what} of robot_{robot}")
             if len(state) != model.state_size:
                 given, kind = short_repr(entry[what]), entry["type"]
                 raise ValueError(f"{what} of robot_{robot} is {given}; a {kind} has {model.state_size} components")
@@ -144,7 +144,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
         team, start, goal[:, :d], _world(environment, team, goal[:, :d]), DT, max(LEAST_STEPS, steps), margin=0.0,
         goal_radius=GOAL_TOLERANCE, goal_speed=np.where(inertia, GOAL_TOLERANCE, np.inf), name=Path(path).stem,
         arrival="stay", goal_heading=np.where(turning, goal[:, min(2, team.state_size - 1)], np.nan),
-        goal_heading_tolerance=GOAL_TOLERANCE,
+        goal_heading_tolerance=GOAL_TOLERANCE, goal_hitches=_hitches(team, goal),
     )  # fmt: skip
 
 
@@ -207,20 +207,17 @@ def _state(model: Model, theirs: Floats) -> Floats:
     return np.append(theirs[:3], _wrapped(theirs[2:-1] - theirs[3:])) if model.trailers else theirs
 
 
-def numbers(given: object, name: str, count: int | None = None) -> Floats:
-    """A list of numbers in a file, or one number; the first ``count`` of them, where so many are wanted."""
-    try:
-        numbers = np.atleast_1d(np.array(given, np.float64))
-    except (TypeError, ValueError):
-        numbers = np.zeros((0, 0))
-    if numbers.ndim != 1 or len(numbers) < (count or 0):
-        wanted = "be a list of numbers, as [1.0, 2.5]" if count is None else f"have numbers, {count} of them"
-        raise ValueError(f"{name} is {short_repr(given)}; it must {wanted}")
-    return numbers[:count]
-
-
 def _wrapped(angle: Floats) -> Floats:
     return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _hitches(team: Team, states: Floats) -> Floats:
+    """``(K, 3)`` hitch angles in states ``(K, n)``, NaN for trailers that there are not."""
+    hitches = np.full((team.num_robots, 3), np.nan)
+    for robot, model in enumerate(team.robot_models):
+        for number, (hitch, _) in enumerate(model.trailers):
+            hitches[robot, number] = states[robot, hitch]
+    return hitches
 
 
 def _footprint(own: Mapping[str, Any]) -> Footprint:
@@ -232,14 +229,14 @@ def _footprint(own: Mapping[str, Any]) -> Footprint:
 
 def _world(environment: Mapping[str, Any], team: Team, goal: Floats) -> World:
     d, covered = team.dimension, min(footprint.inner_radius for footprint in team.footprint)
-    lower, upper = (numbers(environment[name], f"environment's {name}", d) for name in ("min", "max"))
+    lower, upper = (number_list(environment[name], f"environment's {name}", d) for name in ("min", "max"))
     # A robot whose goal lies on the bounds ends on either side of them; their checkers allow the whole tolerance there.
     lower -= GOAL_TOLERANCE / 2 * (abs(goal - lower) < GOAL_TOLERANCE / 2).any(axis=0)
     upper += GOAL_TOLERANCE / 2 * (abs(goal - upper) < GOAL_TOLERANCE / 2).any(axis=0)
     boxes, balls = [], []
     for number, obstacle in enumerate(environment.get("obstacles") or ()):
-        centre = numbers(obstacle["center"], f"center of obstacle {number}", d)
-        size = numbers(obstacle["size"], f"size of obstacle {number}", 1 if obstacle["type"] == "sphere" else d)
+        centre = number_list(obstacle["center"], f"center of obstacle {number}", d)
+        size = number_list(obstacle["size"], f"size of obstacle {number}", 1 if obstacle["type"] == "sphere" else d)
         if obstacle["type"] == "sphere":
             balls.append([*centre, *size])
             continue

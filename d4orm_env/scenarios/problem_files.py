@@ -29,7 +29,7 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     Args:
         path: A YAML file of at most 10 MB, 10,000 robots and 5 * 10^7 robots times steps, in the explicit form (every
             robot listed) or the short form (a scenario and its arguments); or an instance of dynobench or db-CBS, see
-            :func:`~d4orm_env.scenarios.dynobench.load_dynobench`, or of CL-CBS or CSDO, see
+            :func:`~d4orm_env.scenarios.dynobench.load_dynobench`, or of CSDO, see
             :func:`~d4orm_env.scenarios.cl_mapf.load_cl_mapf`.
 
     Warns:
@@ -46,7 +46,7 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     keys = set(content) if isinstance(content, dict) else set()
     if "environment" in keys:
         problem = load_dynobench(path)
-    elif {"agents", "map"} <= keys:
+    elif "agents" in keys:
         problem = load_cl_mapf(path)
     else:
         with naming(path):
@@ -142,6 +142,9 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     if not np.isnan(problem.goal_heading[robot]):
         for name in ("goal_heading", "goal_heading_tolerance"):
             (entry[name],) = _decimals(getattr(problem, name)[[robot]])
+    hitches = problem.goal_hitches[robot, : len(model.trailers)]
+    if not np.isnan(hitches).all():
+        entry["goal_hitches"] = [None if np.isnan(hitch) else _decimals([hitch])[0] for hitch in hitches]
     if model.own_limits:
         names = [limit.name for limit in model.own_limits]
         values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])

@@ -5,6 +5,7 @@ The public description is the documented example ``examples/scenarios/mixed_team
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import did_you_mean
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import Arrival
@@ -61,6 +63,7 @@ class RobotEntry(Entry):
     footprint: dict[str, Any] | None = None
     goal_heading: Number | None = None
     goal_heading_tolerance: Number = 0.1
+    goal_hitches: Annotated[list[Number | None], Field(max_length=MOST_TRAILERS)] | None = None
 
     @model_validator(mode="after")
     def _fits_model(self) -> RobotEntry:
@@ -189,6 +192,7 @@ class ProblemFile(Entry):
             world=self.world.build(team.dimension),
             goal_heading=[np.nan if robot.goal_heading is None else robot.goal_heading for robot in self.robots],
             goal_heading_tolerance=[robot.goal_heading_tolerance for robot in self.robots],
+            goal_hitches=[_padded(robot.goal_hitches or ()) for robot in self.robots],
             **{name: getattr(self, name) for name in names},
         )
 
@@ -262,6 +266,12 @@ def parse(data: object) -> Problem:
     # A value too large for float32 becomes infinite, and is then refused by name.
     with np.errstate(over="ignore"):
         return content.build()
+
+
+def _padded(hitches: Sequence[float | None]) -> list[float]:
+    """Hitch angles, NaN for any, for as many trailers as a robot may pull."""
+    given = [np.nan if hitch is None else hitch for hitch in hitches]
+    return given + [np.nan] * (MOST_TRAILERS - len(given))
 
 
 def _footprint(entry: RobotEntry) -> Footprint:

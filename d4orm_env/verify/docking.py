@@ -115,11 +115,24 @@ def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats)
 
 
 def heading_errors(problem: Problem, motion: TeamMotion) -> Floats:
-    """``(H, K)`` angle to the goal heading after each step [rad]; minus infinity without one."""
+    """``(H, K)`` angle to the goal heading after each step, or that of a trailer to its hitch angle if it is larger
+    [rad]; minus infinity without one.
+    """
     wanted = problem.goal_heading.astype(np.float64)
     if np.isnan(wanted).all():
         return np.full((1, len(wanted)), -np.inf)
-    turns = (motion.end_headings[:, : len(wanted)] - wanted) / (2 * np.pi)
+    missed = _angle_between(motion.end_headings[:, : len(wanted)], wanted)
+    for robot in np.flatnonzero(~np.isnan(problem.goal_hitches).all(axis=1)).tolist():
+        own = [number for number, body in enumerate(problem.team.bodies) if body.robot == robot]
+        hitches = -np.diff(motion.end_headings[:, own], axis=1)
+        errors = _angle_between(hitches, problem.goal_hitches[robot, : len(own) - 1].astype(np.float64))
+        missed[:, robot] = np.maximum(missed[:, robot], errors.max(axis=1))
+    return missed
+
+
+def _angle_between(angles: Floats, wanted: Floats) -> Floats:
+    """Magnitudes of the differences of angles [rad]; minus infinity where they may be any."""
+    turns = (angles - wanted) / (2 * np.pi)
     return np.where(np.isnan(wanted), -np.inf, 2 * np.pi * np.abs(turns - np.round(turns)))
 
 
@@ -130,7 +143,8 @@ def _failure(problem: Problem, motion: TeamMotion, robot: int, distance: Floats,
         yield f", at {pace[-1]:.4g} m/s (goal speed {problem.goal_speed[robot]:g} m/s)"
     if np.isfinite(missed):
         tolerance = problem.goal_heading_tolerance[robot]
-        yield f", {missed:.4g} rad from its goal heading (tolerance {tolerance:g} rad)"
+        bent = "" if np.isnan(problem.goal_hitches[robot]).all() else " or a hitch angle"
+        yield f", {missed:.4g} rad from its goal heading{bent} (tolerance {tolerance:g} rad)"
     if unsure:
         yield (
             f", unless it docks at {unsure[0] * problem.dt:.3f} s, {distance[unsure[0] - 1]:.8g} m from its goal at "

@@ -16,7 +16,9 @@ SECTIONS = (
     "denoising", "threads", "environments", "obstacles", "index", "robots", "startup", "memory", "plans", "big teams",
     "improvement", "big loops",
 )  # fmt: skip
-MODELS = (*COMMON, "unicycle", "unicycle1", "unicycle2", "car", "holonomic2d_jerk", "holonomic3d_drag")
+MODELS = (
+    *COMMON, "unicycle", "unicycle1", "unicycle2", "car", "car_first_order", "holonomic2d_jerk", "holonomic3d_drag",
+)  # fmt: skip
 
 Robots = Annotated[Count, Field(le=10_000)]
 """Number of robots, as many as scenarios make."""

@@ -2,12 +2,14 @@
 
 As L. E. Dubins' paths (1957), but with trailers a circle begins and ends with a swing, worked out beforehand. Since a
 swing leads as far wherever it begins, the centres of both circles are known, and with them the straight between. Where
-there is no room for trailers in line at the goal, the last swing is left out: they stay in a bend.
+there is no room for trailers in line at the goal, the last swing is left out: they stay in a bend; or the last swing
+leads to hitch angles that are asked for.
 """
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from itertools import product
 from typing import NamedTuple, TypeAlias
 
@@ -17,11 +19,11 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
 from d4orm_env.engine.elementary import arctan2, cosine, sine
+from d4orm_planners.manoeuvres.first_order_car_moves import circle, steering, swing, tightest_curvature
 from d4orm_planners.manoeuvres.kinds import Kind, Mode, held
 from d4orm_planners.manoeuvres.lattice import TURN, moved, turned_by, write_pose
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, drive
 from d4orm_planners.manoeuvres.snapping import Goal
-from d4orm_planners.manoeuvres.trailer_moves import circle, steering, swing, tightest_curvature
 
 LEVELS = (1.0, 0.5, 0.25, 0.125)
 """Curvatures, in that of the tightest circle."""
@@ -32,7 +34,7 @@ CIRCLES = len(LEVELS) * len(SIDES)
 
 class Curves(NamedTuple):
     """Circles of a car with its trailers: forwards to the left and to the right by levels, then in reverse; and once
-    more without the swings out of them, if curves end in a bend. ``W`` in all.
+    more, if curves end in a bend, with other swings out of them or none. ``W`` in all.
 
     Attributes:
         last: Number of the first one that may be a curve's last.
@@ -41,7 +43,7 @@ class Curves(NamedTuple):
         controls: ``(S, 2)``.
         ahead: ``(W, 2)`` centre of the circle, from where the swing into it begins.
         behind: ``(W, 2)`` the same from where the swing out of it ends.
-        swung: ``(W,)`` by which both swings together turn the heading [rad].
+        swung: ``(W,)`` by which both swings together turn the heading [rad]; NaN where there is no swing out of it.
         curvature: ``(W,)`` [1/m], to the left positive.
         steering: ``(W,)`` [rad].
         stride: ``(W,)`` distance in a step, in reverse negative [m].
@@ -76,21 +78,28 @@ NO_CURVES = Curves(
 
 
 @cache
-def curves_of(kind: Kind, bent: bool) -> Curves:
-    """Circles of a first-order car, and the swings between them and straight on; ``bent`` if curves end in a bend."""
+def curves_of(kind: Kind, bent: bool, hitches: Mode | None = None) -> Curves:
+    """Circles of a first-order car, and the swings between them and straight on.
+
+    Args:
+        kind: The car.
+        bent: Whether curves end in a bend, in the circles' own ...
+        hitches: ... or at these hitch angles [rad].
+    """
     swings, rows, straight, tightest = [], [], (0.0,) * len(kind.model.trailers), tightest_curvature(kind)
     if tightest is None:
         return NO_CURVES
-    for ends, way, level, side in product((False, True) if bent else (False,), (1, -1), LEVELS, SIDES):
+    after = _ends(kind, bent, hitches)
+    for end, way, level, side in product((_in_line, *after), (1, -1), LEVELS, SIDES):
         curvature = side * level * tightest
-        hitches = circle(kind, curvature)
-        assert hitches is not None
-        mode = tuple(hitches.tolist())
-        into, out = swing(kind, straight, mode, way), swing(kind, mode, straight, way)
-        if into is None or out is None:
+        angles = circle(kind, curvature)
+        assert angles is not None
+        mode = tuple(angles.tolist())
+        into, out = swing(kind, straight, mode, way), end(kind, mode, way)
+        if into is None or _in_line(kind, mode, way) is None:
             return NO_CURVES
-        if ends:
-            out = out[:0]
+        found = out is not None
+        out = held(0, 0.0, 0.0) if out is None else out
         first, last = _driven(kind, straight, into), _driven(kind, mode, out)
         swings += [(into, first[1:]), (out, last[1:])]
         (x, y, turn), (its_x, its_y, its_turn) = first[-1, :3].tolist(), last[-1, :3].tolist()
@@ -98,12 +107,32 @@ def curves_of(kind: Kind, bent: bool) -> Curves:
         ahead = (x - sine / curvature, y + cosine / curvature)
         sine, cosine = portable.sin_cos_of(its_turn)
         dx, dy = -its_x, 1 / curvature - its_y
-        behind, swung = (cosine * dx + sine * dy, cosine * dy - sine * dx), turn + its_turn
+        behind, swung = (cosine * dx + sine * dy, cosine * dy - sine * dx), turn + its_turn if found else np.nan
         rows.append((ahead, behind, swung, curvature, steering(kind, curvature), way * kind.pace(way) * kind.dt))
     controls, poses = zip(*swings, strict=True)
     begin = np.cumsum([0, *map(len, controls)])
     columns = (np.array(column) for column in zip(*rows, strict=True))
-    return Curves(2 * CIRCLES * bent, begin, np.concatenate(poses), np.concatenate(controls), *columns)
+    return Curves(2 * CIRCLES if after else 0, begin, np.concatenate(poses), np.concatenate(controls), *columns)
+
+
+def _in_line(kind: Kind, mode: Mode, way: int) -> FloatArray | None:
+    """Controls from hitch angles until trailers are in line."""
+    return swing(kind, mode, (0.0,) * len(mode), way)
+
+
+def _ends(kind: Kind, bent: bool, hitches: Mode | None) -> list[Callable[[Kind, Mode, int], FloatArray | None]]:
+    """How curves may end but in line: controls from the hitch angles of a circle to those at the goal."""
+    if hitches is None:
+        return [lambda kind, mode, way: held(0, 0.0, 0.0)] if bent else []
+
+    def directly(kind: Kind, mode: Mode, way: int) -> FloatArray | None:
+        return swing(kind, mode, hitches, way)
+
+    def over_straight(kind: Kind, mode: Mode, way: int, last: int) -> FloatArray | None:
+        some = _in_line(kind, mode, way), swing(kind, (0.0,) * len(mode), hitches, last)
+        return None if some[0] is None or some[1] is None else np.concatenate([some[0], some[1]])
+
+    return [directly, partial(over_straight, last=1), partial(over_straight, last=-1)]
 
 
 def _driven(kind: Kind, mode: Mode, controls: FloatArray) -> Floats:
@@ -165,11 +194,13 @@ def curve_of(curves: Curves, goal: Goal, x: float, y: float, heading: float, way
     if curves.last == 0 and way * along >= 0 and abs(across) <= 0.5 * goal.radius and turn <= 0.5 * goal.tolerance:
         return _count(curves, begin, along), -1, 0.0, along, begin, 0.0
     for first in range(begin, begin + CIRCLES):
-        level = curves.last + first - first % 2
-        for second in range(level, level + 2):
-            curve = _joined(curves, goal, x, y, heading, first, second)
-            if curve[0] > 0 and (best[0] == 0 or curve[0] < best[0]):
-                best = curve
+        for level in range(curves.last + first - first % 2, curves.swung.shape[0], 2 * CIRCLES):
+            for second in range(level, level + 2):
+                if np.isnan(curves.swung[second]):
+                    continue
+                curve = _joined(curves, goal, x, y, heading, first, second)
+                if curve[0] > 0 and (best[0] == 0 or curve[0] < best[0]):
+                    best = curve
     return best
 
 

@@ -91,5 +91,5 @@ class Kind:
 
 
 def held(count: int, *control: float) -> FloatArray:
-    """``(n, m)`` a control, for so many steps."""
-    return np.tile(np.array(control, np.float32), (count, 1))
+    """``(n, m)`` a control, for so many steps, or more than a move may have."""
+    return np.tile(np.array(control, np.float32), (min(count, MAX_STEPS + 1), 1))

@@ -11,8 +11,8 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION
+from d4orm_planners.manoeuvres.first_order_car_moves import first_order_car_moves
 from d4orm_planners.manoeuvres.kinds import SECTOR, Kind, Move, held
-from d4orm_planners.manoeuvres.trailer_moves import first_order_car_moves
 
 TURNS = (1, 2)
 """Sectors by which an arc turns, to either side."""

@@ -26,12 +26,15 @@ AHEAD, BEHIND = -2, -3
 
 
 @compiled
-def reaches(goal: Goal, x: float, y: float, heading: float, speed: float, wider: float) -> bool:
-    """Check whether a robot is at its goal, with radius and heading tolerance so many times as wide."""
-    dx, dy, radius = goal.x - x, goal.y - y, goal.radius * wider
+def reaches(goal: Goal, pose: Floats, speed: float, wider: float) -> bool:
+    """Check whether a robot is at its goal in a pose ``(6,)``, radius and heading tolerance so many times as wide."""
+    dx, dy, radius, tolerance = goal.x - pose[0], goal.y - pose[1], goal.radius * wider, goal.tolerance * wider
     if dx * dx + dy * dy > radius * radius or speed > goal.speed:
         return False
-    return np.isnan(goal.heading) or abs(turned_by(goal.heading - heading)) <= goal.tolerance * wider
+    for i in range(3):
+        if abs(goal.hitches[i] - pose[3 + i]) > tolerance:  # not if it is NaN
+            return False
+    return np.isnan(goal.heading) or abs(turned_by(goal.heading - pose[2])) <= tolerance
 
 
 @compiled
@@ -80,9 +83,9 @@ def stretch_steps(task: Task, x: float, y: float, heading: float, move: int) -> 
 def arrives_after(task: Task, nodes: Nodes, count: int) -> int:
     """Steps of a move after which the robot has arrived: more than it has for none, zero where rounding decides."""
     for step in range(1, count + 1):
-        x, y, heading, _, _, _, speed = nodes.swept[step]
-        if reaches(task.goal, x, y, heading, speed, 1.02):
-            return step if reaches(task.goal, x, y, heading, speed, 1.0) else 0
+        pose, speed = nodes.swept[step], nodes.swept[step, POSE_SIZE]
+        if reaches(task.goal, pose, speed, 1.02):
+            return step if reaches(task.goal, pose, speed, 1.0) else 0
     return count + 1
 
 

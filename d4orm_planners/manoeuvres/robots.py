@@ -20,7 +20,6 @@ from d4orm_planners.manoeuvres.lattice import PoseLattice, RobotBody
 from d4orm_planners.manoeuvres.model_moves import MOVES
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives, primitives_of
 from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, TURNING, Goal, Limits
-from d4orm_planners.manoeuvres.trailer_moves import first_order_car_moves
 
 CELLS_PER_RADIUS = 3
 """Cells in the outer radius of the largest robot."""
@@ -58,6 +57,10 @@ class ManoeuvreScene(NamedTuple):
     def interaction_range(self) -> float:
         """Distance beyond which two robots do not matter to each other in a step [m]."""
         return 2 * float(self.problem.team.radius.max()) + self.extra + 2 * self.problem.stride
+
+    def with_cells(self, share: float) -> ManoeuvreScene:
+        """The same with smaller cells."""
+        return self._replace(area=self.area._replace(cell=share * self.area.cell))
 
     def body(self, robot: int) -> RobotBody:
         """A robot among the obstacles."""
@@ -120,12 +123,14 @@ def distance_kept(problem: Problem, bent: BoolArray) -> float:
 
 
 def _at_goals(problem: Problem) -> FloatArray:
-    """``(K, n)`` states in which robots are at their goals, trailers in line."""
+    """``(K, n)`` states in which robots are at their goals, trailers in line unless hitch angles are asked for."""
     goals = np.zeros_like(problem.start)
     goals[:, :2] = problem.goal
     for robot, model in enumerate(problem.team.robot_models):
         if model.heading_index is not None:
             goals[robot, model.heading_index] = problem.goal_heading[robot]
+        for (hitch, _), angle in zip(model.trailers, problem.goal_hitches[robot].tolist(), strict=False):
+            goals[robot, hitch] = 0.0 if np.isnan(angle) else angle
     return goals
 
 
@@ -133,7 +138,8 @@ def must_bend(problem: Problem) -> BoolArray:
     """``(K,)`` whether trailers in line would overlap with an obstacle or a bound at the robot's goal."""
     team, poses, bent = problem.team, problem.team.body_poses(_at_goals(problem)), np.zeros(problem.num_robots, bool)
     for body, pose in zip(team.bodies, poses, strict=True):
-        if team.robot_models[body.robot].trailers and not np.isnan(pose).any():
+        free = np.isnan(problem.goal_hitches[body.robot]).all()
+        if team.robot_models[body.robot].trailers and free and not np.isnan(pose).any():
             bent[body.robot] |= world_gap(problem.world, body.footprint, pose) <= 0
     return bent
 
@@ -203,23 +209,23 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     start[3 : 3 + len(model.trailers)] = state[3 : 3 + len(model.trailers)]
     sectors = 1 if model.heading_index is None else SECTORS
     lattice = area.lattice(area.cell, float(start[2]), sectors, len(modes))
-    bent = bool(scene.bent[number])
+    wanted = tuple(np.nan_to_num(problem.goal_hitches[number, : len(model.trailers)].astype(np.float64)).tolist())
+    hitches = wanted if any(wanted) else None
+    bent = bool(scene.bent[number]) or hitches is not None
     costs = Costs(lattice, np.zeros(0, np.float32), np.inf, 0.0, (0.0, 0.0))
     if problem.world.num_obstacles or last.way in (NOWHERE, CURVING):
         costs = costs_of(kind, area, body, start, goal, problem.num_robots, bent)
-    curves = curves_of(kind.base, bent) if last.way == CURVING else NO_CURVES
+    curves = curves_of(kind.base, bent, hitches) if last.way == CURVING else NO_CURVES
     mode = modes.index(kind.start)
     return Robot(model, start, mode, goal, last, curves, body, primitives, lattice, costs)
 
 
 def _limits(kind: Kind) -> Limits:
     model, own, lower = kind.model, kind.limits, kind.lower
-    way = SIDEWAYS if model.heading_index is None else TURNING if model.turns_in_place else NOWHERE
-    if MOVES[model.name] is first_order_car_moves:
-        way = CURVING
+    way = TURNING if model.turns_in_place else CURVING if model.first_order else NOWHERE
     swing = own[MAX_TURN_ACCELERATION] if model.name == UNICYCLE2.name else np.inf
     return Limits(
-        way, own[SPEED], lower[SPEED],
+        SIDEWAYS if model.heading_index is None else way, own[SPEED], lower[SPEED],
         np.inf if model.first_order else own[ACCELERATION], own[TURN_RATE], lower[TURN_RATE], swing,
         float(np.float32(kind.dt)),
     )  # fmt: skip
@@ -228,7 +234,8 @@ def _limits(kind: Kind) -> Limits:
 def _goal(problem: Problem, number: int) -> Goal:
     heading = np.nan if problem.team.robot_models[number].heading_index is None else problem.goal_heading[number]
     return Goal(
-        float(problem.goal[number, 0]), float(problem.goal[number, 1]), float(heading), problem.goal_radius * CERTAIN,
+        float(problem.goal[number, 0]), float(problem.goal[number, 1]), float(heading),
+        tuple(problem.goal_hitches[number].astype(np.float64).tolist()), problem.goal_radius * CERTAIN,
         float(problem.goal_heading_tolerance[number]) * CERTAIN, float(problem.goal_speed[number]) * CERTAIN,
         problem.docks,
     )  # fmt: skip

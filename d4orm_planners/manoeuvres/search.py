@@ -177,7 +177,7 @@ def find_motion(task: Task, traffic: Traffic, nodes: Nodes, start: Floats, mode:
         ends = task.primitives.rests[nodes.mode[node]] and nodes.until[node] == NEVER
         if task.limits.way == CURVING and task.curves.last == 0:
             ends = ends and nodes.mode[node] == 0
-        if ends and reaches(task.goal, x, y, heading, 0.0, 1.0):
+        if ends and reaches(task.goal, nodes.pose[node], 0.0, 1.0):
             return node
         _snaps(task, nodes, traffic, node)
         begin, end = task.primitives.begin[nodes.mode[node]], task.primitives.begin[nodes.mode[node] + 1]

@@ -49,6 +49,7 @@ class Goal(NamedTuple):
         x: [m].
         y: [m].
         heading: [rad], NaN for any.
+        hitches: Hitch angles [rad], NaN for any.
         radius: Distance at which the robot has arrived beyond doubt [m].
         tolerance: The same of its heading [rad].
         speed: The same of its speed [m/s].
@@ -58,6 +59,7 @@ class Goal(NamedTuple):
     x: float
     y: float
     heading: float
+    hitches: tuple[float, float, float]
     radius: float
     tolerance: float
     speed: float

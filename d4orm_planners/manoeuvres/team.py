@@ -27,6 +27,9 @@ FIRST_NODES = 400_000
 team it is quicker to change others' motions."""
 WEIGHT = 1.5
 """Factor by which the steps ahead of a node count more than those behind it."""
+FINER = (0.8, 0.6)
+"""Sizes of cells that are tried in turn for a robot without a motion alone, as shares of the usual one: whether poses
+that count as one leave a way through a tight place is chance."""
 DEPARTURE_INTERVAL = 0.7
 """Time between departures that are tried, as a share of that in which the fastest robot drives the radius of the
 largest one."""
@@ -80,7 +83,12 @@ class TeamMotions:
         def find_alone(part: IntArray) -> None:
             nodes = self._room_for_nodes()
             for robot in range(part[0], part[1]):
-                self.alone[robot] = self._search(robot, nobody, nodes, 1 + robot, MAX_NODES)
+                for share in (1.0, *FINER):
+                    if share < 1.0:
+                        self.robots[robot] = make_robot(scene.with_cells(share), robot) or self.robots[robot]
+                    self.alone[robot] = self._search(robot, nobody, nodes, 1 + robot, MAX_NODES)
+                    if self.alone[robot] is not None or should_stop():
+                        break
 
         Threads(available_cores()).over(size, find_alone)
 

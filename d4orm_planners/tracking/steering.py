@@ -55,7 +55,7 @@ def preferred_velocities(problem: Problem, states: FloatArray, goals: FloatArray
         return wanted
     offset = goals - states[:, : problem.dimension]
     turning = ~np.isnan(problem.goal_heading) & ((offset * offset).sum(axis=1) <= problem.arrays.squared_goal_radius)
-    creep = problem.team.max_speed[:, None] * CREEPING * directions
+    creep = problem.team.max_speed[:, None] * CREEPING * directions[:, :2]
     return np.where(turning[:, None], creep, wanted)
 
 

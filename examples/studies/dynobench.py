@@ -6,40 +6,41 @@
 
 A row for each file, or for all that one generator drew of one size: how many runs solved them within a minute of
 planning, compilation not counted, how long that took, and how long robots are under way; medians of those that solved
-it. Files that `load_problem` refuses have the reason in their row of the trials.
+it. Files that `load_dynobench` refuses have the reason in their row of the trials.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from examples.common import grouped, save_table, study_parser, study_rows
 
-from d4orm_env import Problem, load_problem
+from d4orm_env import Problem, load_dynobench
 from d4orm_planners import Plan, make_planner
 
 LIMIT = 60.0
 """Time to plan [s]."""
 
 
-def loaded(path: Path) -> Problem | str:
+def loaded(path: Path, load: Callable[[Path], Problem]) -> Problem | str:
     """The problem of a file, or why there is none."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # starts within the margin, which is zero there
-            return load_problem(path)
+            return load(path)
     except ValueError as error:
         return str(error).removeprefix(f"{path}: ")
 
 
-def row_of(checkout: Path, path: Path, seed: int) -> dict[str, Any]:
+def row_of(benchmark: str, path: Path, seed: int, load: Callable[[Path], Problem] = load_dynobench) -> dict[str, Any]:
     """The row of a file and a seed."""
-    problem = loaded(path)
-    row: dict[str, Any] = {"benchmark": checkout.name, "instance": path.stem, "seed": seed, "refused": ""}
+    problem = loaded(path, load)
+    row: dict[str, Any] = {"benchmark": benchmark, "instance": path.stem, "seed": seed, "refused": ""}
     row |= {"robots": 0, "models": "", "solved": False}
     row |= {"seconds": np.nan, "makespan": np.nan, "sum_of_costs": np.nan}
     if isinstance(problem, str):
@@ -57,7 +58,9 @@ def main() -> None:
     parser = study_parser(__doc__, seeds=5)
     parser.add_argument("--checkouts", type=Path, nargs="+", default=(), help="checkouts with instances in example/")
     arguments = parser.parse_args()
-    paths = [(folder, path) for folder in arguments.checkouts for path in sorted((folder / "example").rglob("*.yaml"))]
+    paths = [
+        (folder.name, path) for folder in arguments.checkouts for path in sorted((folder / "example").rglob("*.yaml"))
+    ]
     if not paths and arguments.trials is None:
         parser.error("give --checkouts with instances in example/, or --trials")
     rows = study_rows(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,9 +38,16 @@ def test_an_instance_means_what_it_says() -> None:
     assert (problem.arrival, problem.margin, problem.dt) == ("stay", 0.0, 0.25)
 
 
+def test_headings_may_turn_clockwise_as_those_of_cl_cbs() -> None:
+    usual, mirrored = load_cl_mapf(EXAMPLE), load_cl_mapf(EXAMPLE, clockwise=True)
+    np.testing.assert_array_equal(mirrored.start[:, 2], -usual.start[:, 2])
+    np.testing.assert_array_equal(mirrored.goal_heading, -usual.goal_heading)
+    np.testing.assert_array_equal(mirrored.goal, usual.goal)
+
+
 def test_cars_turn_in_circles_of_the_given_radius() -> None:
     problem = load_cl_mapf(EXAMPLE, vehicle={"r": 4.0})
-    controls = np.tile(np.array([1.0, 1.5], np.float32), (problem.horizon, 4, 1))  # wheels as far as they turn
+    controls = np.tile(np.array([1.0, 3.0], np.float32), (problem.horizon, 4, 1))  # wheels as far as they turn
     turned = rollout(problem, controls).states[4, 0, 2] - problem.start[0, 2]
     assert turned == pytest.approx(4 * problem.dt / 4.0, rel=1e-5)
 
@@ -56,22 +64,26 @@ def test_cars_meet_their_goal_poses() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("agents:", "robots:", "is no problem of CL-CBS or CSDO (it lacks 'agents'); it has agents: start, goal; map"),
+        ("start:", "begin:", "is no problem of CL-CBS or CSDO (it lacks 'start'); it has agents: start, goal; map"),
+        ("map:", "maps:", "is no problem of CL-CBS or CSDO (it lacks 'map'); it has agents: start, goal; map"),
+        ("obstacles:", "obstacle:", "map has the key 'obstacle'; did you mean 'obstacles'?"),
         ("dimensions: [30, 30]", "dimensions: [30]", "dimensions of map is [30]; it must have numbers, 2 of them"),
         ("goal: [25, 10, 0]", "goal: [25, 10]", "goal of robot_0 is [25, 10]; it must have numbers, 3 of them"),
-        ("[10, 15]", "[10, left]", "obstacle 0 is [10, 'left']; it must have numbers, 2 of them"),
-        ("[10, 15]", "[10, 15, wide]", "obstacle 0 is [10, 15, 'wide']; it must"),
+        ("goal: [25, 10, 0]", "goal: [25, 10, ~]", "goal of robot_0 is [25, 10, None]; all must be numbers of at most"),
         (
             "start: [5, 10, 0]",
-            "start: [0, 10, 0]",
-            "start of robot_0 at (0, 10) is 0.99 m inside an obstacle",
+            "start: [.inf, 10, 0]",
+            "start of robot_0 is [inf, 10, 0]; all must be numbers of at most",
         ),
+        ("[10, 15]", "[10, left]", "obstacle 0 is [10, 'left']; it must be a list of numbers"),
+        ("[10, 15]", "[10, 15, 1, 1]", "obstacle 0 is [10.0, 15.0, 1.0, 1.0]; it must have numbers, 2 or 3 of them"),
+        ("start: [5, 10, 0]", "start: [0, 10, 0]", "start of robot_0 at (0, 10) is 0.99 m inside an obstacle"),
     ],
 )
 def test_what_is_wrong_is_told(instance: Path, old: str, new: str, message: str) -> None:
     instance.write_text(instance.read_text().replace(old, new))
     with pytest.raises(ValueError, match=rf"^{re.escape(str(instance))}: .*{re.escape(message)}"):
-        load_cl_mapf(instance)
+        load_problem(instance)
 
 
 @pytest.mark.parametrize(
@@ -82,8 +94,10 @@ def test_what_is_wrong_is_told(instance: Path, old: str, new: str, message: str)
             "vehicle's entry 'carwidth' is unknown; choose one of r, carWidth, LF, LB, obs",
         ),
         ({"LF": -2.0}, "LF of vehicle is -2; it must be positive"),
+        ({"r": "wide"}, "r of vehicle"),
+        ([3.0], r"vehicle must be a mapping such as {'r': 3.0}, not \[3.0\]"),
     ],
 )
-def test_entries_of_a_vehicle_are_checked(vehicle: dict[str, float], message: str) -> None:
+def test_entries_of_a_vehicle_are_checked(vehicle: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load_cl_mapf(EXAMPLE, vehicle=vehicle)

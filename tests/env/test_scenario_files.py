@@ -101,7 +101,7 @@ def problems(draw: st.DrawFn) -> Problem:
     limits = (array(numbers, count) for numbers in (positive, positive, st.floats(2**-10, 2, width=32)))
     speed, *others = limits
     # A car as long as it drives in a second turns no faster than the others.
-    own = {"wheelbase": speed} if "car" in models else {}
+    own = {"wheelbase": speed} if {"car", "car_first_order"} & set(models) else {}
     team = Team(models, array(st.floats(2**-20, 0.5, width=32), count), speed, *others, own_limits=own)
     positions = array(offsets, 2, count, dimension)
     positions[:, :, 0] += 2 * np.arange(count)

@@ -143,9 +143,9 @@ def test_cars_of_a_benchmark_are_planned(tmp_path: Path) -> None:
     content = (EXAMPLES / "scenarios" / "cl_mapf_cars.yaml").read_text()
     (folder / "map_30by30_obst2_agents4_ex0.yaml").write_text(content)
     (folder / "map_30by30_obst2_agents4_ex1.yaml").write_text(content.replace("[15, 5, 1.57]", "[10, 15, 0]"))
-    completed("cl_mapf", tmp_path / "out", "--checkouts", str(tmp_path / "cars"))
+    completed("cl_mapf", tmp_path / "out", "--csdo", str(tmp_path / "cars"))
     (row,) = table(tmp_path / "out" / "cl_mapf.csv")
-    assert (row["benchmark"], row["instances"], row["solved"]) == ("cars", "30by30,   4 cars", "1 of 1")
+    assert (row["benchmark"], row["instances"], row["solved"]) == ("CSDO", "30by30 m,   4 cars", "1 of 1")
 
 
 def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) -> None:

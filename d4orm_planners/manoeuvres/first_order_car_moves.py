@@ -14,7 +14,7 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats
-from d4orm_env.dynamics.car_with_trailers import MAX_STEERING, WHEELBASE
+from d4orm_env.dynamics.first_order_cars import MAX_STEERING, WHEELBASE
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, SECTOR, Kind, Mode, Move, held
 
 SHARE = 0.95
