@@ -113,8 +113,9 @@ class Problem(Frozen):
         goal_heading_tolerance: ArrayLike = 0.1,
         goal_hitches: ArrayLike | None = None,
     ) -> None:
-        world = world_of(world, team.dimension)
-        size = team.num_robots
+        if not isinstance(team, Team):
+            raise ValueError(f"team is {team!r}; give a Team, as make_team() returns")
+        world, size = world_of(world, team.dimension), team.num_robots
         numbers = checks.checked_numbers(dt, horizon, margin, goal_radius, collision_penalty, size)
         checks.check_arrival(arrival)
         self._set(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -84,6 +84,8 @@ class World(Frozen):
             name: None if given is None else frozen_array(given, f"bounds {name}", (dimension,), largest=LARGEST)
             for name, given in (("lower", lower), ("upper", upper))
         }
+        if not isinstance(polygons, Iterable):
+            raise ValueError(f"polygons must be a list of polygons, each a list of corners, not {polygons!r}")
         corners = tuple(
             frozen_array(given, f"polygons[{index}]", (None, 2), largest=LARGEST)
             for index, given in enumerate(polygons)

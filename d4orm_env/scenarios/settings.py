@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import cached_property
 from typing import Any, SupportsFloat
 
@@ -162,6 +162,14 @@ def parsed(content: object) -> Footprint:
     if kind is None:
         raise unknown("footprint", content["shape"], KINDS)
     sizes = {name: value for name, value in content.items() if name != "shape"}
+    parts = fields(kind)  # type: ignore[arg-type] # all are dataclasses
+    known = [part.name for part in parts]
+    lacking = [part.name for part in parts if part.default is MISSING and part.name not in sizes]
+    for name in sizes:
+        if name not in known:
+            raise unknown(f"footprint {content['shape']}: field", name, known)
+    if lacking:
+        raise ValueError(f"footprint {content['shape']} lacks {', '.join(lacking)}; it has {', '.join(known)}")
     try:
         if kind is Train:
             bodies: list[Any] = [parsed(sizes.pop("front")), *map(parsed, sizes.pop("trailers"))]

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from d4orm_env.core import portable
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch
 from d4orm_env.verify.convex_bodies import ConvexBodies
-from d4orm_env.verify.discs import CHORD_ERROR, surroundings
+from d4orm_env.verify.curves import CHORD_ERROR
+from d4orm_env.verify.discs import surroundings
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
 from d4orm_env.verify.footprints import TurningPairs, turning_watches
 from d4orm_env.verify.geometry import Floats, norm

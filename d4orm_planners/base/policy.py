@@ -216,8 +216,8 @@ class OpenLoop(StatePolicy):
             self.plan = planner.solve(self.problem, seed=seed, time_limit=self.time_limit)
         elif self.plan is not None and self.plan.problem != self.problem:
             raise ValueError(
-                "the plan was made for another problem than the environment's; plan for this one, or keep one with "
-                "randomize_instance=False"
+                "the plan was made for another problem than the environment's; plan for this one, keep one with "
+                "randomize_instance=False, or give a Controller, which holds back some of the limits, reserve=0"
             )
 
     def identity(self) -> dict[str, object]:

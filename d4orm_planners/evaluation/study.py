@@ -74,8 +74,10 @@ class Study:
             for condition in under:
                 EnvSetup(EnvOptions.of(problem=problem, disturbances=condition.disturbances, **self.observation))
             check_physics(problem, self.physics)
+        texts = (one for one in _several(self.scenarios) if isinstance(one, str) and not is_scenario_file(one))
+        imports = tuple(text for text in texts if ":" in text)
         return [
-            [Job(policy, problem, scenario, seed, under) for seed, problem in zip(seeds, problems)]
+            [Job(policy, problem, scenario, seed, under, imports) for seed, problem in zip(seeds, problems)]
             for scenario, problems in cells
             for policy in policies
         ]

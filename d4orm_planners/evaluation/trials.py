@@ -20,7 +20,7 @@ from d4orm_env import verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.errors import describe
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.registry import source_digest
+from d4orm_env.core.registry import load_reference, source_digest
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
 from d4orm_planners.base.episode import Episode, open_env, run_episode
@@ -117,13 +117,17 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Job:
-    """A policy on a problem with one seed, under several conditions."""
+    """A policy on a problem with one seed, under several conditions.
+
+    ``scenario`` is a name for the results; ``imports`` are import paths, after which a process knows users' models.
+    """
 
     policy: Configuration
     problem: Problem
     scenario: str
     seed: int
     conditions: tuple[Condition, ...]
+    imports: tuple[str, ...] = ()
 
     def key(self, condition: Condition) -> TrialKey:
         """Return the key of the trial under one condition."""
@@ -157,6 +161,8 @@ class Job:
         Raises:
             KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
         """
+        for reference in self.imports:
+            load_reference(reference)
         timed: _TimedPolicy | None = None
         for condition in self.conditions:
             begin = time.perf_counter()

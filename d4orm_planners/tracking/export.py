@@ -24,7 +24,7 @@ from d4orm_env.core.arrays import Floats
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.problem import Problem
 from d4orm_env.verify import VerificationReport
-from d4orm_env.verify.discs import verify_curves
+from d4orm_env.verify.curves import verify_curves
 from d4orm_planners.tracking.ros_messages import write_bag
 from d4orm_planners.tracking.setpoints import Setpoints, sample_motion
 from d4orm_planners.tracking.smoothing import SmoothMotion
@@ -93,8 +93,11 @@ def _pieces(motion: SmoothMotion, count: int) -> tuple[PPoly, float]:
 
 def _verified(motion: SmoothMotion, curves: PPoly) -> VerificationReport:
     times = np.linspace(0, motion.duration, (len(curves.x) - 1) * CHECKS + 1)
-    bend = np.linalg.norm(curves(times, nu=2)[..., :-1], axis=2).max(axis=0)
-    return verify_curves(motion.problem, lambda times: curves(times)[..., :-1], motion.duration, bend)
+    second = curves(times, nu=2)
+    turned = motion.problem.team.radius * (np.abs(second[..., -1]) + curves(times, nu=1)[..., -1] ** 2)
+    bend = (np.linalg.norm(second[..., :-1], axis=2) + turned).max(axis=0)
+    position, heading = (lambda times: curves(times)[..., :-1]), (lambda times: curves(times)[..., -1])
+    return verify_curves(motion.problem, position, motion.duration, bend, heading)
 
 
 def _coefficients(motion: SmoothMotion, curves: PPoly, height: float) -> Floats:
@@ -201,6 +204,8 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         raise ValueError(f"height is {height!r}; it must be a finite number")
     if height and motion.problem.dimension == 3:
         raise ValueError(f"height is {height:g} m, and this team has heights of its own; leave it out")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file; give a folder")
     setpoints = sample_motion(motion, rate)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder.parent, prefix=".export") as name:

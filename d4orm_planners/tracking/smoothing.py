@@ -20,8 +20,9 @@ from scipy.sparse.linalg import splu
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.verify import VerificationReport
-from d4orm_env.verify.discs import verify_curves
+from d4orm_env.verify.curves import has_trailers, verify_curves
 from d4orm_planners.tracking.steering import present_velocities
 
 DEGREE = 5
@@ -42,8 +43,11 @@ class MotionLimits:
     """Limits of what a robot's controller is asked for, each ``(K,)``; infinite for none."""
 
     speed: Floats  #: [m/s]
+    reverse_speed: Floats  #: [m/s]; of robots with a heading
+    turn_rate: Floats  #: [rad/s]; to the left
+    right_turn_rate: Floats  #: [rad/s]
     acceleration: Floats  #: [m/s^2]; of robots with a heading along it
-    turn_rate: Floats  #: [rad/s]
+    turn_acceleration: Floats  #: [rad/s^2]
     jerk: Floats  #: [m/s^3]
 
     @classmethod
@@ -53,18 +57,27 @@ class MotionLimits:
         Raises:
             ValueError: If one is not positive, or neither one number nor one per robot.
         """
-        team = problem.team
-        models = zip(team.robot_models, team.limits, team.max_acceleration, strict=True)
-        own = [
-            (np.inf if model.first_order else most, model.turn_rate(limits) or np.inf) for model, limits, most in models
-        ]
-        accelerations, turn_rates = np.array(own, np.float64).T
-        return cls(
-            team.max_speed.astype(np.float64),
-            _each("max_acceleration", acceleration, accelerations),
-            turn_rates,
-            _each("max_jerk", jerk, np.full(team.num_robots, np.inf)),
-        )
+        team, rows = problem.team, []
+        for model, limits in zip(team.robot_models, team.limits.astype(np.float64), strict=True):
+            own, lower = dict(zip(model.limit_names, limits.tolist(), strict=False)), model.lower_bounds(limits)
+            fastest = model.turn_rate(limits) or np.inf
+            left, right = (limits, lower) if TURN_RATE in dict(model.lower_limits) else ([fastest] * 4, [fastest] * 4)
+            rows.append([
+                limits[SPEED], np.inf if model.heading_index is None else lower[SPEED], left[TURN_RATE],
+                right[TURN_RATE], np.inf if model.first_order else limits[ACCELERATION],
+                own.get("max_turn_acceleration", np.inf), own.get("max_jerk", np.inf),
+            ])  # fmt: skip
+        columns = dict(zip(LIMITS, np.array(rows, np.float64).T, strict=True))
+        for name, given in (("acceleration", acceleration), ("jerk", jerk)):
+            columns[name] = _each(f"max_{name}", given, columns[name])
+        return cls(**columns)
+
+
+LIMITS = {
+    "speed": ("m/s", 1), "reverse_speed": ("m/s", 1), "turn_rate": ("rad/s", 1), "right_turn_rate": ("rad/s", 1),
+    "acceleration": ("m/s^2", 2), "turn_acceleration": ("rad/s^2", 2), "jerk": ("m/s^3", 3),
+}  # fmt: skip
+"""Units of the limits, and by which power of its duration a slower motion has less of each."""
 
 
 def _each(name: str, value: ArrayLike | None, otherwise: Floats) -> Floats:
@@ -109,38 +122,44 @@ class SmoothMotion:
 
     @cached_property
     def peaks(self) -> MotionLimits:
-        """Peaks of speed, acceleration, turn rate and jerk of each robot."""
+        """Peaks of what is limited, of each robot."""
         steps = round(self.curves.t[-1] / self.problem.dt)
         times = np.linspace(0, self.duration, steps * PER_STEP + 1)
         velocity, acceleration, jerk = (self.position(times, order) for order in (1, 2, 3))
-        heading = self.heading(times)
-        along = np.abs(acceleration[..., 0] * np.cos(heading) + acceleration[..., 1] * np.sin(heading))
+        heading, rate = self.heading(times), self.heading(times, 1)
+        ahead, faster = (
+            part[..., 0] * np.cos(heading) + part[..., 1] * np.sin(heading) for part in (velocity, acceleration)
+        )
         has_heading = np.array([model.heading_index is not None for model in self.problem.team.robot_models])
-        sizes = np.where(has_heading, along, np.linalg.norm(acceleration, axis=2))
         return MotionLimits(
-            np.linalg.norm(velocity, axis=2).max(axis=0),
-            sizes.max(axis=0),
-            np.abs(self.heading(times, 1)).max(axis=0),
-            np.linalg.norm(jerk, axis=2).max(axis=0),
+            speed=np.linalg.norm(velocity, axis=2).max(axis=0),
+            reverse_speed=(-ahead).max(axis=0),
+            turn_rate=rate.max(axis=0),
+            right_turn_rate=(-rate).max(axis=0),
+            acceleration=np.where(has_heading, np.abs(faster), np.linalg.norm(acceleration, axis=2)).max(axis=0),
+            turn_acceleration=np.abs(self.heading(times, 2)).max(axis=0),
+            jerk=np.linalg.norm(jerk, axis=2).max(axis=0),
         )
 
     @cached_property
     def report(self) -> VerificationReport:
-        """Verdict of :func:`d4orm_env.verify.discs.verify_curves`."""
+        """Verdict of :func:`d4orm_env.verify.curves.verify_curves`."""
         times = np.linspace(0, self.duration, round(self.curves.t[-1] / self.problem.dt) * PER_STEP + 1)
-        bend = np.linalg.norm(self.position(times, 2), axis=2).max(axis=0)
-        return verify_curves(self.problem, self.position, self.duration, bend)
+        turned = self.problem.team.radius * (np.abs(self.heading(times, 2)) + self.heading(times, 1) ** 2)
+        bend = (np.linalg.norm(self.position(times, 2), axis=2) + turned).max(axis=0)
+        return verify_curves(self.problem, self.position, self.duration, bend, self.heading)
 
     def within(self, limits: MotionLimits) -> SmoothMotion:
         """The same motion, as slow as these limits need."""
-        peaks = self.peaks
-        needed = [
-            (1 + RESERVE) * (peaks.speed / limits.speed).max(),
-            (1 + RESERVE) * (peaks.turn_rate / limits.turn_rate).max(),
-            np.sqrt((1 + RESERVE) * (peaks.acceleration / limits.acceleration).max()),
-            np.cbrt((1 + RESERVE) * (peaks.jerk / limits.jerk).max()),
-        ]
-        return replace(self, stretch=self.stretch * max(1.0, *map(float, needed)))
+        return replace(self, stretch=self.stretch * max(1.0, *(needed for needed, _ in self.needed(limits).values())))
+
+    def needed(self, limits: MotionLimits) -> dict[str, tuple[float, int]]:
+        """How many times as slow each of :data:`LIMITS` needs the motion to be, and the robot that it is for."""
+        needed = {}
+        for name, (_, power) in LIMITS.items():
+            share = (1 + RESERVE) * getattr(self.peaks, name) / getattr(limits, name)
+            needed[name] = float(max(share.max(), 0.0)) ** (1 / power), int(np.argmax(share))
+        return needed
 
 
 def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits) -> SmoothMotion:
@@ -167,20 +186,20 @@ def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits
     for motion in motions:
         if motion.report.ok and motion.stretch <= SLOWEST:
             return motion
+    discs = "; cars with trailers count as the discs round them" if has_trailers(problem) else ""
     raise ValueError(
-        f"smoothed, the plan fails: {best.report.violations[0]}; plan with a larger margin, or allow more acceleration "
-        "with max_acceleration"
+        f"smoothed, the plan fails: {best.report.violations[0]}{discs}; plan with a larger margin, or allow more "
+        "acceleration with max_acceleration"
     )
 
 
 def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
-    peaks = replace(motion, stretch=1.0).peaks
-    for name, unit in (("acceleration", "m/s^2"), ("jerk", "m/s^3"), ("turn_rate", "rad/s"), ("speed", "m/s")):
-        most, limit = getattr(peaks, name), getattr(limits, name)
-        robot = int(np.argmax(most / limit))
-        if most[robot] > limit[robot]:
-            values = f"{most[robot]:.3g} {unit} of {name.replace('_', ' ')}, limit {limit[robot]:.3g}"
-            break
+    usual = replace(motion, stretch=1.0)
+    needed = usual.needed(limits)
+    name = max(needed, key=lambda name: needed[name][0])
+    robot = needed[name][1]
+    most, limit = getattr(usual.peaks, name)[robot], getattr(limits, name)[robot]
+    values = f"{most:.3g} {LIMITS[name][0]} of {name.replace('_', ' ')}, limit {limit:.3g}"
     remedy = "plan with goal_speed, for robots stop in one step without it"
     demand = f"robot_{robot} needs {values}, and {why}"
     return f"smoothed, the plan asks for too much: {demand}; {remedy}, or allow more with max_{name}"

@@ -18,6 +18,7 @@ from shapely import geometry as shapely
 from d4orm_env import Problem, Team, World, load_problem, make_problem, navigation_v0, rollout, save_problem, verify
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Footprint, Polygon
+from d4orm_env.scenarios.settings import parsed
 from d4orm_env.verify.footprints import Obstacles, Sides, TurningPairs
 
 KITE = Polygon([[0.3, 0.0], [0.0, 0.2], [-0.2, 0.1], [-0.2, -0.1]])
@@ -263,3 +264,23 @@ def test_discs_and_balls_round_bodies_hide_no_gap_from_the_judge(
         assert report.min_separation == pytest.approx(everything.min_separation, abs=1e-9)
         assert report.min_clearance == pytest.approx(everything.min_clearance, abs=1e-9)
     assert contacts >= {"robot contact", "obstacle contact", "bounds contact"}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"shape": "box", "length": 0.3}, "footprint box lacks width; it has length, width, offset"),
+        ({"shape": "disc", "radus": 0.3}, "footprint disc: field 'radus' is unknown; choose one of radius; did you"),
+        ({"shape": "train", "front": {"shape": "disc", "radius": 0.1}}, "footprint train lacks trailers; it has front"),
+    ],
+)
+def test_fields_of_a_footprint_in_a_file_are_checked(content: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        parsed(content)
+
+
+def test_what_is_no_team_or_no_polygon_is_told() -> None:
+    with pytest.raises(ValueError, match=r"team is 5; give a Team, as make_team\(\) returns"):
+        Problem(5, [[0]], [[0]])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="polygons must be a list of polygons, each a list of corners, not 5"):
+        World(polygons=5)  # type: ignore[arg-type]

@@ -710,3 +710,24 @@ def test_an_unreachable_cluster_is_one_line(d4orm, address: str, message: str, m
     status, _, err = d4orm("evaluate", "-p", "go-to-goal", "-k", "2", "-n", "1", "--ray", address)
     assert (status, err.count("\n")) == (2, 1)
     assert message in err
+
+
+OWN_MODEL = """
+from d4orm_env import make_problem, register_model
+from d4orm_env.dynamics.models import get_model
+
+register_model(dataclasses.replace(get_model("velocity2d"), name="drifter"))
+
+
+def arena(seed, num_robots=2):
+    return make_problem("circle", num_robots=num_robots, seed=seed, model="drifter")
+"""
+
+
+@pytest.mark.slow
+def test_workers_know_the_models_of_a_scenarios_module(tmp_path: Path, d4orm) -> None:
+    Path("own.py").write_text("import dataclasses\n" + OWN_MODEL)
+    arguments = ("--policy", "go-to-goal", "--num-robots", "2", "--seeds", "2", "--workers", "2", "--out", "out", "-q")
+    result = d4orm("evaluate", "--scenario", "own.py:arena", *arguments)
+    assert result.status == 0, result.err
+    assert "error" not in result.err

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from d4orm_env import Problem, Team, make_problem, navigation_v0
 from d4orm_env.disturbances import Bias, ControlNoise, Gain, Lag, StateNoise
 from d4orm_env.envs.joint_state import split_state
-from d4orm_planners import Controller, make_policy, run_episode
+from d4orm_planners import Controller, make_planner, make_policy, run_episode
 from d4orm_planners.base.controller import ControlSetpoint
 from d4orm_planners.base.disturbance_observer import MOST, DisturbanceObserver
-from d4orm_planners.base.policy import GoToGoal
+from d4orm_planners.base.policy import GoToGoal, OpenLoop
 
 MODELS = ("holonomic2d", "velocity2d", "differential_drive", "unicycle", "holonomic3d")
 
@@ -382,3 +382,11 @@ def test_a_policy_that_is_named_answers_in_time() -> None:
             assert controller.policy.config.deadline == pytest.approx(deadline)
     with Controller("orca", timeout=0.1) as controller:
         assert controller.timeout == 0.1
+
+
+def test_a_finished_plan_needs_a_controller_without_a_reserve() -> None:
+    problem = make_problem("circle", num_robots=2)
+    plan = make_planner().solve(problem, seed=0)
+    with pytest.raises(ValueError, match="or give a Controller, which holds back some of the limits, reserve=0"):
+        Controller(OpenLoop(plan=plan)).begin(problem, problem.start)
+    Controller(OpenLoop(plan=plan), reserve=0.0).begin(problem, problem.start)

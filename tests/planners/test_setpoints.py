@@ -13,13 +13,14 @@ import pytest
 from numpy.polynomial.polynomial import polyder, polyval
 
 from d4orm_env import Problem, Team, World, make_problem
-from d4orm_env.verify.discs import verify_curves
+from d4orm_env.footprints import Box
+from d4orm_env.verify.curves import verify_curves
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.export import FORMATS, MOST_PIECES
-from d4orm_planners.tracking.smoothing import fit_spline
+from d4orm_planners.tracking.smoothing import MotionLimits, fit_spline, smooth_motion
 
 CASES: dict[str, dict[str, Any]] = {
     "plane": {"scenario": "circle", "num_robots": 5},
@@ -182,14 +183,56 @@ def test_curves_are_judged_in_numbers() -> None:
         x = np.asarray(times)[:, None] / 2
         return np.stack([np.hstack([x, 0 * x]), np.hstack([1 - x, 0 * x + 1])], axis=1)
 
-    report = verify_curves(problem, lines, 2.0, np.zeros(2))
+    def still(times: Any) -> Any:
+        return np.zeros((len(times), 2))
+
+    report = verify_curves(problem, lines, 2.0, np.zeros(2), still)
     assert report.ok
     assert report.min_separation == pytest.approx(0.7, abs=1e-6)
     assert report.min_clearance == pytest.approx(0.2, abs=1e-6)
-    far = verify_curves(problem, lines, 1.0, np.zeros(2))
+    far = verify_curves(problem, lines, 1.0, np.zeros(2), still)
     assert [violation.kind for violation in far.violations] == ["not arrived", "not arrived"]
-    through = verify_curves(problem, lambda times: lines(2 * np.asarray(times)), 2.0, np.zeros(2))
+    through = verify_curves(problem, lambda times: lines(2 * np.asarray(times)), 2.0, np.zeros(2), still)
     assert {violation.kind for violation in through.violations} == {"obstacle contact", "not arrived"}
+
+
+def test_footprints_of_curves_are_exact() -> None:
+    """Boxes 1 m long pass each other 0.5 m apart, where the discs round them would touch."""
+    team = Team(("unicycle", "unicycle"), footprint=Box(1.0, 0.2))
+    start = [[-3, 0.35, 0], [3, -0.35, np.pi]]
+    plan = make_planner().solve(Problem(team, start, [[3, 0.35], [-3, -0.35]], goal_heading=[0.0, np.pi]), seed=0)
+    setpoints = plan.sample()
+    assert setpoints.report.ok
+    assert setpoints.report.min_separation == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("model", "own", "goal", "heading", "peak"),
+    [
+        ("unicycle2", {"max_turn_acceleration": 0.3}, [0, 0.3], 3.14, "turn_acceleration"),
+        ("unicycle1", {"max_reverse_speed": 0.2}, [-0.6, 0], 0.0, "reverse_speed"),
+        ("unicycle1", {"max_right_turn_rate": 0.4}, [0, -0.6], -1.5, "right_turn_rate"),
+    ],
+)
+def test_limits_of_one_way_and_of_turning_are_kept(
+    model: str, own: dict[str, float], goal: list[float], heading: float, peak: str
+) -> None:
+    team = Team((model,), own_limits=own)
+    start = np.zeros((1, team.state_size))
+    plan = make_planner().solve(Problem(team, start, [goal], goal_heading=heading, horizon=300), seed=0)
+    motion = smooth_motion(plan.problem, plan.trajectory, limits := MotionLimits.of(plan.problem))
+    (most,), (limit,) = own.values(), getattr(limits, peak)
+    assert limit == pytest.approx(most)
+    assert 0.5 * most < getattr(motion.peaks, peak)[0] <= most
+
+
+def test_a_jerk_limit_of_the_model_is_kept_and_named() -> None:
+    settings = {"model": "holonomic2d_jerk", "own_limits": {"max_jerk": 0.5}, "max_acceleration": 0.5}
+    plan = make_planner().solve(make_problem("circle", num_robots=2, horizon=300, **settings), seed=0)
+    motion = smooth_motion(plan.problem, plan.trajectory, MotionLimits.of(plan.problem))
+    assert motion.peaks.jerk.max() <= 0.5
+    with pytest.raises(ValueError, match=r"needs .* m/s\^3 of jerk, limit 0.001, .* allow more with max_jerk"):
+        plan.sample(max_jerk=0.001)
 
 
 # Files.
@@ -370,3 +413,10 @@ def test_the_command(plans: dict[str, Plan], tmp_path: Path, d4orm: Any) -> None
     status, _, err = d4orm("export", str(tmp_path / "plan.npz"), "-f", "cvs", "-o", str(tmp_path / "other"))
     assert (status, err.count("\n")) == (2, 1)
     assert not (tmp_path / "other").exists()
+
+
+def test_a_file_is_no_folder(plans: dict[str, Plan], tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("mine")
+    with pytest.raises(ValueError, match="taken is a file; give a folder"):
+        plans["space"].export("csv", tmp_path / "taken")
+    assert (tmp_path / "taken").read_text() == "mine"
