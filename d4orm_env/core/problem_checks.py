@@ -52,6 +52,12 @@ def check_arrival(value: object) -> None:
         raise ValueError(f"arrival is {short_repr(value)}; choose one of {', '.join(get_args(Arrival))}")
 
 
+def check_is_problem(value: object) -> None:
+    """Refuse what is no problem."""
+    if not hasattr(value, "goal_radius"):
+        raise ValueError(f"problem is {short_repr(value)}; give a Problem, as make_problem() returns")
+
+
 def checked_numbers(
     dt: float, horizon: int, margin: float, goal_radius: float, collision_penalty: float, num_robots: int
 ) -> dict[str, Any]:

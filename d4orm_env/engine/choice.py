@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.types import Engine
 
@@ -55,6 +56,7 @@ def rollout(problem: Problem, controls: ArrayLike, engine: str = "auto") -> Traj
     Raises:
         ValueError: If the controls have another shape or are not finite, or the engine is unknown.
     """
+    check_is_problem(problem)
     return get_engine(engine).rollout(problem, controls)
 
 

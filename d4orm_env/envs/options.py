@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import UnknownKeywordError
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.disturbances.controls import ControlNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbances, at_work, checked_disturbances
 from d4orm_env.disturbances.perception import RayNoise
@@ -187,6 +188,7 @@ class EnvOptions:
                 ``randomize_instance`` asks for it.
         """
         if self.problem is not None:
+            check_is_problem(self.problem)
             return self.problem, None
         settings = {"num_robots": self.num_robots, **self.scenario_settings}
         if self.lifelong and "goal_speed" in find_scenario(self._scenario).arguments:

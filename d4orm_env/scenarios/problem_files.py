@@ -16,6 +16,7 @@ import yaml
 from d4orm_env.core.files import naming, read_yaml, replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.footprints import Disc
 from d4orm_env.scenarios.cl_mapf import load_cl_mapf
 from d4orm_env.scenarios.dynobench import load_dynobench
@@ -39,8 +40,7 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
         ValueError: If the file cannot be read, is not YAML, breaks the schema, or makes no valid problem. One line that
             names the file, the field, and what was expected.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
+    path = _checked_path(path)
     with naming(path):
         content = read_yaml(path)
     keys = set(content) if isinstance(content, dict) else set()
@@ -58,6 +58,12 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     return problem
 
 
+def _checked_path(path: object) -> Path:
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
+    return Path(path)
+
+
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     """Write a problem in the explicit form; :func:`load_problem` returns an equal one, to the bit.
 
@@ -66,7 +72,8 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     Raises:
         ValueError: If the file cannot be written; nothing is left behind.
     """
-    target = Path(path)
+    check_is_problem(problem)
+    target = _checked_path(path)
     try:
         with replaced_when_done(target) as temporary:
             temporary.write_text(scenario_text(problem), encoding="utf-8")

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, short_repr
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.background import Background
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
@@ -147,8 +148,7 @@ class Controller:
         Raises:
             ValueError: If there is no problem, the states have another shape, or the lag fits no team of this size.
         """
-        if not isinstance(problem, Problem):
-            raise ValueError(f"problem is {short_repr(problem)}; give a Problem, as make_problem() returns")
+        check_is_problem(problem)
         self._background.forget()
         try:
             self._begin(problem, states, _seconds(time), seed)

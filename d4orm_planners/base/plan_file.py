@@ -91,6 +91,8 @@ def _evaluated(
 
 
 def _npz_path(path: str | os.PathLike[str]) -> Path:
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"the path of a plan file must be text or a path, not {path!r}")
     target = Path(path)
     if target.suffix != ".npz":
         raise ValueError(f"plan file {str(target)!r} must end in .npz")

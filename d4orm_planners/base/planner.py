@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import FloatArray, duration, short_repr, whole_number
 from d4orm_env.core.infeasibility import prepare_proofs, prove_infeasible
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
 from d4orm_planners.base.settings import CheckedSettings, Count, EngineName
@@ -138,8 +139,7 @@ class Planner(ABC):
         Raises:
             ValueError: If an argument makes no sense, or there is a watcher and another engine; the message names it.
         """
-        if not isinstance(problem, Problem):
-            raise ValueError(f"problem is {short_repr(problem)}; give a Problem, such as make_problem() returns")
+        check_is_problem(problem)
         if callback is not None and not callable(callback):
             raise ValueError(f"callback is {short_repr(callback)}; give a function of an IterationRecord")
         limit = None if time_limit is None else duration(time_limit, "time_limit")

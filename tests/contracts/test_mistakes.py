@@ -11,11 +11,21 @@ import gymnasium
 import numpy as np
 import pytest
 
-from d4orm_env import Problem, Team, load_map, load_problem, make_problem, navigation_v0, verify
+from d4orm_env import (
+    Problem,
+    Team,
+    load_map,
+    load_problem,
+    make_problem,
+    navigation_v0,
+    rollout,
+    save_problem,
+    verify,
+)
 from d4orm_env.disturbances import MovingObstacle
 from d4orm_env.envs.rewards import TrainingReward
 from d4orm_env.footprints import Box, Train
-from d4orm_planners import Controller, Policy, make_planner, make_policy, run_episode
+from d4orm_planners import Controller, Policy, load_plan, make_planner, make_policy, run_episode
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3, from_torch
 
 
@@ -81,6 +91,11 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: Team(("unicycle",) * 3, footprint=[0.3, 0.2]), "has 2 entries for 3 robots; give one for each, such"),
         (lambda: make_policy("orca").reset(PROBLEM), "give an environment, such as parallel_env"),
         (lambda: Controller("orca").begin("circle", PROBLEM.start), "problem is 'circle'; give a Problem"),
+        (lambda: verify(None, []), "problem is None; give a Problem"),
+        (lambda: rollout(5, []), "problem is 5; give a Problem"),
+        (lambda: save_problem(5, "problem.yaml"), "problem is 5; give a Problem"),
+        (lambda: navigation_v0.parallel_env(problem=5), "problem is 5; give a Problem"),
+        (lambda: load_plan(5), "the path of a plan file must be text or a path, not 5"),
         (lambda: controller().step(PROBLEM.start, "now"), "time is 'now'; give the seconds of one clock"),
         (lambda: controller().step(PROBLEM.start, np.nan), "time is nan; give the seconds of one clock"),
         (lambda: controller().step("abc", 0.0), "states must be an array of numbers, not 'abc'"),
