@@ -16,17 +16,8 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.winding import unwound
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TimeStep
 from d4orm_env.envs.body_simulation import Moved, Robots
-from d4orm_env.mujoco.scene import (
-    DRIVES,
-    GRAVITY,
-    HALF_TRACK,
-    NOT_SOLID,
-    OBSTACLE,
-    PUCKS,
-    WHEEL_RADIUS,
-    Physics,
-    build_scene,
-)
+from d4orm_env.mujoco.parts import HALF_TRACK, WHEEL_RADIUS
+from d4orm_env.mujoco.scene import DRIVES, GRAVITY, NOT_SOLID, OBSTACLE, PUCKS, Physics, build_scene
 
 _HELD = 1e6
 """Weight added to a docked robot, per degree of freedom [kg]: nothing moves it."""
@@ -49,7 +40,7 @@ class TeamBodies:
         names = np.array(problem.team.models)
         self._pucks, self._drives = np.flatnonzero(np.isin(names, PUCKS)), np.flatnonzero(np.isin(names, DRIVES))
         self._servos = np.flatnonzero(names == "velocity2d")
-        radius = np.asarray(problem.team.radius, np.float64)[self._drives]
+        radius = self.scene.radius[self._drives]
         mass = self.scene.mass[self._drives]
         self._wheels = WheelControl(WHEEL_RADIUS * radius, HALF_TRACK * radius, mass, physics.settling_time)
         dofs = self.scene.dofs
@@ -135,9 +126,7 @@ class TeamBodies:
         data.qpos[joint + _FREE_POSITIONS : joint + _FREE_POSITIONS + 2] = 0
         self._wanted[robot] = speed = float(sum(state[index] for index in model.speed_indices))
         data.qvel[dof : dof + 2] = speed * math.cos(heading), speed * math.sin(heading)
-        data.qvel[dof + _FREE_DOFS : dof + _FREE_DOFS + 2] = speed / (
-            WHEEL_RADIUS * float(self.problem.team.radius[robot])
-        )
+        data.qvel[dof + _FREE_DOFS : dof + _FREE_DOFS + 2] = speed / (WHEEL_RADIUS * float(self.scene.radius[robot]))
 
     def _dofs(self, robot: int) -> slice:
         first = int(self.scene.dofs[robot])

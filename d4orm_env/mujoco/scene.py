@@ -12,6 +12,18 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray, positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
+from d4orm_env.footprints import Disc, Planar
+from d4orm_env.mujoco.parts import (
+    CLEARANCE,
+    HEIGHT,
+    ROLLING,
+    SOLID,
+    add_bumper,
+    add_cylinder,
+    add_drive,
+    add_puck,
+    solid,
+)
 
 _ALLOWED_ZERO = ("drag", "wheel_friction", "body_friction")
 _MOST = {"time_step": 0.02, "wheel_friction": 10.0, "body_friction": 10.0, "settling_time": 1.0, "surface_density": 1e6}
@@ -59,17 +71,8 @@ GRAVITY = 9.81
 PUCKS, DRIVES = ("holonomic2d", "velocity2d"), ("differential_drive", "unicycle")
 """Models of robots that are pushed, and of those on two wheels."""
 
-WHEEL_RADIUS, HALF_TRACK, WHEEL_HALF_WIDTH, CASTER_RADIUS, CASTER_POSITION = 0.3, 0.65, 0.08, 0.1, 0.75
-CLEARANCE, HEIGHT, FRONT_GAP = 0.25, 0.85, 0.02
-"""Measures of a robot, over its radius. The caster is behind; one in front, off the floor, keeps the nose up."""
-WHEEL_SHARE, BATTERY_SHARE, BATTERY_POSITION = 0.1, 0.5, (-0.15, 0.0, 0.2)
-"""Shares of the mass: of each wheel, and of what lies low and behind the axle."""
 _WALL = 0.2
 """Thickness of the walls round a bounded world [m]."""
-_ROLLING, _SOLID = 1, 2
-"""Kinds of contact: of what rolls on the floor, and of what bodies must not touch."""
-_PALETTE = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.15, 0.16), (0.58, 0.4, 0.74),
-            (0.55, 0.34, 0.29), (0.89, 0.47, 0.76), (0.74, 0.74, 0.13))  # fmt: skip
 
 
 class MujocoScene(NamedTuple):
@@ -82,6 +85,7 @@ class MujocoScene(NamedTuple):
     dofs: NDArray[np.int64]  #: ``(K,)`` first address of its velocities
     #: ``(geoms,)`` the robot that a solid geom belongs to, :data:`OBSTACLE`, or :data:`NOT_SOLID`
     owner: NDArray[np.int64]
+    radius: NDArray[np.float64]  #: ``(K,)`` of the largest discs within footprints, or of the discs [m]
     mass: NDArray[np.float64]  #: ``(K,)`` [kg]
 
 
@@ -94,22 +98,22 @@ def check_problem(problem: Problem) -> None:
     """Refuse what has no bodies here.
 
     Raises:
-        ValueError: For a robot whose model has none, as in space, which is too small for one, or which is not round.
+        ValueError: For a robot whose model has none, as in space, or which is too small for one.
     """
     for robot, name in enumerate(problem.team.models):
         if name not in PUCKS + DRIVES:
             raise ValueError(
                 f"robot_{robot} is a {name}, which has no body in MuJoCo; use one of {', '.join(PUCKS + DRIVES)}"
             )
-        if problem.team.shapes:
-            raise ValueError(
-                f"robot_{robot} has the footprint {problem.team.footprint[robot]}; bodies in MuJoCo are round, so use "
-                f"a team of discs"
-            )
-        if problem.team.radius[robot] < LEAST_RADIUS:
-            raise ValueError(
-                f"radius of robot_{robot} is {problem.team.radius[robot]:g}; bodies in MuJoCo need {LEAST_RADIUS:g} m"
-            )
+        if (radius := _core_radius(problem, robot)) < LEAST_RADIUS:
+            what = "radius" if not problem.team.shapes else f"distance to the edge of {problem.team.footprint[robot]}"
+            raise ValueError(f"{what} of robot_{robot} is {radius:g}; bodies in MuJoCo need {LEAST_RADIUS:g} m")
+
+
+def _core_radius(problem: Problem, robot: int) -> float:
+    """Radius of the largest disc about a robot's reference point within its footprint [m]."""
+    team = problem.team
+    return float(team.footprint[robot].inner_radius if team.shapes else team.radius[robot])
 
 
 def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, step: float) -> MujocoScene:
@@ -125,57 +129,42 @@ def build_scene(problem: Problem, physics: Physics, body_radius: FloatArray, ste
     # The only light comes from where one looks from, as far as one is.
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.5] * 3, [0.5] * 3
     spec.visual.headlight.specular = [0.0] * 3
-    radius = np.asarray(problem.team.radius, np.float64)
+    radius = np.array([_core_radius(problem, robot) for robot in range(problem.num_robots)])
     top = max(HEIGHT * float(radius.max()), 2 * CLEARANCE * float(radius.max()))
     _add_surroundings(spec, problem.world, top, physics)
     for number, size in enumerate(body_radius.tolist()):
         body = spec.worldbody.add_body(name=f"intruder_{number}", mocap=True)
-        _cylinder(body, size, 0.0, top, physics, rgba=[0.2, 0.2, 0.2, 1])
+        add_cylinder(body, size, 0.0, top, physics, rgba=[0.2, 0.2, 0.2, 1])
     for robot, name in enumerate(problem.team.models):
-        add = _add_puck if name in PUCKS else _add_drive
-        add(spec, robot, float(radius[robot]), top, physics)
+        add = add_puck if name in PUCKS else add_drive
+        body = add(spec, robot, float(radius[robot]), top, physics, is_solid=not problem.team.shapes)
+        footprint = problem.team.footprint[robot]
+        if problem.team.shapes and isinstance(footprint, Disc | Planar):
+            add_bumper(spec, body, footprint.core, CLEARANCE * float(radius[robot]), top, physics)
     try:
         model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"MuJoCo makes no bodies of problem {problem.name!r}: {reason}") from error
-    return _addresses(model, problem, physics)
+    return _addresses(model, radius, physics)
 
 
-def _addresses(model: mujoco.MjModel, problem: Problem, physics: Physics) -> MujocoScene:
-    names = [f"robot_{robot}" for robot in range(problem.num_robots)]
+def _addresses(model: mujoco.MjModel, radius: NDArray[np.float64], physics: Physics) -> MujocoScene:
+    names = [f"robot_{robot}" for robot in range(len(radius))]
     first = [int(model.body(name).jntadr[0]) for name in names]
     owner = np.full(model.ngeom, NOT_SOLID)
-    solid = model.geom_contype == _SOLID
+    solid = model.geom_contype == SOLID
     owner[solid] = OBSTACLE
     for robot, name in enumerate(names):
         owner[solid & (model.geom_bodyid == model.body(name).id)] = robot
-    radius = np.asarray(problem.team.radius, np.float64)
     return MujocoScene(
         model,
         np.array(model.jnt_qposadr[first], np.int64),
         np.array(model.jnt_dofadr[first], np.int64),
         owner,
+        radius,
         physics.surface_density * radius * radius,
     )
-
-
-def _solid(physics: Physics) -> dict[str, object]:
-    return {"contype": _SOLID, "conaffinity": _SOLID, "friction": [physics.body_friction, 0.005, 0.0001]}
-
-
-def _cylinder(
-    body: mujoco.MjsBody,
-    radius: float,
-    low: float,
-    high: float,
-    physics: Physics,
-    position: tuple[float, float] = (0.0, 0.0),
-    **attributes: object,
-) -> None:
-    """A solid upright cylinder between two heights [m]."""
-    size, middle = [radius, (high - low) / 2, 0], [*position, (high + low) / 2]
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=middle, **_solid(physics), **attributes)
 
 
 def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Physics) -> None:
@@ -183,10 +172,10 @@ def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Ph
     ground, grey = spec.worldbody, [0.45, 0.47, 0.5, 1]
     # It has a side of the contact only, so that nothing but what rolls meets it.
     ground.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[100, 100, 1], contype=0, conaffinity=_ROLLING, rgba=[0.8, 0.8, 0.8, 1]
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[100, 100, 1], contype=0, conaffinity=ROLLING, rgba=[0.8, 0.8, 0.8, 1]
     )  # fmt: skip
     for x, y, radius in world.circles.tolist():
-        _cylinder(ground, radius, 0.0, top, physics, position=(x, y), rgba=grey)
+        add_cylinder(ground, radius, 0.0, top, physics, position=(x, y), rgba=grey)
     boxes = world.boxes.tolist()
     if world.lower is not None and world.upper is not None:
         boxes += _walls(world.lower.tolist(), world.upper.tolist())
@@ -196,7 +185,7 @@ def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Ph
             size=[(right - left) / 2, (high - low) / 2, top / 2],
             pos=[(right + left) / 2, (high + low) / 2, top / 2],
             rgba=grey,
-            **_solid(physics),
+            **solid(physics),
         )
     for number, corners in enumerate(world.shapes.triangles.reshape(-1, 3, 2).astype(np.float64)):
         prism = [[*corner, height] for corner in corners.tolist() for height in (0.0, top)]
@@ -204,7 +193,7 @@ def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Ph
         spec.add_mesh(
             name=f"prism_{number}", uservert=np.ravel(prism), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         )
-        ground.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"prism_{number}", rgba=grey, **_solid(physics))
+        ground.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"prism_{number}", rgba=grey, **solid(physics))
 
 
 def _walls(lower: list[float], upper: list[float]) -> list[list[float]]:
@@ -215,51 +204,3 @@ def _walls(lower: list[float], upper: list[float]) -> list[list[float]]:
         [left, low - _WALL, right, low],
         [left, high, right, high + _WALL],
     ]
-
-
-def colour(robot: int) -> list[float]:
-    """Return the colour of a robot and its goal: red, green, blue and opacity, from 0 to 1."""
-    return [*_PALETTE[robot % len(_PALETTE)], 1.0]
-
-
-def _add_puck(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physics: Physics) -> None:
-    """A disc that glides over the floor against a drag, and turns when it is touched."""
-    body = spec.worldbody.add_body(name=f"robot_{robot}")
-    mass = physics.surface_density * radius * radius
-    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-    body.add_joint(type=slide, axis=[1, 0, 0], damping=physics.drag * mass)
-    body.add_joint(type=slide, axis=[0, 1, 0], damping=physics.drag * mass)
-    body.add_joint(type=hinge, axis=[0, 0, 1], damping=physics.drag * mass * radius * radius / 2)
-    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=mass, rgba=colour(robot))
-
-
-def _add_drive(spec: mujoco.MjSpec, robot: int, radius: float, top: float, physics: Physics) -> None:
-    """A round robot on two wheels and a caster; its frame is on the floor, under the middle of the axle."""
-    body = spec.worldbody.add_body(name=f"robot_{robot}")
-    body.add_freejoint()
-    mass, shell = physics.surface_density * radius * radius, 1 - 2 * WHEEL_SHARE - BATTERY_SHARE
-    _cylinder(body, radius, CLEARANCE * radius, top, physics, mass=shell * mass, rgba=colour(robot))
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[0.3 * radius, 0.3 * radius, 0.05 * radius],
-        pos=[radius * part for part in BATTERY_POSITION],
-        mass=BATTERY_SHARE * mass,
-        contype=0,
-        conaffinity=0,
-    )
-    size = CASTER_RADIUS * radius
-    for position, gap in ((-CASTER_POSITION, 0.0), (CASTER_POSITION, FRONT_GAP)):
-        # Without friction: it turns and rolls as it likes. Its priority has the floor's own friction not count.
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[size, 0, 0], pos=[position * radius, 0, size + gap * radius],
-            mass=0, contype=_ROLLING, conaffinity=0, condim=1, priority=1,
-        )  # fmt: skip
-    for side in (1, -1):
-        wheel = body.add_body(pos=[0, side * HALF_TRACK * radius, WHEEL_RADIUS * radius])
-        wheel.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
-        # Round across too, as a tyre is: it meets the floor in one point, and turning does not scrub.
-        wheel.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, mass=WHEEL_SHARE * mass, contype=_ROLLING, conaffinity=0,
-            size=[WHEEL_RADIUS * radius, WHEEL_HALF_WIDTH * radius, WHEEL_RADIUS * radius],
-            friction=[physics.wheel_friction, 0.005, 0.0001], priority=1, rgba=[0.1, 0.1, 0.1, 1],
-        )  # fmt: skip

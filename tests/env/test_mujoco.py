@@ -21,7 +21,9 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Delay, Drag, Intruder, Push, Stall, StateNoise
 from d4orm_env.envs.joint_state import split_state
+from d4orm_env.footprints import Box, Capsule, Footprint, Polygon
 from d4orm_env.mujoco import Physics, environment
+from d4orm_env.mujoco.bodies import TeamBodies
 from d4orm_planners import run_episode
 from d4orm_planners.base.episode import open_env
 
@@ -337,3 +339,41 @@ def test_an_environment_is_opened_by_its_physics() -> None:
     assert type(open_env(problem, "mujoco")) is mujoco.parallel_env
     with pytest.raises(ValueError, match="physics is 'bullet'; choose one of model, mujoco, crazyflow"):
         open_env(problem, "bullet")
+
+
+@pytest.mark.parametrize(
+    "footprint", [Box(1.0, 0.3), Capsule(0.7, 0.15), Polygon([[0.5, 0.0], [-0.5, 0.15], [-0.5, -0.15]])]
+)
+@pytest.mark.parametrize(("gap", "touches"), [(1.06, False), (0.94, True)])
+def test_footprints_touch_where_they_end(footprint: Footprint, gap: float, touches: bool) -> None:
+    """Two face each other: discs within them are far apart."""
+    team = Team(("differential_drive",) * 2, footprint=footprint)
+    problem = Problem(team, [[-2, 0, 0, 0], [2, 0, np.pi, 0]], [[2, 3], [-2, 3]])
+    env = mujoco.parallel_env(problem=problem)
+    env.reset(seed=0)
+    states = problem.start.copy()
+    states[:, 0] = [-gap / 2, gap / 2]
+    env.unwrapped.set_state(states)
+    _, _, _, _, infos = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+    assert [info["collided"] for info in infos.values()] == [touches, touches]
+
+
+def test_a_puck_that_is_no_disc_keeps_its_heading() -> None:
+    """Its model has none: one that is hit at its end does not turn."""
+    team = Team(("velocity2d",) * 2, footprint=Box(1.0, 0.2))
+    problem = Problem(team, [[0, 0], [0.9, -1]], [[3, 3], [0.9, 3]], horizon=60)
+    bodies = TeamBodies(problem, np.zeros(0, np.float32), Physics())
+    bodies.begin(0)
+    controls = np.zeros((2, 2), np.float32)
+    controls[1] = [0, 1]
+    touched = np.zeros(2, bool)
+    for _ in range(20):
+        touched |= bodies.advance(controls, problem.arrays, np.zeros((0, 4))).touched
+    assert touched.all()
+    assert abs(bodies.data.qpos[bodies.scene.joints[0] + 2]) < 1e-3
+
+
+def test_a_footprint_that_its_reference_point_is_outside_of_has_no_body() -> None:
+    team = Team(("unicycle",), footprint=Box(0.3, 0.2, offset=0.5))
+    with pytest.raises(ValueError, match=r"distance to the edge of Box\(.*\) of robot_0 is 0; bodies in MuJoCo need"):
+        mujoco.parallel_env(problem=Problem(team, [[0, 0, 0]], [[2, 0]]))
