@@ -438,7 +438,7 @@ def test_copies_are_equal_and_as_read_only_as_the_original(duplicate: Any) -> No
     problem = two_robots()
     assert problem.arrays is problem.arrays
     twin = duplicate(problem)
-    assert len(all_arrays(twin)) == 16
+    assert len(all_arrays(twin)) == 17
     for array in all_arrays(twin):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
