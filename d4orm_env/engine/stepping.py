@@ -121,10 +121,10 @@ for _sizes in ((2, 2), (2, 3), (3, 3)):
 
 
 Six: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]
-GoalHeading: TypeAlias = tuple[np.bool_ | None, np.float32, np.float32, np.float32, Six]
+GoalHeading: TypeAlias = tuple[np.bool_ | None, np.float32, np.float32, np.float32, Six | None]
 """``None`` in a team without goal headings, which leaves what they ask for out of a kernel; a robot's own as a unit
 vector; the square of the chord by which it may be missed, infinite for none; and likewise its trailers' hitch angles,
-zero for any."""
+zero for any, ``None`` as the first."""
 Docking: TypeAlias = tuple[np.float32, np.float32, np.bool_, GoalHeading]
 """Squares of the goal radius and of the goal speed, whether a robot that has arrived stays there for good, and its goal
 heading."""
@@ -146,9 +146,9 @@ def docking_of(arrays: ProblemArrays, k: Whole) -> Docking:
 @inlined
 def _goal_heading(
     directions: FloatArray | None, chords2: Any, k: Whole
-) -> tuple[np.float32, np.float32, np.float32, Six]:
+) -> tuple[np.float32, np.float32, np.float32, Six | None]:
     if directions is None:
-        return ZERO, ZERO, ZERO, (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+        return ZERO, ZERO, ZERO, None
     own = directions[k]
     return own[0], own[1], chords2[k], (own[2], own[3], own[4], own[5], own[6], own[7])
 
@@ -239,10 +239,11 @@ def _facing(model: Model) -> Callable[[np.bool_ | None, Row, GoalHeading], bool]
     @inlined
     def bends(turns: np.bool_ | None, x: Row, heading: GoalHeading) -> bool:
         good = faces(turns, x, heading)
-        if turns is None:
+        wanted = heading[4]
+        if turns is None or wanted is None:
             return good
         for i in range(count):
-            c, s, angle = heading[4][2 * i], heading[4][2 * i + 1], x[hitches[i]]
+            c, s, angle = wanted[2 * i], wanted[2 * i + 1], x[hitches[i]]
             if c != ZERO or s != ZERO:
                 good = good and bool(transition.faces(cosine(angle), sine(angle), c, s, heading[3]))
         return good
