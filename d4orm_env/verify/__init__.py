@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch
 from d4orm_env.verify.convex_bodies import ConvexBodies
 from d4orm_env.verify.curves import CHORD_ERROR
@@ -68,7 +67,8 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     Raises:
         ValueError: If the controls are not numbers or their shape is another.
     """
-    check_is_problem(problem)
+    if not hasattr(problem, "goal_radius"):
+        raise ValueError(f"problem is {problem!r}; give a Problem, as make_problem() returns")
     array = _checked_controls(problem, controls)
     if not np.isfinite(array).all():
         return _left_out(problem, _non_finite(array, problem.dt))
