@@ -34,7 +34,7 @@ SLOWEST = 5
 """A problem's duration, in times that its cars would need straight to their goals."""
 LEAST_STEPS = 400
 VEHICLE = {"r": 3.0, "carWidth": 2.0, "LF": 2.0, "LB": 1.0, "obsRadius": 0.8}
-"""Turning radius, width, rear axle to front and to back, radius of an obstacle without one [m]: ``config.yaml``."""
+"""Turning radius, width, rear axle to front and to back, radius of an obstacle without one [m], by ``config.yaml``."""
 MAP_KEYS = ("dimensions", "obstacles")
 
 
