@@ -60,12 +60,13 @@ class MotionLimits:
         team, rows = problem.team, []
         for model, limits in zip(team.robot_models, team.limits.astype(np.float64), strict=True):
             own, lower = dict(zip(model.limit_names, limits.tolist(), strict=False)), model.lower_bounds(limits)
-            fastest = model.turn_rate(limits) or np.inf
-            left, right = (limits, lower) if TURN_RATE in dict(model.lower_limits) else ([fastest] * 4, [fastest] * 4)
+            if TURN_RATE in dict(model.lower_limits):
+                left, right = limits[TURN_RATE], lower[TURN_RATE]
+            else:
+                left = right = model.turn_rate(limits) or np.inf
             rows.append([
-                limits[SPEED], np.inf if model.heading_index is None else lower[SPEED], left[TURN_RATE],
-                right[TURN_RATE], np.inf if model.first_order else limits[ACCELERATION],
-                own.get("max_turn_acceleration", np.inf), own.get("max_jerk", np.inf),
+                limits[SPEED], np.inf if model.heading_index is None else lower[SPEED], left, right,
+                np.inf if model.first_order else limits[ACCELERATION], own.get("max_turn_acceleration", np.inf), own.get("max_jerk", np.inf),
             ])  # fmt: skip
         columns = dict(zip(LIMITS, np.array(rows, np.float64).T, strict=True))
         for name, given in (("acceleration", acceleration), ("jerk", jerk)):
