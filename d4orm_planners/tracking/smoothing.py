@@ -66,7 +66,8 @@ class MotionLimits:
                 left = right = model.turn_rate(limits) or np.inf
             rows.append([
                 limits[SPEED], np.inf if model.heading_index is None else lower[SPEED], left, right,
-                np.inf if model.first_order else limits[ACCELERATION], own.get("max_turn_acceleration", np.inf), own.get("max_jerk", np.inf),
+                np.inf if model.first_order else limits[ACCELERATION],
+                own.get("max_turn_acceleration", np.inf), own.get("max_jerk", np.inf),
             ])  # fmt: skip
         columns = dict(zip(LIMITS, np.array(rows, np.float64).T, strict=True))
         for name, given in (("acceleration", acceleration), ("jerk", jerk)):
