@@ -57,6 +57,9 @@ CASES = {
     "manoeuvres of boxes": Case(
         "hybrid", {}, "four_obstacles", {"num_robots": 4, "model": "differential_drive"}, footprint=Box(0.4, 0.2, 0.05)
     ),
+    "manoeuvres of cars": Case(
+        "hybrid", {}, "four_obstacles", {"num_robots": 4, "model": "car_first_order"}, footprint=Box(0.4, 0.2, 0.05)
+    ),
     "in space": Case("d4orm", {}, "sphere", {"num_robots": 8}),
     "in space with drag": Case("d4orm", {}, "sphere", {"num_robots": 4, "model": "holonomic3d_drag"}),
     "among walls": Case("hybrid", {"improve": True}, "rooms", {"num_robots": 8}, 3),
