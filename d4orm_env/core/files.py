@@ -22,6 +22,17 @@ import numpy as np
 import yaml
 
 
+def checked_path(path: object, what: str) -> Path:
+    """Return the path of ``what``.
+
+    Raises:
+        ValueError: If it is neither text nor a path.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"the path of {what} must be text or a path, not {path!r}")
+    return Path(path)
+
+
 def require_file(path: Path, kind: str) -> None:
     """Refuse a folder, a pipe or a device, whose reading may never end, in place of a ``kind`` such as ``"a map"``.
 

@@ -6,13 +6,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core import portable
-from d4orm_env.core.arrays import FloatArray, as_float32, short_repr
+from d4orm_env.core.arrays import FloatArray, as_float32, frozen_per_robot, short_repr
 from d4orm_env.core.team import Team
 
 MOST_TRAILERS = 3
-"""Of a robot."""
+"""Most trailers of a robot."""
 LEAST_TOLERANCE = 1e-3
 """Smallest tolerance of a goal heading [rad]."""
+
+
+def checked_goal_poses(
+    team: Team, heading: ArrayLike | None, tolerance: ArrayLike, hitches: ArrayLike | None
+) -> dict[str, FloatArray]:
+    """What a problem asks of poses at goals, by its attributes' names."""
+    headings = _goal_headings(team, heading)
+    tolerances = frozen_per_robot(tolerance, "goal_heading_tolerance", team.num_robots)
+    _check_tolerances(tolerances)
+    angles = _goal_hitches(team, hitches, headings)
+    return {"goal_heading": headings, "goal_heading_tolerance": tolerances, "goal_hitches": angles}
 
 
 def one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
@@ -27,7 +38,7 @@ def one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") ->
     return values
 
 
-def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
+def _goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
     """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
     headings = one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
     for robot in np.flatnonzero(~np.isnan(headings)).tolist():
@@ -44,7 +55,7 @@ def goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
     return headings
 
 
-def goal_hitches(team: Team, given: ArrayLike | None, headings: FloatArray) -> FloatArray:
+def _goal_hitches(team: Team, given: ArrayLike | None, headings: FloatArray) -> FloatArray:
     """``(K, 3)`` hitch angles with which trailers must arrive [rad], NaN for any and for those that there are not."""
     hitches = np.full((team.num_robots, MOST_TRAILERS), np.nan, np.float32)
     if given is None:
@@ -71,7 +82,7 @@ def goal_hitches(team: Team, given: ArrayLike | None, headings: FloatArray) -> F
     return hitches
 
 
-def check_tolerances(tolerance: FloatArray) -> None:
+def _check_tolerances(tolerance: FloatArray) -> None:
     """Refuse tolerances of goal headings ``(K,)`` that float32 does not resolve, or that allow any."""
     for robot in np.flatnonzero((tolerance < LEAST_TOLERANCE) | (tolerance > np.float32(np.pi)))[:1].tolist():
         value = f"goal_heading_tolerance of robot_{robot} is {tolerance[robot]:g} rad"

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core import goal_poses
 from d4orm_env.core import problem_checks as checks
-from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array, frozen_per_robot
+from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array
+from d4orm_env.core.goal_poses import checked_goal_poses
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_arrays import ProblemArrays, as_arrays, digest_of
 from d4orm_env.core.problem_checks import Arrival
@@ -33,7 +33,6 @@ else:
 
 ROUNDING, GRAINS = 1 / 15_000, 4
 """Allowance for rounding, in radii of the largest robot, and in what float32 resolves at the farthest start or goal."""
-GOAL_POSE = ("goal_heading", "goal_heading_tolerance", "goal_hitches")
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -113,8 +112,7 @@ class Problem(Frozen):
         goal_heading_tolerance: ArrayLike = 0.1,
         goal_hitches: ArrayLike | None = None,
     ) -> None:
-        if not isinstance(team, Team):
-            raise ValueError(f"team is {team!r}; give a Team, as make_team() returns")
+        checks.check_is_team(team)
         world, size = world_of(world, team.dimension), team.num_robots
         numbers = checks.checked_numbers(dt, horizon, margin, goal_radius, collision_penalty, size)
         checks.check_arrival(arrival)
@@ -125,9 +123,7 @@ class Problem(Frozen):
             goal=frozen_array(goal, "goal", (size, team.dimension), largest=LARGEST),
             world=world,
             goal_speed=checks.goal_speeds(team, numbers["dt"], goal_speed),
-            goal_heading=(headings := goal_poses.goal_headings(team, goal_heading)),
-            goal_heading_tolerance=frozen_per_robot(goal_heading_tolerance, "goal_heading_tolerance", team.num_robots),
-            goal_hitches=goal_poses.goal_hitches(team, goal_hitches, headings),
+            **checked_goal_poses(team, goal_heading, goal_heading_tolerance, goal_hitches),
             name=name,
             arrival=arrival,
         )
@@ -291,7 +287,11 @@ class Problem(Frozen):
         return self._unchecked(
             team=team,
             start=self.start[index, : team.state_size],
-            **{name: getattr(self, name)[index] for name in ("goal", "goal_speed", *GOAL_POSE)},
+            goal=self.goal[index],
+            goal_speed=self.goal_speed[index],
+            goal_heading=self.goal_heading[index],
+            goal_heading_tolerance=self.goal_heading_tolerance[index],
+            goal_hitches=self.goal_hitches[index],
         )
 
     def _unchecked(self, **changes: object) -> Problem:

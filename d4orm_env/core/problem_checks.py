@@ -18,7 +18,7 @@ from d4orm_env.core.arrays import (
 )
 from d4orm_env.core.bodies import numbers_by_robot
 from d4orm_env.core.footprint_gaps import near_pairs, pair_gap, world_gap
-from d4orm_env.core.goal_poses import check_tolerances, one_or_each
+from d4orm_env.core.goal_poses import one_or_each
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
@@ -52,6 +52,12 @@ def check_arrival(value: object) -> None:
         raise ValueError(f"arrival is {short_repr(value)}; choose one of {', '.join(get_args(Arrival))}")
 
 
+def check_is_team(value: object) -> None:
+    """Refuse what is no team."""
+    if not isinstance(value, Team):
+        raise ValueError(f"team is {short_repr(value)}; give a Team, as make_team() returns")
+
+
 def check_is_problem(value: object) -> None:
     """Refuse what is no problem."""
     if not hasattr(value, "goal_radius"):
@@ -80,7 +86,6 @@ def check_physics(problem: Problem) -> list[str]:
     team, starts = problem.team, problem.start[:, : problem.dimension]
     check_resolution(team, np.concatenate([starts, problem.goal], axis=1), problem.dt, problem.goal_radius)
     check_turning(team, problem.dt, problem.goal_radius)
-    check_tolerances(problem.goal_heading_tolerance)
     at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, problem.goal_heading)
     goals = np.column_stack([problem.goal, at_goals]).astype(np.float64)
     faults = [

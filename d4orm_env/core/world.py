@@ -84,12 +84,7 @@ class World(Frozen):
             name: None if given is None else frozen_array(given, f"bounds {name}", (dimension,), largest=LARGEST)
             for name, given in (("lower", lower), ("upper", upper))
         }
-        if not isinstance(polygons, Iterable):
-            raise ValueError(f"polygons must be a list of polygons, each a list of corners, not {polygons!r}")
-        corners = tuple(
-            frozen_array(given, f"polygons[{index}]", (None, 2), largest=LARGEST)
-            for index, given in enumerate(polygons)
-        )
+        corners = _polygons(polygons)
         origin = np.zeros(dimension) if origin is None else origin
         frozen_array(origin, "origin", (dimension,), largest=LARGEST_ORIGIN)
         # Adding zero makes -0.0 a plain zero.
@@ -246,6 +241,13 @@ class World(Frozen):
 def _rounded_up(distance: float) -> float:
     """The next power of two, so that distances of about the same size share an index."""
     return 2.0 ** math.ceil(math.log2(distance))
+
+
+def _polygons(given: Sequence[ArrayLike]) -> tuple[FloatArray, ...]:
+    if not isinstance(given, Iterable):
+        raise ValueError(f"polygons must be a list of polygons, each a list of corners, not {given!r}")
+    corners = (frozen_array(one, f"polygons[{index}]", (None, 2), largest=LARGEST) for index, one in enumerate(given))
+    return tuple(corners)
 
 
 def world_of(value: object, dimension: int) -> World:

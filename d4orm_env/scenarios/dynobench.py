@@ -20,6 +20,7 @@ import numpy as np
 from d4orm_env.core.arrays import Floats, number_list, short_repr
 from d4orm_env.core.errors import did_you_mean, first_line
 from d4orm_env.core.files import naming, read_yaml
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -213,7 +214,7 @@ def _wrapped(angle: Floats) -> Floats:
 
 def _hitches(team: Team, states: Floats) -> Floats:
     """``(K, 3)`` hitch angles in states ``(K, n)``, NaN for trailers that there are not."""
-    hitches = np.full((team.num_robots, 3), np.nan)
+    hitches = np.full((team.num_robots, MOST_TRAILERS), np.nan)
     for robot, model in enumerate(team.robot_models):
         for number, (hitch, _) in enumerate(model.trailers):
             hitches[robot, number] = states[robot, hitch]

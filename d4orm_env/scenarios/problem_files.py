@@ -8,12 +8,11 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 import yaml
 
-from d4orm_env.core.files import naming, read_yaml, replaced_when_done
+from d4orm_env.core.files import checked_path, naming, read_yaml, replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
@@ -40,7 +39,7 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
         ValueError: If the file cannot be read, is not YAML, breaks the schema, or makes no valid problem. One line that
             names the file, the field, and what was expected.
     """
-    path = _checked_path(path)
+    path = checked_path(path, "a scenario file")
     with naming(path):
         content = read_yaml(path)
     keys = set(content) if isinstance(content, dict) else set()
@@ -58,12 +57,6 @@ def load_problem(path: str | os.PathLike[str]) -> Problem:
     return problem
 
 
-def _checked_path(path: object) -> Path:
-    if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"the path of a scenario file must be text or a path, not {path!r}")
-    return Path(path)
-
-
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
     """Write a problem in the explicit form; :func:`load_problem` returns an equal one, to the bit.
 
@@ -73,7 +66,7 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
         ValueError: If the file cannot be written; nothing is left behind.
     """
     check_is_problem(problem)
-    target = _checked_path(path)
+    target = checked_path(path, "a scenario file")
     try:
         with replaced_when_done(target) as temporary:
             temporary.write_text(scenario_text(problem), encoding="utf-8")

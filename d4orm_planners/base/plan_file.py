@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import ArrayArchive, replaced_when_done, require_file
+from d4orm_env.core.files import ArrayArchive, checked_path, replaced_when_done, require_file
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import DEFAULT_RADIUS
@@ -91,9 +91,7 @@ def _evaluated(
 
 
 def _npz_path(path: str | os.PathLike[str]) -> Path:
-    if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"the path of a plan file must be text or a path, not {path!r}")
-    target = Path(path)
+    target = checked_path(path, "a plan file")
     if target.suffix != ".npz":
         raise ValueError(f"plan file {str(target)!r} must end in .npz")
     return target

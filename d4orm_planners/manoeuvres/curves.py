@@ -121,7 +121,7 @@ def _in_line(kind: Kind, mode: Mode, way: int) -> FloatArray | None:
 
 
 def _ends(kind: Kind, bent: bool, hitches: Mode | None) -> list[Callable[[Kind, Mode, int], FloatArray | None]]:
-    """How curves may end but in line: controls from the hitch angles of a circle to those at the goal."""
+    """Ends of curves other than in line: controls from the hitch angles of a circle to those at the goal."""
     if hitches is None:
         return [lambda kind, mode, way: held(0, 0.0, 0.0)] if bent else []
 
@@ -162,6 +162,8 @@ def _count(curves: Curves, circle: Whole, length: float) -> int:
 @compiled
 def _joined(curves: Curves, goal: Goal, x: float, y: float, heading: float, first: int, second: int) -> Curve:
     """The curve by two circles, if there is one."""
+    if np.isnan(curves.swung[second]):
+        return NO_CURVE
     px, py = _turned(curves.ahead[first, 0], curves.ahead[first, 1], heading)
     qx, qy = _turned(curves.behind[second, 0], curves.behind[second, 1], goal.heading)
     dx, dy = goal.x + qx - x - px, goal.y + qy - y - py
@@ -196,8 +198,6 @@ def curve_of(curves: Curves, goal: Goal, x: float, y: float, heading: float, way
     for first in range(begin, begin + CIRCLES):
         for level in range(curves.last + first - first % 2, curves.swung.shape[0], 2 * CIRCLES):
             for second in range(level, level + 2):
-                if np.isnan(curves.swung[second]):
-                    continue
                 curve = _joined(curves, goal, x, y, heading, first, second)
                 if curve[0] > 0 and (best[0] == 0 or curve[0] < best[0]):
                     best = curve

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.engine.compiling import compiled
 from d4orm_planners.manoeuvres.curves import curve_of, sweep_curve
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS
@@ -31,7 +32,7 @@ def reaches(goal: Goal, pose: Floats, speed: float, wider: float) -> bool:
     dx, dy, radius, tolerance = goal.x - pose[0], goal.y - pose[1], goal.radius * wider, goal.tolerance * wider
     if dx * dx + dy * dy > radius * radius or speed > goal.speed:
         return False
-    for i in range(3):
+    for i in range(MOST_TRAILERS):
         if abs(goal.hitches[i] - pose[3 + i]) > tolerance:  # not if it is NaN
             return False
     return np.isnan(goal.heading) or abs(turned_by(goal.heading - pose[2])) <= tolerance

@@ -15,12 +15,11 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, Kind, Mode, Move
 from d4orm_planners.manoeuvres.model_moves import MOVES
 
-HITCHES = 3
-"""Most trailers of a robot."""
-POSE_SIZE = 3 + HITCHES
+POSE_SIZE = 3 + MOST_TRAILERS
 """Numbers of a pose: position, heading and hitch angles, zero for those that there are not."""
 
 

@@ -156,7 +156,7 @@ class SmoothMotion:
         return replace(self, stretch=self.stretch * max(1.0, *(needed for needed, _ in self.needed(limits).values())))
 
     def needed(self, limits: MotionLimits) -> dict[str, tuple[float, int]]:
-        """How many times as slow each of :data:`LIMITS` needs the motion to be, and the robot that it is for."""
+        """Factors by which each of :data:`LIMITS` needs the motion slower, and the robots that they are for."""
         needed = {}
         for name, (_, power) in LIMITS.items():
             share = (1 + RESERVE) * getattr(self.peaks, name) / getattr(limits, name)

@@ -9,13 +9,13 @@ A row for each map's kind and number of cars, of the first files of each folder;
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from examples.common import grouped, save_table, study_parser, study_rows
 from examples.studies.dynobench import described, row_of
 
-from d4orm_env import Problem
 from d4orm_env.scenarios import load_cl_mapf
 
 
@@ -40,17 +40,12 @@ def main() -> None:
     if not found and arguments.trials is None:
         parser.error("give --cl-cbs, --csdo or both with instances in benchmark/, or --trials")
 
-    def measured() -> list[dict[str, Any]]:
-        return [_row(*one) for one in found]
-
-    rows = study_rows(arguments, "cl_mapf", measured)
+    rows = study_rows(arguments, "cl_mapf", lambda: [_row(*one) for one in found])
     accepted = [row | {"kind": f"{row['map']}, {row['robots']:3} cars"} for row in rows if not row["refused"]]
     table = [described(*kind, own) for kind, own in sorted(grouped(accepted, "benchmark", "kind").items())]
     save_table([{k: v for k, v in row.items() if k != "models"} for row in table], arguments.out / "cl_mapf.csv")
 
 
 def _row(benchmark: str, path: Path) -> dict[str, Any]:
-    def load(path: Path) -> Problem:
-        return load_cl_mapf(path, clockwise=benchmark == "CL-CBS")
-
+    load = partial(load_cl_mapf, clockwise=benchmark == "CL-CBS")
     return row_of(benchmark, path, 0, load) | {"map": map_of(path)}

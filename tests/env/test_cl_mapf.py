@@ -14,7 +14,7 @@ from d4orm_env.footprints import Box
 from d4orm_env.scenarios import load_cl_mapf
 from d4orm_planners import make_planner
 
-EXAMPLE = Path("examples/scenarios/cl_mapf_cars.yaml")
+EXAMPLE = Path(__file__).parents[2] / "examples" / "scenarios" / "cl_mapf_cars.yaml"
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_what_is_wrong_is_told(instance: Path, old: str, new: str, message: str)
             "vehicle's entry 'carwidth' is unknown; choose one of r, carWidth, LF, LB, obs",
         ),
         ({"LF": -2.0}, "LF of vehicle is -2; it must be positive"),
-        ({"r": "wide"}, "r of vehicle"),
+        ({"r": "wide"}, "r of vehicle must be a number, not 'wide'"),
         ([3.0], r"vehicle must be a mapping such as {'r': 3.0}, not \[3.0\]"),
     ],
 )

@@ -153,3 +153,21 @@ def test_other_models_have_no_result_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="robot_0 is a car, which dynobench has no model for"):
         plan.to_dynobench(tmp_path / "result.yaml")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_trailer_ends_bent_where_its_goal_has_another_heading(tmp_path: Path) -> None:
+    """Whichever way round the two headings of the goal are written."""
+    goal = [2.0, 0.5, 3.0, 2.8 - 2 * np.pi]
+    path = tmp_path / "bent.yaml"
+    environment = {"min": [-3, -3], "max": [5, 5]}
+    robot = {"type": "car1_v0", "start": [0, 0, 3.0, 3.0], "goal": goal}
+    path.write_text(yaml.safe_dump({"environment": environment, "robots": [robot]}))
+    problem = load_dynobench(path)
+    np.testing.assert_allclose(problem.goal_hitches, [[0.2, np.nan, np.nan]], atol=1e-6)
+    plan = make_planner().solve(problem, seed=0, time_limit=60)
+    assert verify(problem, plan.controls).ok
+    plan.to_dynobench(tmp_path / "result.yaml")
+    result = yaml.safe_load((tmp_path / "result.yaml").read_text())
+    missed = np.subtract(result["result"][0]["states"][-1], goal)
+    missed[2:] = (missed[2:] + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(missed).max() < 0.0101
