@@ -281,7 +281,11 @@ class Problem(Frozen):
         )
 
     def select(self, robots: Sequence[int]) -> Problem:
-        """The problem of these robots only, in the order given."""
+        """The problem of these robots only, in the order given.
+
+        Raises:
+            ValueError: If a number is no robot's.
+        """
         index = list(robots)
         team = self.team.select(index)
         return self._unchecked(

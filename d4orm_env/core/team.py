@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, read_only, short_repr
+from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, read_only, short_repr, whole_number
 from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, find_bodies
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
@@ -274,8 +274,13 @@ class Team(Frozen):
         return read_only(np.array([model.turning_radius(limits) for model, limits in models], np.float32))
 
     def select(self, robots: Sequence[int]) -> Team:
-        """The team of these robots only, in the order given."""
-        index, models = list(robots), self.robot_models
+        """The team of these robots only, in the order given.
+
+        Raises:
+            ValueError: If a number is no robot's.
+        """
+        index = [whole_number(robot, "robot", 0, self.num_robots - 1) for robot in robots]
+        models = self.robot_models
         limits = {limit.name for robot in index for limit in models[robot].own_limits}
         return Team(
             tuple(self.models[robot] for robot in index),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.verify.contact import MAX_NUMBERS, Pairs, Stretch, Watch
+from d4orm_env.core import portable
+from d4orm_env.verify.contact import MAX_NUMBERS, Indices, Pairs, Stretch, Watch
 from d4orm_env.verify.convex_bodies import ConvexBodies
 from d4orm_env.verify.discs import surroundings
 from d4orm_env.verify.footprints import TurningPairs, turning_watches
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 CHORD_ERROR = 1 / 15_000
 """Largest distance between a curve and the chord that stands for it, as a share of the robot's radius."""
+HITCH_TOLERANCE = 0.02
+"""Share by which a trailer may exceed its largest hitch angle: beyond, it is not towed but pushed aside."""
 
 
 def verify_curves(
@@ -30,9 +34,8 @@ def verify_curves(
 ) -> VerificationReport:
     """Judge curves: do all robots end at their goals, and touch nothing at any time?
 
-    As :func:`d4orm_env.verify.verify` judges controls, known to ``CHORD_ERROR`` of the radius for each robot. Curves
-    say nothing of trailers: a team with any counts as the discs round its robots, which may refuse what is fine. Of
-    control limits it says nothing, nor when robots arrive.
+    As :func:`d4orm_env.verify.verify` judges controls, known to ``CHORD_ERROR`` of the radius for each robot. Trailers
+    are towed, from their hitch angles at the start. Of control limits it says nothing, nor when robots arrive.
 
     Args:
         problem: The team and its world; its dynamics do not count.
@@ -45,25 +48,34 @@ def verify_curves(
     steps = max(1, int(np.ceil(duration / problem.dt)))
     dt = duration / steps
     sub_steps = max(1, int(np.ceil(dt * np.sqrt(bend / (8 * CHORD_ERROR * radius))).max()))
-    robots = np.arange(len(radius))
-    shapes = ConvexBodies.of(team) if team.shapes and not has_trailers(problem) else None
+    trailers = _Trailers.of(problem)
+    robots = np.concatenate([np.arange(len(radius)), trailers.robot])
+    shapes = ConvexBodies.of(team) if team.shapes else None
     pairs: Pairs = Pairs(robots, radius) if shapes is None else TurningPairs(robots, shapes)
     world = problem.world
     obstacles = surroundings(world, robots, radius) if shapes is None else turning_watches(world, robots, shapes)
     watches: list[Watch] = [pairs, *obstacles]
+
+    def robots_at(samples: Indices) -> tuple[Floats, Floats]:
+        times = samples.ravel() * (dt / sub_steps)
+        path = position(times).reshape(*samples.shape, len(radius), problem.dimension)
+        return path, heading(times).reshape(*samples.shape, len(radius))
+
+    violations = _not_arrived(problem, position, duration)
+    towed = None
+    if len(trailers.robot):
+        *towed, hitches = trailers.tow(*robots_at(np.arange(steps * sub_steps + 1)))
+        violations += trailers.violations(hitches, dt / sub_steps)
     size = max(1, MAX_NUMBERS // ((2 * sub_steps + 1) * len(radius) * problem.dimension))
     for first in range(0, steps, size):
-        begins = np.arange(first, min(first + size, steps)) * dt
-        times = begins[:, None] + np.linspace(0, dt, sub_steps + 1)
-        path = position(times.ravel()).reshape(*times.shape, len(radius), problem.dimension)
-        travel, turn = norm(path - path[:, :1]).max(axis=1), np.zeros((0, 0, 0))
+        samples = np.arange(first, min(first + size, steps))[:, None] * sub_steps + np.arange(sub_steps + 1)
+        path, turn = robots_at(samples) if towed is None else (part[samples] for part in towed)
+        travel = norm(path - path[:, :1]).max(axis=1)
         if shapes is not None:
-            turn = heading(times.ravel()).reshape(*times.shape, len(radius))
             travel = shapes.stretch * (travel + shapes.outer * np.abs(turn - turn[:, :1]).max(axis=1))
         for watch in watches:
             watch.observe(Stretch(path, travel, first * dt, dt, turn))
-    violations = [violation for watch in watches for violation in watch.violations()]
-    violations += _not_arrived(problem, position, duration)
+    violations += [violation for watch in watches for violation in watch.violations()]
     nearest = min((watch.minimum for watch in obstacles), default=np.inf)
     unknown = np.full(len(radius), np.nan)
     return VerificationReport(
@@ -71,9 +83,61 @@ def verify_curves(
     )
 
 
-def has_trailers(problem: Problem) -> bool:
-    """Check whether any robot pulls trailers."""
-    return any(model.trailers for model in problem.team.robot_models)
+@dataclass(frozen=True, eq=False)
+class _Trailers:
+    """The trailers of a team, robot by robot: what curves say of them by towing them."""
+
+    robot: Indices  #: ``(J,)``
+    order: Indices  #: ``(J,)`` how many trailers a robot pulls before it
+    initial: Floats  #: ``(J,)`` hitch angles at the start [rad]
+    most: Floats  #: ``(J,)`` largest hitch angles [rad]
+    length: Floats  #: ``(J,)`` of the hitches [m]
+
+    @classmethod
+    def of(cls, problem: Problem) -> _Trailers:
+        rows = [
+            (robot, order, problem.start[robot, state], limits[dict(model.state_limits)[state]], limits[column])
+            for robot, (model, limits) in enumerate(zip(problem.team.robot_models, problem.team.limits, strict=True))
+            for order, (state, column) in enumerate(model.trailers)
+        ]
+        robot, order, *angles = np.array(rows, np.float64).reshape(-1, 5).T
+        return cls(robot.astype(np.intp), order.astype(np.intp), *angles)
+
+    def tow(self, path: Floats, turn: Floats) -> tuple[Floats, Floats, Floats]:
+        """Reference points ``(N, F, 2)``, headings ``(N, F)`` and hitch angles ``(N, J)`` where robots move like this.
+
+        While its hitch moves straight, a trailer follows a tractrix: the tangent of half of the angle between its
+        heading and the hitch's direction shrinks by ``exp(-way / length)``.
+        """
+        samples, first = turn.shape
+        path = np.concatenate([path, np.zeros((samples, len(self.robot), 2))], axis=1)
+        turn = np.concatenate([turn, np.zeros((samples, len(self.robot)))], axis=1)
+        hitches = np.zeros((samples, len(self.robot)))
+        for order in range(int(self.order.max(initial=-1)) + 1):
+            each = np.flatnonzero(self.order == order)
+            own, before = first + each, self.robot[each] if order == 0 else first + each - 1
+            moves = np.diff(path[:, before], axis=0, prepend=path[:1, before])
+            direction = portable.arctan2(moves[..., 1], moves[..., 0])
+            shrinkage = portable.exp(-norm(moves) / self.length[each])
+            angle = turn[0, before] - self.initial[each]
+            for sample in range(samples):
+                off = angle - direction[sample]
+                off -= 2 * np.pi * np.rint(off / (2 * np.pi))
+                sine, cosine = portable.sin_cos(off / 2)
+                angle = angle + 2 * portable.arctan2(sine * shrinkage[sample], cosine) - off
+                turn[sample, own] = angle
+            hitches[:, each] = turn[:, before] - turn[:, own]
+            sine, cosine = portable.sin_cos(turn[:, own])
+            path[:, own] = path[:, before] - self.length[each, None] * np.stack([cosine, sine], axis=-1)
+        return path, turn, hitches
+
+    def violations(self, hitches: Floats, dt: float) -> Iterator[Violation]:
+        """Yield a violation for each trailer whose hitch angles ``(N, J)``, every ``dt``, exceed its largest one."""
+        over = np.abs(hitches) > self.most * (1 + HITCH_TOLERANCE)
+        for each in np.flatnonzero(over.any(axis=0)):
+            detail = f"hitch {self.order[each] + 1} is at {np.abs(hitches[:, each]).max():.3g} rad at most"
+            detail += f", limit {self.most[each]:.3g}"
+            yield Violation("hitch limit", (int(self.robot[each]),), float(over[:, each].argmax()) * dt, detail)
 
 
 def _not_arrived(problem: Problem, position: Callable[[Floats], Floats], duration: float) -> list[Violation]:

@@ -13,7 +13,7 @@ class Violation:
 
     Attributes:
         kind: ``"robot contact"``, ``"obstacle contact"``, ``"bounds contact"``, ``"control limit"``, ``"not arrived"``,
-            ``"non-finite"`` or ``"not judged"``.
+            ``"non-finite"``, ``"not judged"`` or, of curves, ``"hitch limit"``.
         robots: Indices of the robots concerned.
         time: Time at which it first happens, contacts to within a sub-step [s].
         detail: Description, with values and units.

@@ -102,7 +102,7 @@ class CheckedSettings:
         try:
             converted = _schema(kind)(**vars(self))
         except ValidationError as error:
-            raise ValueError(_explain(error)) from None
+            raise ValueError(_explain(error, vars(self))) from None
         for field in fields(self):
             object.__setattr__(self, field.name, getattr(converted, field.name))
 
@@ -165,10 +165,12 @@ _EXPECTED = {
 _PLAIN = {"above 0": "positive", "at least 0": "zero or more"}
 
 
-def _explain(error: ValidationError) -> str:
+def _explain(error: ValidationError, given: Mapping[str, object]) -> str:
     """The first error as one line."""
     first = error.errors(include_url=False)[0]
     name, kind, value = str(first["loc"][0]), first["type"], first["input"]
+    if isinstance(group := given[name], Mapping) and first["loc"][1:] and first["loc"][1] in group:
+        name = f"{first['loc'][1]} of {name}"
     if kind == "value_error":
         return f"{name} {first['ctx']['error']}"
     if kind not in _EXPECTED:

@@ -66,11 +66,17 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 
 
 class OnceEach(TyperCommand):
-    """A command none of whose options is given twice, unless it takes several: one would count for nothing."""
+    """A command with no empty option, as a variable of a shell may be, and none twice, unless it takes several.
+
+    An empty path would be the present folder, and one of two options would count for nothing.
+    """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        given = Counter(self.make_parser(ctx).parse_args(args=list(args))[2])
-        for parameter, times in given.items():
+        values, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        for parameter, times in Counter(order).items():
+            value = values[parameter.name]
+            if "" in (value if isinstance(value, list | tuple) else [value]):
+                raise ValueError(f"{parameter.opts[0]} is empty; give it a value, or leave it out")
             if times > 1 and not parameter.multiple:
                 raise ValueError(f"{parameter.opts[0]} is given {times} times; give it once")
         return super().parse_args(ctx, args)

@@ -22,7 +22,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.verify import VerificationReport
-from d4orm_env.verify.curves import has_trailers, verify_curves
+from d4orm_env.verify.curves import verify_curves
 from d4orm_planners.tracking.steering import present_velocities
 
 DEGREE = 5
@@ -188,10 +188,9 @@ def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits
     for motion in motions:
         if motion.report.ok and motion.stretch <= SLOWEST:
             return motion
-    discs = "; cars with trailers count as the discs round them" if has_trailers(problem) else ""
     raise ValueError(
-        f"smoothed, the plan fails: {best.report.violations[0]}{discs}; plan with a larger margin, or allow more "
-        "acceleration with max_acceleration"
+        f"smoothed, the plan fails: {best.report.violations[0]}; plan with a larger margin, or allow more acceleration "
+        "with max_acceleration"
     )
 
 

@@ -421,8 +421,9 @@ def test_select_takes_robots_in_the_order_given() -> None:
     assert swapped.select([1, 0]) == problem
     # Alone, a first-order robot needs no padding.
     assert problem.select([1]).start.tolist() == [[1, 0]]
-    with pytest.raises(ValueError, match="models is empty"):
-        problem.select([])
+    for wrong, message in (([], "models is empty"), ([2], "robot is 2; it must be at most 1"), ([1.5], "not 1.5")):
+        with pytest.raises(ValueError, match=message):
+            problem.select(wrong)  # type: ignore[arg-type]
 
 
 def all_arrays(problem: Problem) -> list[np.ndarray]:

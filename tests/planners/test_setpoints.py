@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.polynomial.polynomial import polyder, polyval
+from scipy.interpolate import make_interp_spline
 
-from d4orm_env import Problem, Team, World, make_problem
-from d4orm_env.footprints import Box
+from d4orm_env import Problem, Team, World, make_problem, verify
+from d4orm_env.engine.choice import get_engine
+from d4orm_env.footprints import Box, Train
 from d4orm_env.verify.curves import verify_curves
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.candidate import evaluate_controls
@@ -204,6 +206,35 @@ def test_footprints_of_curves_are_exact() -> None:
     setpoints = plan.sample()
     assert setpoints.report.ok
     assert setpoints.report.min_separation == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_curves_tow_trailers_as_the_physics_does(count: int) -> None:
+    """Two cars drive, and one backs a little: judged by its controls and by its curves the motion is the same."""
+    model = f"car_with_{count}_trailer" + "s" * (count > 1)
+    team = Team((model,) * 2, footprint=Train(Box(0.5, 0.25), [Box(0.3, 0.25)] * count))
+    start = [[0, 0, 0, *[0.3] * count], [0, 3, 0, *[0] * count]]
+    world = World(circles=[[-1.2, 1.5, 0.1]])
+    problem = Problem(team, start, [[9, 9], [9, -9]], world, dt=0.01, horizon=540)
+    controls = np.zeros((540, 2, 2), np.float32)
+    controls[:500, 0], controls[500:, 0], controls[:, 1] = (0.5, 0.3), (-0.2, -0.1), (0.5, -0.2)
+    exact, moved = verify(problem, controls), evaluate_controls(get_engine("cpu"), problem, controls).trajectory
+    times = np.arange(541) * problem.dt
+    position, heading = (make_interp_spline(times, part) for part in (moved.positions, moved.states[..., 2]))
+    report = verify_curves(problem, position, times[-1], np.full(2, 2.0), heading)
+    assert report.min_separation == pytest.approx(exact.min_separation, abs=1e-4)
+    assert report.min_clearance == pytest.approx(exact.min_clearance, abs=1e-4)
+    assert {violation.kind for violation in report.violations} == {"not arrived"}
+
+
+def test_a_trailer_that_is_pushed_aside_is_told() -> None:
+    """A trailer of 0.5 m at an angle of 0.3, backed by 1 m in a straight line, ends at 1.68: tan(phi / 2) times e^2."""
+    team = Team(("car_with_1_trailer",), footprint=Train(Box(0.5, 0.25), [Box(0.3, 0.25)]))
+    problem = Problem(team, [[0, 0, 0, 0.3]], [[-1, 0]])
+    line = make_interp_spline([0, 2], [[[0, 0]], [[-1, 0]]], k=1)
+    report = verify_curves(problem, line, 2.0, np.ones(1), lambda times: np.zeros((len(times), 1)))
+    assert [violation.detail for violation in report.violations] == ["hitch 1 is at 1.68 rad at most, limit 0.785"]
+    assert report.violations[0].time == pytest.approx(1.03, abs=0.01)
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,7 @@ def run_row(record: Record, rows: Sequence[Row], dt: float) -> Row:
         "iteration, 95th percentile [ms]": f"{np.percentile(computing, 95):.0f}" if len(computing) else "",
         "tick answered, median [ms]": _median(1000 * np.array(record.answered)),
         "tick answered, slowest [ms]": f"{1000 * max(record.answered, default=0):.0f}",
+        "ticks answered late": sum(seconds > dt for seconds in record.answered),
         "messages": len(sent),
         "kB sent": f"{sum(row['bytes'] for row in sent) / 1000:.0f}",
     }
