@@ -30,8 +30,7 @@ from numba.core.typing.templates import Signature
 from numba.misc.appdirs import AppDirs
 
 from d4orm_env.dynamics.source_digest import bytecode, pieces
-from d4orm_env.engine.file_turns import Turn
-from d4orm_env.engine.kernel_files import KernelFiles, ShippedFiles, shipped_folder
+from d4orm_env.engine.kernel_files import KernelFiles, ShippedFiles, Turn, shipped_folder
 
 P = ParamSpec("P")
 R_co = TypeVar("R_co", covariant=True)

@@ -20,10 +20,9 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.models import COMMON, names_of_codes
 from d4orm_env.engine.caching import Kernel
 from d4orm_env.engine.compiling import aligned_zeros
-from d4orm_env.engine.episodes import advance_worlds_kernel
+from d4orm_env.engine.episodes import RollOut, advance_worlds_kernel, roll_out_kernel
 from d4orm_env.engine.observing import ObservationSpec, observe_worlds_kernel
 from d4orm_env.engine.ray_casting import Surroundings, cast_rays
-from d4orm_env.engine.rollouts import RollOut, roll_out_kernel
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import models_of_kernel
 from d4orm_env.engine.threads import Threads, available_cores

@@ -1,4 +1,4 @@
-"""Files of compiled kernels: what is whole is loaded, from the cache or from a wheel.
+"""Files of compiled kernels: what is whole is loaded, from the cache or from a wheel; and turns at compiling them.
 
 A wheel may bring kernels, compiled for the levels of x86-64 (``make warm-wheel``). A plan has the same bits on every
 processor, so that a level is all that such a kernel has to know of one.
@@ -11,12 +11,13 @@ import hashlib
 import importlib.metadata
 import os
 import pickle
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from llvmlite.binding import get_host_cpu_features
 from numba.core.caching import IndexDataCacheFile, _cache_log
@@ -24,6 +25,13 @@ from numba.core.environment import Environment, _rebuild_env, lookup_environment
 
 from d4orm_env.core.files import replaced_when_done
 
+try:
+    import fcntl
+except ImportError:  # Windows: nobody waits
+    fcntl = None  # type: ignore[assignment]
+
+_PATIENCE, _PAUSE = 120.0, 0.02
+"""Seconds to wait for a turn at most, for the process whose turn it is may have been stopped; and between looks."""
 _DIGEST_SIZE = hashlib.sha256().digest_size
 
 
@@ -97,6 +105,40 @@ class KernelFiles(IndexDataCacheFile):
 
     def _digest(self, content: bytes) -> bytes:
         return hashlib.sha256(repr((self._version, self._source_stamp)).encode() + content).digest()
+
+
+class Turn:
+    """A turn at something that one process at a time does, as long as it takes less than two minutes.
+
+    It is a lock on a file, which the system takes from a process that dies.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: IO[bytes] | None = None
+
+    def wait(self) -> bool:
+        """Wait for this process's turn; true if another one had it meanwhile."""
+        if fcntl is None or self._file is not None:
+            return False
+        waited, begin = False, time.monotonic()
+        with suppress(OSError):  # a folder that cannot be written to, or a file system without locks
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self._path.open("ab")
+            while time.monotonic() - begin < _PATIENCE:
+                try:
+                    fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    waited = True
+                    time.sleep(_PAUSE)
+        return waited
+
+    def end(self) -> None:
+        """End it, if it is this process's."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
 
 LEVELS = {

@@ -108,32 +108,21 @@ class TeamSimulation(Simulation):
         self.put_robots(states, self.arrived, observations)
         return self._report_unrewarded(observations)
 
-    def state(self) -> FloatArray:
-        """The joint state vector as it is seen; see :mod:`d4orm_env.envs.joint_state`."""
-        return self._joined(self.seen)
-
-    def true_state(self) -> FloatArray:
-        """:meth:`state` as it truly is, whatever is seen."""
-        return self._joined(self.true)
+    def joined(self, shown: Observed) -> FloatArray:
+        """The joint state vector of the world as it is ``seen``, or ``true``."""
+        self.require_reset()
+        states, controls, bodies = (part[0] for part in shown)
+        return join_state(JointState(states, self.goals, controls, self.arrived, int(self.worlds.steps[0]), bodies))
 
     def metrics(self) -> dict[str, float]:
         """The episode so far in numbers; see :func:`d4orm_env.envs.team_step.episode_metrics`."""
         self.require_reset()
         return {name: float(values[0]) for name, values in self.episode_metrics().items()}
 
-    def effect(self) -> DisturbanceEffect:
-        """Return the effect of the disturbances up to now, as of a batch of one world."""
-        self.require_reset()
-        return super().effect()
-
     def events(self) -> DisturbanceEvents | None:
         """Return the disturbances of the present moment, as far as they can be drawn; ``None`` without any."""
-        return events_of([self.effect()], self.problem) if self.setup.disturbances else None
-
-    def _joined(self, shown: Observed) -> FloatArray:
         self.require_reset()
-        states, controls, bodies = (part[0] for part in shown)
-        return join_state(JointState(states, self.goals, controls, self.arrived, int(self.worlds.steps[0]), bodies))
+        return events_of([self.effect()], self.problem) if self.setup.disturbances else None
 
     def _new_observations(self) -> FloatArray:
         return np.empty((1, self.problem.num_robots, self.setup.layout.size), np.float32)
@@ -240,14 +229,15 @@ class BaseEnv:
 
     def state(self) -> FloatArray:
         """The joint state, all a planner needs to go on from here; see :mod:`d4orm_env.envs.joint_state`."""
-        return self._simulation.state()
+        return self._simulation.joined(self._simulation.seen)
 
     def true_state(self) -> FloatArray:
         """:meth:`state` as it truly is, without disturbances of what is seen."""
-        return self._simulation.true_state()
+        return self._simulation.joined(self._simulation.true)
 
     def effect(self) -> DisturbanceEffect:
         """Return the effect of the disturbances up to now, as arrays with one world as their first axis."""
+        self._simulation.require_reset()
         return self._simulation.effect()
 
     def metrics(self) -> dict[str, float]:

@@ -107,11 +107,7 @@ def _fits(rest: FloatArray, team_size: int, body: int) -> bool:
 
 
 def state_bounds(
-    problem: Problem,
-    positions: FloatArray,
-    max_cycles: int,
-    slack: BoundsSlack = BoundsSlack(),  # noqa: B008 - it is immutable
-    num_bodies: int = 0,
+    problem: Problem, positions: FloatArray, max_cycles: int, slack: BoundsSlack, num_bodies: int
 ) -> tuple[FloatArray, FloatArray]:
     """Finite bounds that every joint state of an episode keeps.
 

@@ -22,7 +22,6 @@ from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.engine.types import OWN_ARRAYS, WorldBatch
 from d4orm_env.envs.features import Features
 from d4orm_env.envs.inputs import checked_cycles
-from d4orm_env.envs.joint_state import state_bounds
 from d4orm_env.envs.lifelong import fresh_goal, given_goal, goal_region
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.rewards import find_reward, paper_reward
@@ -123,10 +122,6 @@ class EnvSetup:
         self.__dict__ |= state
         low, high = (frozen_array(bound, "bounds", (None,)) for bound in (self.layout.low, self.layout.high))
         self.layout = replace(self.layout, low=low, high=high)
-
-    def state_bounds(self, max_cycles: int, num_bodies: int) -> tuple[FloatArray, FloatArray]:
-        """Finite bounds of the joint states of episodes of so many steps, with so many dynamic obstacles."""
-        return state_bounds(self.problem, self.region, max_cycles, self.slack, num_bodies)
 
     @property
     def observation_bounds(self) -> tuple[FloatArray, FloatArray]:

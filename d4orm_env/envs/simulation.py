@@ -17,10 +17,11 @@ from d4orm_env.disturbances.disturbance import DisturbanceEffect, Observed, Scen
 from d4orm_env.disturbances.disturbed_worlds import DisturbedWorlds
 from d4orm_env.engine.types import LOOK, RESET, SKIP, STEP, ObservationInputs, WorldBatch
 from d4orm_env.envs.inputs import checked_states
+from d4orm_env.envs.joint_state import state_bounds
 from d4orm_env.envs.lifelong import assign_goals, reached_goals
 from d4orm_env.envs.rewards import RewardInput, along_paths, compute_rewards, no_terms
 from d4orm_env.envs.setup import EnvSetup, WorldPaths, WorldProblems
-from d4orm_env.envs.team_step import EpisodeCounts, episode_metrics
+from d4orm_env.envs.team_step import episode_metrics
 from d4orm_env.paths.shortest_paths import observe_paths
 
 _READ_BEFORE = ("state", "distance", "arrived", "total_reward")
@@ -74,7 +75,8 @@ class Simulation:
     @property
     def state_bounds(self) -> tuple[FloatArray, FloatArray]:
         """Finite bounds of the joint states, for the present ``max_cycles``."""
-        return self.setup.state_bounds(self.max_cycles, self.worlds.bodies.shape[1])
+        setup, num_bodies = self.setup, self.worlds.bodies.shape[1]
+        return state_bounds(setup.problem, setup.region, self.max_cycles, setup.slack, num_bodies)
 
     def show(self, seen: FloatArray, worlds: slice | BoolArray = slice(None)) -> FloatArray:
         """Observations ``(b, K, D)`` of some worlds as their robots are shown them: as features, if egocentric."""
@@ -141,15 +143,12 @@ class Simulation:
 
     def episode_metrics(self) -> dict[str, Floats]:
         """``(B,)`` numbers of the present episodes; see :func:`d4orm_env.envs.team_step.episode_metrics`."""
-        worlds = self.worlds
-        arrival = None if self.setup.lifelong else np.where(worlds.arrival > 0, worlds.arrival, np.inf)
-        goals = self._goals_reached if self.setup.lifelong else worlds.arrived
-        counts = (goals, worlds.contacts, worlds.violations, arrival, self.effect().lost)
-        return episode_metrics(EpisodeCounts(worlds.steps, worlds.total_reward, *counts), self.problems.all[0].dt)
+        goals = self._goals_reached if self.setup.lifelong else None
+        return episode_metrics(self.worlds, self.problems.all[0].dt, goals, self.effect().lost)
 
     def effect(self) -> DisturbanceEffect:
         """Return the effect of the disturbances up to now."""
-        return self._disturbed.effect(self._scene) if self.setup.disturbances else DisturbanceEffect()
+        return self._disturbed.effect(self._scene()) if self.setup.disturbances else DisturbanceEffect()
 
     @property
     def seen(self) -> Observed:
@@ -176,13 +175,11 @@ class Simulation:
         self._disturbed.begin(indices, list(seeds.values()), worlds.start[indices], worlds.goal[indices])
         worlds.bodies[indices] = self._disturbed.bodies[indices]
 
-    @property
-    def _scene(self) -> Scene:
-        return self._scene_of(self.worlds.state)
-
-    def _scene_of(self, states: FloatArray) -> Scene:
+    def _scene(self, states: FloatArray | None = None) -> Scene:
+        """The worlds as disturbances are told of them; robots are in ``states`` ``(B, K, n)``, if these are given."""
         now = self.worlds
-        return self._disturbed.scene(now.start, now.goal, states, now.control, now.arrived, now.steps)
+        where = now.state if states is None else states
+        return self._disturbed.scene(now.start, now.goal, where, now.control, now.arrived, now.steps)
 
     @property
     def _sensed(self) -> FloatArray:
@@ -193,7 +190,7 @@ class Simulation:
         """Disturb states and controls at the beginning of a step, and return the controls."""
         if not self.setup.disturbances:
             return controls
-        states, controls = self._disturbed.act(self._scene, controls)
+        states, controls = self._disturbed.act(self._scene(), controls)
         if states is not self.worlds.state:
             self._put(states)
         np.copyto(self.worlds.bodies, self._disturbed.bodies)
@@ -240,7 +237,7 @@ class Simulation:
         if layout.observed_path:
             observe_paths(seen, layout, *self._paths.look(worlds, inputs.state))
         self.problems.sense_ranges(self._engine, self.worlds, seen, None if every else worlds)
-        seen = self._disturbed.observe(seen, layout, self._scene, None if every else worlds)
+        seen = self._disturbed.observe(seen, layout, self._scene(), None if every else worlds)
         if seen is not out:
             out[worlds] = seen
 
@@ -250,7 +247,7 @@ class Simulation:
         if every and not self.setup.disturbances:
             seen = self.true._replace(states=self._sensed)
         else:
-            seen = self._disturbed.see(self._scene_of(self._sensed), None if every else worlds)
+            seen = self._disturbed.see(self._scene(self._sensed), None if every else worlds)
         if every:
             self._seen = seen
         else:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.engine.types import WorldBatch
 
 Info: TypeAlias = dict[str, Any]
 """Infos of an environment, by name."""
@@ -50,86 +51,44 @@ def agent_infos(names: Iterable[str], robots: Iterable[int], step: TeamStep) -> 
     }
 
 
-def masked(values: Mapping[str, NDArray[np.generic]], mask: BoolArray) -> Info:
-    """Copies of batched values, zero outside ``mask`` ``(B,)``, each with its mask."""
-    infos: Info = {}
-    whole = bool(mask.all())
-    for key, value in values.items():
-        infos[key] = value.copy()
-        if not whole:
-            infos[key][~mask] = 0
-        infos[f"_{key}"] = mask.copy()
-    return infos
+def episode_metrics(
+    worlds: WorldBatch, dt: float, goals: NDArray[np.int64] | None, lost: BoolArray | None
+) -> dict[str, Floats]:
+    """Episodes in numbers.
 
-
-def final_infos(observations: FloatArray, infos: Info, ended: BoolArray) -> Info:
-    """Last observations and infos of episodes that have ``ended`` ``(B,)``, kept before their worlds are reset.
-
-    ``infos`` go into the result.
-    """
-    final_obs = np.full(len(ended), None, dtype=object)
-    for world in np.flatnonzero(ended):
-        final_obs[world] = observations[world].copy()
-    final_info: Info = {}
-    for key in [name for name in infos if not name.startswith("_")]:
-        final_info[key] = infos[key]
-        if isinstance(infos[key], np.ndarray):
-            final_info[key][~ended] = 0
-        final_info[f"_{key}"] = ended.copy()
-    return {
-        "final_obs": final_obs,
-        "_final_obs": ended.copy(),
-        "final_info": final_info,
-        "_final_info": ended.copy(),
-    }
-
-
-Counts = NDArray[np.int64]
-
-
-class EpisodeCounts(NamedTuple):
-    """Counts of an episode of one world or, with leading axes, of many."""
-
-    steps: int | Counts  #: ``(...)`` steps taken
-    reward: float | Floats  #: ``(...)`` sum over steps and robots
-    goals: Counts | BoolArray  #: ``(..., K)`` goals reached by each robot
-    contacts: Counts  #: ``(..., K)`` steps in contact
-    violations: Counts  #: ``(..., K)`` steps within the margin
-    #: ``(..., K)`` step since which a robot is at its goal, infinite where it is not; ``None`` in lifelong mode
-    arrival_step: Floats | None
-    #: ``(..., K)`` robots that a disturbance keeps from ever arriving, if there can be any
-    lost: BoolArray | None = None
-
-
-def episode_metrics(counts: EpisodeCounts, dt: float) -> dict[str, Floats]:
-    """Episodes in numbers; ``dt`` is the time step [s].
+    Args:
+        worlds: The worlds.
+        dt: Time step [s].
+        goals: ``(B, K)`` goals reached by each robot in lifelong mode, or ``None`` outside it.
+        lost: ``(B, K)`` bool: robots that a disturbance keeps from ever arriving, if there can be any.
 
     Returns:
         ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
         ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin; ``collided`` and
         ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots arrived; ``success``:
         1.0 when all have docked, but for those that are lost, and none was ever in contact; ``travel_time`` and
-        ``makespan``: mean and latest arrival [s], with the time so far for a robot that has not arrived. Each ``(...)``
+        ``makespan``: mean and latest arrival [s], with the time so far for a robot that has not arrived. Each ``(B,)``
         float64.
     """
-    team_size, steps = counts.contacts.shape[-1], np.asarray(counts.steps, np.float64)
-    robot_steps = team_size * np.maximum(steps, 1)
-    reached = counts.goals.sum(axis=-1).astype(np.float64)
-    collided = np.count_nonzero(counts.contacts, axis=-1)
+    steps = worlds.steps.astype(np.float64)
+    robot_steps = worlds.contacts.shape[1] * np.maximum(steps, 1)
+    reached = (worlds.arrived if goals is None else goals).sum(axis=1).astype(np.float64)
+    collided = np.count_nonzero(worlds.contacts, axis=1)
     metrics = {
         "steps": steps,
-        "reward": np.asarray(counts.reward / robot_steps),
+        "reward": worlds.total_reward / robot_steps,
         "goals_reached": reached,
         "goals_per_robot_minute": 60 * reached / (robot_steps * dt),
-        "collisions": counts.contacts.sum(axis=-1).astype(np.float64),
-        "margin_violations": counts.violations.sum(axis=-1).astype(np.float64),
-        "collided": np.asarray(collided, np.float64),
-        "margin_violated": np.asarray(np.count_nonzero(counts.violations, axis=-1), np.float64),
+        "collisions": worlds.contacts.sum(axis=1).astype(np.float64),
+        "margin_violations": worlds.violations.sum(axis=1).astype(np.float64),
+        "collided": collided.astype(np.float64),
+        "margin_violated": np.count_nonzero(worlds.violations, axis=1).astype(np.float64),
     }
-    if counts.arrival_step is None:
+    if goals is not None:
         return metrics
-    times = np.minimum(counts.arrival_step * dt, (steps * dt)[..., None])
-    done = counts.goals > 0 if counts.lost is None else (counts.goals > 0) | counts.lost
-    success = (done.all(axis=-1) & (np.asarray(collided) == 0)).astype(np.float64)
-    arrivals = {"travel_time": times.mean(axis=-1), "makespan": times.max(axis=-1)}
+    arrival = np.where(worlds.arrival > 0, worlds.arrival, np.inf)
+    times = np.minimum(arrival * dt, (steps * dt)[:, None])
+    done = worlds.arrived if lost is None else worlds.arrived | lost
+    success = (done.all(axis=1) & (collided == 0)).astype(np.float64)
+    arrivals = {"travel_time": times.mean(axis=1), "makespan": times.max(axis=1)}
     return metrics | {"arrived": reached.copy(), "success": success} | arrivals

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,7 @@ from d4orm_env.envs.joint_env import joint_spaces
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.envs.simulation import Simulation
-from d4orm_env.envs.team_step import Info, final_infos, masked
+from d4orm_env.envs.team_step import Info
 from d4orm_env.scenarios.problems import ScenarioLike
 
 __all__ = ["NavigationVectorEnv"]
@@ -166,7 +166,12 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             RuntimeError: Before the first reset, or, without auto-reset, if an episode is over.
             ValueError: If the actions have another shape, or a value that is not finite or beyond 1e15.
         """
-        self._require_episodes()
+        self._require_reset()
+        if self._mode is AutoresetMode.DISABLED and self._simulation.ended.any():
+            raise RuntimeError(
+                f"the episode of world {int(self._simulation.ended.argmax())} is over; begin another with "
+                "reset(options={'reset_mask': terminations | truncations})"
+            )
         simulation, worlds, seen = self._simulation, self._simulation.worlds, self._new_observations()
         controls = simulation.controls(joint_controls(actions, self._action_shape, self.problem.num_robots))
         simulation.step_worlds(controls, seen, self._drawn(simulation.ended))
@@ -175,9 +180,9 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         rewards, terminated, truncated = worlds.reward.copy(), worlds.terminated.copy(), worlds.truncated.copy()
         infos = self._infos()
         if ended.any():
-            infos |= {"metrics": masked(self.metrics(), ended), "_metrics": ended}
+            infos |= {"metrics": _masked(self.metrics(), ended), "_metrics": ended}
             if self._mode is AutoresetMode.SAME_STEP:
-                final = final_infos(observations, infos, ended)
+                final = _final_infos(observations, infos, ended)
                 simulation.reset_worlds(self._drawn(ended), seen, others=SKIP)
                 shown[ended] = simulation.show(seen[ended], ended)
                 infos = self._infos() | final
@@ -226,15 +231,6 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         if not self._running.all():
             raise RuntimeError("no episode has begun; call reset() first")
 
-    def _require_episodes(self) -> None:
-        self._require_reset()
-        ended = self._simulation.ended
-        if self._mode is AutoresetMode.DISABLED and ended.any():
-            raise RuntimeError(
-                f"the episode of world {int(ended.argmax())} is over; begin another with reset(options="
-                "{'reset_mask': terminations | truncations})"
-            )
-
     def _new_observations(self) -> FloatArray:
         """``(B, K, D)`` array for observations."""
         return np.empty_like(self._observations) if self._copy else self._observations
@@ -261,4 +257,38 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             **{f"reward_{name}": term for name, term in self._simulation.terms.items()},
             "is_success": np.asarray(done.all(axis=1) & ~worlds.contacts.any(axis=1)),
         }
-        return masked(values, np.ones(self.num_envs, np.bool_) if mask is None else mask)
+        return _masked(values, np.ones(self.num_envs, np.bool_) if mask is None else mask)
+
+
+def _masked(values: Mapping[str, NDArray[np.generic]], mask: BoolArray) -> Info:
+    """Copies of batched values, zero outside ``mask`` ``(B,)``, each with its mask."""
+    infos: Info = {}
+    whole = bool(mask.all())
+    for key, value in values.items():
+        infos[key] = value.copy()
+        if not whole:
+            infos[key][~mask] = 0
+        infos[f"_{key}"] = mask.copy()
+    return infos
+
+
+def _final_infos(observations: FloatArray, infos: Info, ended: BoolArray) -> Info:
+    """Last observations and infos of episodes that have ``ended`` ``(B,)``, kept before their worlds are reset.
+
+    ``infos`` go into the result.
+    """
+    final_obs = np.full(len(ended), None, dtype=object)
+    for world in np.flatnonzero(ended):
+        final_obs[world] = observations[world].copy()
+    final_info: Info = {}
+    for key in [name for name in infos if not name.startswith("_")]:
+        final_info[key] = infos[key]
+        if isinstance(infos[key], np.ndarray):
+            final_info[key][~ended] = 0
+        final_info[f"_{key}"] = ended.copy()
+    return {
+        "final_obs": final_obs,
+        "_final_obs": ended.copy(),
+        "final_info": final_info,
+        "_final_info": ended.copy(),
+    }

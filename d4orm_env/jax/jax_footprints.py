@@ -176,11 +176,6 @@ def _balls_within(offset: Array, a: Array, b: Array) -> Array:
 
 def static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
     """``(K, S)`` whether robots in ``state`` ``(K, n, S)`` come within ``extra`` of an obstacle or a bound."""
-    return of_robots(arrays.footprints, _static_contacts(arrays, state, extra), len(state))
-
-
-def _static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array:
-    """``(F, S)`` the same of bodies."""
     dimension, extra = arrays.goal.shape[1], jnp.asarray(extra)
     bodies = place_robots(arrays.footprints, state, dimension)
     if dimension == 3:
@@ -191,15 +186,15 @@ def _static_contacts(arrays: ProblemArrays, state: Array, extra: Given) -> Array
     lower, upper = (bound[:, None, None] for bound in jnp.asarray(arrays.bounds))
     hit = ((bodies.position - (low + extra) <= lower) | (bodies.position + (high + extra) >= upper)).any(axis=0)
     boxes, triangles = jnp.asarray(arrays.boxes), jnp.asarray(arrays.triangles).reshape(-1, 3, 2)
-    if len(boxes):
-        hit = jax.lax.fori_loop(0, len(boxes), lambda i, hit: hit | _meets_box(bodies, boxes[i], extra), hit)
-    if not len(triangles):
-        return hit
 
-    def meet(i: Array, hit: Array) -> Array:
+    def meet_triangle(i: Array, hit: Array) -> Array:
         return hit | _cores_within(bodies, _polygon(triangles[i].T, jnp.float32(0)), -bodies.position, extra)
 
-    return jax.lax.fori_loop(0, len(triangles), meet, hit)
+    if len(boxes):
+        hit = jax.lax.fori_loop(0, len(boxes), lambda i, hit: hit | _meets_box(bodies, boxes[i], extra), hit)
+    if len(triangles):
+        hit = jax.lax.fori_loop(0, len(triangles), meet_triangle, hit)
+    return of_robots(arrays.footprints, hit, len(state))
 
 
 def _meets_box(bodies: PlacedBodies, box: Array, extra: Array) -> Array:

@@ -16,8 +16,17 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.core.winding import unwound
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TimeStep
 from d4orm_env.envs.body_simulation import Moved, Robots
-from d4orm_env.mujoco.parts import HALF_TRACK, WHEEL_RADIUS
-from d4orm_env.mujoco.scene import DRIVES, GRAVITY, NOT_SOLID, OBSTACLE, PUCKS, Physics, build_scene
+from d4orm_env.mujoco.scene import (
+    DRIVES,
+    GRAVITY,
+    HALF_TRACK,
+    NOT_SOLID,
+    OBSTACLE,
+    PUCKS,
+    WHEEL_RADIUS,
+    Physics,
+    build_scene,
+)
 
 _HELD = 1e6
 """Weight added to a docked robot, per degree of freedom [kg]: nothing moves it."""

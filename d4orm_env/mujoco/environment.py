@@ -23,8 +23,7 @@ from d4orm_env.envs.base_env import Frame, TeamSimulation, Viewer
 from d4orm_env.envs.body_simulation import BodySimulation
 from d4orm_env.envs.options import EnvOptions
 from d4orm_env.mujoco.bodies import TeamBodies
-from d4orm_env.mujoco.parts import colour
-from d4orm_env.mujoco.scene import Physics, check_problem
+from d4orm_env.mujoco.scene import Physics, check_problem, colour
 from d4orm_env.navigation_v0 import AECNavigationEnv
 from d4orm_env.scenarios.problems import ScenarioLike
 

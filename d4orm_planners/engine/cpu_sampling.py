@@ -83,11 +83,6 @@ class CpuSamplingEngine(CpuEngine):
         return SamplingResult(mean, mean_rewards[:done], excluded, factor)
 
 
-def _nobody(task: SamplingTask) -> MovingObstacles:
-    nowhere = np.zeros((len(task.base), 0, task.problem.dimension), np.float32)
-    return MovingObstacles(nowhere, np.zeros(0, np.float32))
-
-
 def _discs(radius: FloatArray) -> FootprintArrays:
     return as_arrays([Body(number, Disc(size), None, 0.0) for number, size in enumerate(radius.tolist())])
 
@@ -129,7 +124,8 @@ class Sampling:
         problem = task.problem
         worth = task.base.shape[0] * problem.num_robots * num_samples // WORTH_A_THREAD
         self.task, self.threads = task, Threads(min(threads.num_threads, max(worth, 1)))
-        self.arrays, moving = typed(task.arrays), task.moving or _nobody(task)
+        nobody = np.zeros((task.base.shape[0], 0, problem.dimension), np.float32), np.zeros(0, np.float32)
+        self.arrays, moving = typed(task.arrays), task.moving or MovingObstacles(*nobody)
         self.kernel = score.score_kernel(problem.team.models)
         self.spaces: dict[int, score.Workspace] = {}
         self.base = np.ascontiguousarray(task.base, np.float32)

@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 from numba.core import config
 
-from d4orm_env.engine import caching, file_turns, kernel_files
+from d4orm_env.engine import caching, kernel_files
 from d4orm_env.engine.caching import has_to_be_compiled
-from d4orm_env.engine.file_turns import Turn
+from d4orm_env.engine.kernel_files import Turn
 
 KERNEL = """
 from os import environ
@@ -287,7 +287,7 @@ def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path: Path)
 def test_nobody_waits_for_ever_nor_where_nothing_can_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(file_turns, "_PATIENCE", 0.1)
+    monkeypatch.setattr(kernel_files, "_PATIENCE", 0.1)
     first, second = Turn(tmp_path / "a.lock"), Turn(tmp_path / "a.lock")
     assert not first.wait()
     assert second.wait()  # given up
