@@ -121,8 +121,10 @@ class TeamSimulation(Simulation):
 
     def events(self) -> DisturbanceEvents | None:
         """Return the disturbances of the present moment, as far as they can be drawn; ``None`` without any."""
+        if not self.setup.disturbances:
+            return None
         self.require_reset()
-        return events_of([self.effect()], self.problem) if self.setup.disturbances else None
+        return events_of([self.effect()], self.problem)
 
     def _new_observations(self) -> FloatArray:
         return np.empty((1, self.problem.num_robots, self.setup.layout.size), np.float32)
