@@ -1,21 +1,32 @@
-"""The scenarios. Each is a function from the common settings and its own arguments to a problem."""
+"""The scenarios without walls. Each is a function from the common settings and its own arguments to a problem.
+
+The ``paper_`` ones are those that the paper's authors measure on, as their published code of 2026 defines them (section
+IV-B). All of these have 100 steps, whatever the path, and no bounds unless asked for.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from d4orm_env.core.arrays import Floats
 from d4orm_env.core.portable import cos, root, sin
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.layout import Layout, build, in_space
-from d4orm_env.scenarios.placement import PlacementArea, Points, round_up, scatter
-from d4orm_env.scenarios.settings import JITTER, Settings, bounded
+from d4orm_env.scenarios.layout import Layout, PlacementArea, build, in_space, round_up, scatter
+from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, bounded, require_plane, require_space
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+SINGLE_RADIUS = 0.5
+"""Radius of a single obstacle [m]."""
+SIDE, NEAREST, FURTHEST = 10.0, 5.0, 6.0
+"""Side of the random square, and least and largest distance of a start from its goal [m]."""
+SPACING = 6
+"""Least distance of two random starts, in robots' radii."""
+RESTARTS, CANDIDATES = 20, 1000
 
 
 def circle(settings: Settings, *, diameter: float = 5.0) -> Problem:
@@ -79,10 +90,7 @@ def four_obstacles(settings: Settings, *, diameter: float = 5.0, obstacle_distan
     layout = antipodal_circle(settings, bounded(diameter, "diameter"))
     distance = bounded(obstacle_distance, "obstacle_distance")
     centres = distance * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    obstacles = np.hstack([centres, np.full((4, 1), settings.obstacle_radius)])
-    dimension = settings.team.dimension
-    world = World(circles=obstacles) if dimension == 2 else World(3, cylinders=obstacles)
-    return build(settings, replace(layout, world=world))
+    return build(settings, replace(layout, world=_pillars(settings, centres, settings.obstacle_radius)))
 
 
 def heterogeneous(settings: Settings, *, diameter: float = 5.0) -> Problem:
@@ -126,43 +134,74 @@ def swap(settings: Settings, *, distance: float = 5.0, spacing: float | None = N
     return build(settings, Layout(starts, goals, World(dimension=dimension), distance, area))
 
 
-AMSWARM: Mapping[str, tuple[str, Sequence[tuple[float, float]]]] = {
-    "amswarm_1": ("ten 3D robots on a circle, no obstacles", ()),
-    "amswarm_2": ("five cylinders close together in the centre", ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))),
-    "amswarm_3": ("four cylinders around the centre", ((0, 1), (0, -1), (1, 0), (-1, 0))),
-    "amswarm_4": (
-        "a cylinder in the centre and four at the corners of a square", ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
-    ),
-    "amswarm_5": ("five cylinders, to one side", ((0, 0), (0, 1), (0, -1), (-1, 1), (-1, -1))),
-}  # fmt: skip
-"""Environments of AMSwarm, and where their cylinders are; see :func:`amswarm`."""
+def paper_sphere(settings: Settings, *, diameter: float = 5.0) -> Problem:
+    """The paper's 3D scenario: robots of radius 0.3 m on a Fibonacci sphere of 5 m, goals at the antipodes.
 
-
-def amswarm(centres: Sequence[tuple[float, float]], settings: Settings, *, jitter: float = 0.0) -> Problem:
-    """Ten 3D robots among cylinders: the paper's comparison with AMSwarm (section VIII).
-
-    ``holonomic3d`` robots of radius 0.29 m with margin 0.05 m, antipodal on a circle of radius 2.5 m in the plane
-    z = 0, in bounds of +-3 m. The obstacles are vertical cylinders of radius 0.2 m.
+    The sphere is that of scenario ``sphere`` in the mirror, for its azimuths run the other way.
 
     Args:
-        centres: x and y of the cylinders [m].
-        settings: The common arguments; ten robots.
-        jitter: Each coordinate of each start is moved by a uniform random number within +-``jitter`` [m].
+        settings: The common arguments; the radius is 0.3 m by default.
+        diameter: Diameter of the sphere [m].
     """
-    _require_space(settings)
-    if settings.num_robots != 10:
-        raise ValueError(
-            f"num_robots is {settings.num_robots}; scenario {settings.scenario!r} has exactly 10 robots, so leave "
-            f"num_robots out, or use scenario 'circle' with model='holonomic3d'"
-        )
-    jitter = bounded(jitter, "jitter", zero_allowed=True)
-    layout = antipodal_circle(settings, 5.0)
-    moved = layout.starts + settings.generator(JITTER).uniform(-jitter, jitter, layout.starts.shape)
-    world = World(dimension=3, cylinders=[(x, y, 0.2) for x, y in centres], lower=[-3.0] * 3, upper=[3.0] * 3)
-    return build(settings, replace(layout, starts=moved, world=world))
+    layout = antipodal_sphere(settings, bounded(diameter, "diameter"))
+    mirror = np.array([1.0, -1.0, 1.0])
+    return build(settings, replace(layout, starts=layout.starts * mirror + 0.0, goals=layout.goals * mirror + 0.0))
 
 
-def fibonacci_sphere(count: int) -> Points:
+def paper_random(settings: Settings) -> Problem:
+    """The paper's random 2D scenario: goals on a grid over 10 x 10 m, starts at random 5 to 6 m from them.
+
+    Goals take the first points, row by row, of a ``ceil(sqrt K)`` by ``ceil(sqrt K)`` grid over ``[-5, 5]^2``. A start
+    is the first of 1 000 uniform points of the square that is 5 to 6 m from its goal and six radii from all starts
+    before it; where none is, all are drawn again, up to 20 times. That places 64 robots, and never 100.
+    """
+    require_plane(settings)
+    side = math.isqrt(settings.num_robots - 1) + 1
+    across = np.linspace(-SIDE / 2, SIDE / 2, side)
+    goals: Floats = np.column_stack([np.tile(across, side), np.repeat(across, side)])[: settings.num_robots]
+    random = settings.generator(STARTS_AND_GOALS)
+    for _ in range(RESTARTS):
+        starts = _starts(random, goals, SPACING * float(np.max(settings.team.radius)))
+        if len(starts) == len(goals):
+            area = PlacementArea(np.full(2, SIDE / 2))
+            return build(settings, Layout(starts, goals, World(dimension=2), FURTHEST, area))
+    raise ValueError(
+        f"scenario {settings.scenario!r}: {settings.num_robots} robots of radius {np.max(settings.team.radius):g} m "
+        f"found no room in {RESTARTS} draws; use fewer robots, another seed, or scenario 'random'"
+    )
+
+
+def paper_heterogeneous(settings: Settings, *, diameter: float = 5.0) -> Problem:
+    """The paper's heterogeneous circle: holonomic robots (1 m/s^2) and differential drives (2 m/s^2) in turn.
+
+    Robots 0, 2, ... are holonomic. In scenario ``heterogeneous`` they are the drives, and these the slower ones.
+
+    Args:
+        settings: The common arguments, ``model`` left out.
+        diameter: Diameter of the circle [m].
+    """
+    mixed = mixed_team(settings, first=("holonomic2d", 1.0), second=("differential_drive", 2.0))
+    return circle(mixed, diameter=diameter)
+
+
+def paper_obstacles(settings: Settings, *, diameter: float = 5.0) -> Problem:
+    """The paper's circle with obstacles ("2D Holo X Obs"), ``num_obstacles`` of them, 4 by default.
+
+    One stands in the centre and has a radius of 0.5 m. Two to four stand evenly on the unit circle, from (0, 1) on, and
+    more are uniform in the unit disc, where they may overlap; their radius is ``obstacle_radius``, 0.15 m. In 3D they
+    are vertical cylinders.
+
+    Args:
+        settings: The common arguments.
+        diameter: Diameter of the circle [m].
+    """
+    layout = antipodal_circle(settings, bounded(diameter, "diameter"))
+    radius = SINGLE_RADIUS if settings.num_obstacles == 1 else settings.obstacle_radius
+    world = _pillars(settings, _obstacle_centres(settings), bounded(radius, "obstacle_radius"))
+    return build(replace(settings, num_obstacles=0), replace(layout, world=world))
+
+
+def fibonacci_sphere(count: int) -> Floats:
     """``(count, 3)`` Fibonacci points on the unit sphere: equal areas in z, the golden angle around it."""
     index = np.arange(count)
     z = 1 - (2 * index + 1) / count
@@ -184,7 +223,7 @@ def mixed_team(settings: Settings, first: tuple[str, float], second: tuple[str, 
 
 def antipodal_sphere(settings: Settings, diameter: float) -> Layout:
     """Robots on the Fibonacci points of a sphere, goals at the antipodes."""
-    _require_space(settings)
+    require_space(settings)
     points = fibonacci_sphere(settings.num_robots)
     gaps = (np.linalg.norm(points[:index] - points[index], axis=1).min() for index in range(1, len(points)))
     needed = 2 * settings.spacing / float(min(gaps, default=np.inf))
@@ -208,18 +247,43 @@ def antipodal_circle(settings: Settings, diameter: float) -> Layout:
     return Layout(starts, goals, World(dimension=dimension), diameter, area)
 
 
-def _antipodal(points: Points) -> tuple[Points, Points]:
+def _pillars(settings: Settings, centres: Floats, radius: float) -> World:
+    """The open world of round obstacles at centres ``(., 2)`` [m]: circles, or vertical cylinders in space."""
+    obstacles = np.column_stack([centres, np.full(len(centres), radius)])
+    return World(circles=obstacles) if settings.team.dimension == 2 else World(3, cylinders=obstacles)
+
+
+def _antipodal(points: Floats) -> tuple[Floats, Floats]:
     """Starts and goals, rid of rounding dust such as 3e-16 and -0.0, which files and pictures would show."""
-    starts: Points = np.round(points, 12) + 0.0
+    starts: Floats = np.round(points, 12) + 0.0
     return starts, 0.0 - starts
 
 
-def _require_space(settings: Settings) -> None:
-    if settings.team.dimension != 3:
-        raise ValueError(
-            f"scenario {settings.scenario!r} is three-dimensional and model {settings.model!r} is not; "
-            f"use model='holonomic3d', or scenario 'circle'"
-        )
+def _starts(random: np.random.Generator, goals: Floats, spacing: float) -> Floats:
+    """Starts for the goals ``(K, 2)``, one after another; fewer where one finds no room."""
+    starts: Floats = np.empty((0, 2))
+    for goal in goals:
+        candidates = random.uniform(-SIDE / 2, SIDE / 2, (CANDIDATES, 2))
+        distance = np.linalg.norm(candidates - goal, axis=1)
+        candidates = candidates[(distance >= NEAREST) & (distance <= FURTHEST)]
+        separation = np.linalg.norm(candidates[:, None] - starts, axis=-1).min(axis=1, initial=np.inf) >= spacing
+        if not separation.any():
+            break
+        starts = np.vstack([starts, candidates[np.argmax(separation)]])
+    return starts
+
+
+def _obstacle_centres(settings: Settings) -> Floats:
+    """``(num_obstacles, 2)`` [m]."""
+    count = settings.num_obstacles
+    if count == 1:
+        return np.zeros((1, 2))
+    if count <= 4:
+        angle = 2 * math.pi * np.arange(count) / max(count, 1)
+        return np.round(np.column_stack([sin(angle), cos(angle)]), 12) + 0.0
+    random = settings.generator(OBSTACLES)
+    distance, angle = np.sqrt(random.uniform(size=count)), random.uniform(0, 2 * math.pi, count)
+    return distance[:, None] * np.column_stack([cos(angle), sin(angle)])
 
 
 def _too_small(settings: Settings, name: str, value: float, needed: float) -> ValueError:

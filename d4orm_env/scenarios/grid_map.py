@@ -15,12 +15,11 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, SMALLEST, Floats, positive_number, short_repr
+from d4orm_env.core.arrays import LARGEST, SMALLEST, BoolArray, Floats, positive_number, short_repr
 from d4orm_env.core.files import read_limited, read_yaml
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_checks import RESOLUTION
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.placement import Mask, Points
 
 Image: Any = LazyModule("PIL.Image")
 
@@ -40,7 +39,7 @@ MOST_PARTS = 8
 class GridMap:
     """Square cells, free or blocked."""
 
-    blocked: Mask  #: ``(rows, columns)``, the first row at the top
+    blocked: BoolArray  #: ``(rows, columns)``, the first row at the top
     cell: float  #: Side of a cell [m]
     low: tuple[float, float] = (0.0, 0.0)  #: x and y of the lower left corner [m]
     origin: tuple[float, float] = (0.0, 0.0)  #: Of the world, where the map was elsewhere before [m]
@@ -67,7 +66,7 @@ class GridMap:
         upper = corner + self.cell * np.array([columns, rows])
         return World(2, boxes=boxes, lower=corner, upper=upper, origin=self.origin)
 
-    def centres(self, cells: Points) -> Points:
+    def centres(self, cells: Floats) -> Floats:
         """``(., 2)`` centres of the cells of these columns and rows ``(., 2)`` [m]."""
         column, row = cells.T
         return np.array(self.low) + self.cell * np.column_stack([column + 0.5, len(self.blocked) - row - 0.5])
@@ -88,7 +87,7 @@ def float32_resolves(coordinate: float, cell: float) -> bool:
     return coordinate <= LARGEST and bool(RESOLUTION * np.spacing(np.float32(coordinate)) <= cell)
 
 
-def merge_cells(blocked: Mask) -> np.ndarray:
+def merge_cells(blocked: BoolArray) -> np.ndarray:
     """Disjoint rectangles that cover the blocked cells and nothing else.
 
     Cells side by side make a run, and equal runs one below the other a rectangle; columns are tried in place of rows.
@@ -101,7 +100,7 @@ def merge_cells(blocked: Mask) -> np.ndarray:
     return flat if len(flat) <= len(upright) else upright
 
 
-def _merge_rows(blocked: Mask) -> np.ndarray:
+def _merge_rows(blocked: BoolArray) -> np.ndarray:
     edges = np.diff(np.pad(blocked, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, left = np.nonzero(edges == 1)
     right = np.nonzero(edges == -1)[1]
@@ -153,7 +152,7 @@ def grid_of_fields(fields: dict[str, Any], folder: Path) -> GridMap:
 
 @lru_cache(maxsize=4)
 def _grid_map(blocked: bytes, shape: tuple[int, int], resolution: float, low: tuple[float, float]) -> GridMap:
-    cells: Mask = np.frombuffer(blocked, np.bool_).reshape(shape)
+    cells: BoolArray = np.frombuffer(blocked, np.bool_).reshape(shape)
     far = max(max(abs(low[axis]), abs(low[axis] + resolution * shape[1 - axis])) for axis in (0, 1))
     if float32_resolves(far, resolution):
         return GridMap(cells, resolution, low)

@@ -1,32 +1,54 @@
-"""Layout of robots and obstacles, made into a problem: headings, horizon, bounds, random obstacles, the final check."""
+"""Layout of robots and obstacles, made into a problem: random positions, headings, horizon, bounds, the final check."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import as_float32, frozen_array, short_repr
-from d4orm_env.core.portable import arctan2
+from d4orm_env.core.arrays import BoolArray, Floats, as_float32, frozen_array, short_repr
+from d4orm_env.core.portable import arctan2, root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MAX_HORIZON, check_positions
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.placement import PlacementArea, Points, with_random_obstacles
-from d4orm_env.scenarios.settings import LARGEST, Settings, bounded
+from d4orm_env.scenarios.settings import LARGEST, OBSTACLES, STARTS_AND_GOALS, Settings, bounded
 
 MIN_HORIZON = 100
 HORIZON_SLACK = 1.6
+
+FEW, MANY, ROUNDS = 8, 512, 70
+"""Candidates drawn at first and at most at once, and how often, before a position is held to be impossible."""
+
+DENSITY = {2: 0.4, 3: 0.25}
+"""Share of the area (volume) that random placement fills without fail; it jams at 0.547 (0.384)."""
+
+
+class PlacementArea(NamedTuple):
+    """Region that points are drawn from: a box, or the ellipse (ellipsoid) inside it."""
+
+    half_extent: Floats  #: ``(d,)`` half the sides of the box [m]
+    is_round: bool = False  #: Whether it is the ellipse
+    centre: Floats | float = 0.0  #: ``(d,)`` [m]
+
+    def contains(self, points: Floats) -> BoolArray:
+        """``(C,)`` which of ``(C, d)`` points of the box belong to it."""
+        if not self.is_round:
+            return np.full(len(points), True)
+        extent = np.maximum(self.half_extent, np.finfo(np.float64).tiny)
+        return (((points - self.centre) / extent) ** 2).sum(axis=1) <= 1
 
 
 @dataclass(frozen=True)
 class Layout:
     """Positions of a scenario's robots and obstacles."""
 
-    starts: Points  #: ``(K, d)`` start positions [m]
-    goals: Points  #: ``(K, d)`` goal positions [m]
+    starts: Floats  #: ``(K, d)`` start positions [m]
+    goals: Floats  #: ``(K, d)`` goal positions [m]
     world: World  #: Obstacles and bounds of the scenario itself
     #: The distance the horizon is made for [m]: the same for every seed, so that problems that differ in their seed
     #: alone have the same shapes
@@ -41,16 +63,16 @@ def build(settings: Settings, layout: Layout) -> Problem:
     team, horizon = settings.team, settings.horizon
     if settings.height is not None:
         layout = _lifted(layout, settings.height)
-    require_scale(settings, layout.travel)
+    _require_scale(settings, layout.travel)
     positions = np.vstack([layout.starts, layout.goals])
-    world = with_bounds(settings, layout.world, layout.area)
-    require_inside(settings, world, layout.starts, layout.goals)
+    world = _with_bounds(settings, layout.world, layout.area)
+    _require_inside(settings, world, layout.starts, layout.goals)
     if layout.area is not None:
         world = with_random_obstacles(settings, world, positions, layout.area)
-    require_margin(settings, world, layout.starts, layout.goals)
+    _require_margin(settings, world, layout.starts, layout.goals)
     return Problem(
         team=team,
-        start=start_states(team, layout.starts, layout.goals),
+        start=_start_states(team, layout.starts, layout.goals),
         goal=layout.goals,
         world=world,
         dt=settings.dt,
@@ -102,7 +124,7 @@ def default_horizon(team: Team, dt: float, distance: float) -> int:
     return max(MIN_HORIZON, 10 * math.ceil(steps / 10))
 
 
-def start_states(team: Team, starts: Points, goals: Points) -> Points:
+def _start_states(team: Team, starts: Floats, goals: Floats) -> Floats:
     """``(K, n)`` states at rest; a model that has a heading faces its goal (as in the paper's reference code)."""
     states = np.zeros((team.num_robots, team.state_size))
     states[:, : team.dimension] = starts
@@ -113,13 +135,13 @@ def start_states(team: Team, starts: Points, goals: Points) -> Points:
     return states
 
 
-def in_space(points: ArrayLike, dimension: int) -> Points:
+def in_space(points: ArrayLike, dimension: int) -> Floats:
     """``(., 2)`` points of the plane as ``(., dimension)``: in space, at z = 0."""
-    planar: Points = np.asarray(points, np.float64).reshape(-1, 2)
+    planar: Floats = np.asarray(points, np.float64).reshape(-1, 2)
     return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])
 
 
-def require_scale(settings: Settings, travel: float) -> None:
+def _require_scale(settings: Settings, travel: float) -> None:
     """Refuse a step in which all robots pass the whole scenario, or a goal radius as large: numbers in other units."""
     stride = float(settings.team.max_speed.min()) * settings.dt
     for what, length in (
@@ -133,7 +155,7 @@ def require_scale(settings: Settings, travel: float) -> None:
             )
 
 
-def require_margin(settings: Settings, world: World, starts: Points, goals: Points) -> None:
+def _require_margin(settings: Settings, world: World, starts: Floats, goals: Floats) -> None:
     """Check that the surfaces of robots and obstacles are more than the margin apart, at the start and at the goal.
 
     The problem would have no solution that keeps the margin.
@@ -146,7 +168,7 @@ def require_margin(settings: Settings, world: World, starts: Points, goals: Poin
             )
 
 
-def with_bounds(settings: Settings, world: World, area: PlacementArea | None) -> World:
+def _with_bounds(settings: Settings, world: World, area: PlacementArea | None) -> World:
     """The world, with the bounds that were asked for if any were.
 
     A margin is laid around the scenario's ``area``, the same for every seed, so that worlds that differ in their seed
@@ -167,14 +189,14 @@ def with_bounds(settings: Settings, world: World, area: PlacementArea | None) ->
     return replace(world, lower=lower, upper=upper)
 
 
-def require_inside(settings: Settings, world: World, starts: Points, goals: Points) -> None:
+def _require_inside(settings: Settings, world: World, starts: Floats, goals: Floats) -> None:
     """Check that the bounds that were asked for leave every start and goal its radius and the margin."""
     if settings.bounds is None:
         return
     lower, upper = world.bounds.astype(np.float64)
     needed = np.asarray(settings.team.radius, np.float64) + settings.margin
     for what, positions in (("start", starts), ("goal", goals)):
-        gaps: NDArray[np.float64] = np.minimum(positions - lower, upper - positions).min(axis=1)
+        gaps: Floats = np.minimum(positions - lower, upper - positions).min(axis=1)
         robot = int(np.argmin(gaps - needed))
         if gaps[robot] <= needed[robot]:
             position = ", ".join(f"{coordinate:g}" for coordinate in positions[robot])
@@ -184,3 +206,110 @@ def require_inside(settings: Settings, world: World, starts: Points, goals: Poin
                 f"{short_repr(settings.bounds)}, and its radius and the margin take {needed[robot]:.3g} m; use wider "
                 "bounds"
             )
+
+
+def scatter(settings: Settings, size: float) -> tuple[Floats, Floats]:
+    """Random starts and goals ``(K, d)`` in the square (cube) of side ``size`` around the origin.
+
+    Starts keep more than the margin to each other, goals likewise, and no robot starts at its goal. Each is drawn
+    uniformly, and drawn again until it is free.
+    """
+    count, dimension = settings.num_robots, settings.team.dimension
+    random = settings.generator(STARTS_AND_GOALS)
+    area = PlacementArea(np.full(dimension, size / 2))
+    needed = max(_size_for(count, settings.spacing, dimension), 3 * settings.goal_radius)
+    starts, goals = np.empty((0, dimension)), np.empty((0, dimension))
+    for robot in range(count if needed <= size else 0):
+        starts = _with_another(random, area, starts, settings.spacing)
+        own = (starts[robot:], settings.goal_radius)
+        goals = _with_another(random, area, goals, settings.spacing, own)
+        if min(len(starts), len(goals)) == robot:
+            break
+    if min(len(starts), len(goals)) < count:
+        raise ValueError(
+            f"scenario {settings.scenario!r}: {count} robots of radius {np.max(settings.team.radius):g} m with margin "
+            f"{settings.margin:g} m do not fit at random in a size of {size:g} m; "
+            f"use size={round_up(needed if needed > size else 1.2 * size)}"
+        )
+    return starts, goals
+
+
+def _size_for(count: int, spacing: float, dimension: int) -> float:
+    """Side of the square (cube) that takes ``count`` random points ``spacing`` apart without fail [m]."""
+    ball = math.pi / 4 * spacing * spacing if dimension == 2 else math.pi / 6 * spacing * spacing * spacing
+    return root(count * ball / DENSITY[dimension], dimension) if count > 1 else 0.0
+
+
+def with_random_obstacles(settings: Settings, world: World, positions: Floats, area: PlacementArea) -> World:
+    """The world and ``settings.num_obstacles`` random circles, or spheres in space.
+
+    They keep more than the margin to the ``positions`` ``(2 K, d)``, starts, then goals, of which there are none where
+    these are drawn later, and leave the largest robot a passage with its margin on both sides, between each other and
+    to everything else: no obstacle closes a path.
+    """
+    if not settings.num_obstacles:
+        return world
+    random = settings.generator(OBSTACLES)
+    size = float(np.float32(settings.obstacle_radius))
+    passage = 2 * (float(np.max(settings.team.radius)) + settings.margin)
+    safety_distance = np.tile(np.float64(settings.team.radius), 2) + size + settings.margin
+    balls: Floats = np.empty((0, world.dimension))
+
+    def is_free(centres: Floats) -> BoolArray:
+        apart = _gaps(centres, positions, safety_distance) > 0
+        passable = (world.clearance(centres) > size + passage) & (_gaps(centres, balls, 2 * size + passage) > 0)
+        return np.asarray(apart & passable)
+
+    for index in range(settings.num_obstacles):
+        ball = _first(random, area, is_free)
+        if ball is None:
+            raise ValueError(
+                f"scenario {settings.scenario!r}: only {index} of {settings.num_obstacles} obstacles of radius "
+                f"{size:g} m fit between the robots; use num_obstacles={index}, a smaller obstacle_radius or a larger "
+                f"scenario"
+            )
+        balls = np.vstack([balls, ball])
+    rows = np.vstack([world.balls, np.hstack([balls, np.full((len(balls), 1), size)])])
+    return replace(world, circles=rows) if world.dimension == 2 else replace(world, spheres=rows)
+
+
+def round_up(value: float) -> str:
+    """A length rounded up to the next centimetre, for an error that says what would do."""
+    return f"{math.floor(value * 100) / 100 + 0.01:.2f}" if value < 1e6 else f"{value * 1.01:.2e}"
+
+
+def _with_another(
+    random: np.random.Generator,
+    area: PlacementArea,
+    points: Floats,
+    spacing: float,
+    avoid: tuple[Floats, float] | None = None,
+) -> Floats:
+    """``points`` and a random one further than ``spacing`` from each, or just ``points`` if there is no room."""
+
+    def is_free(candidates: Floats) -> BoolArray:
+        free = _gaps(candidates, points, spacing) > 0
+        return free if avoid is None else free & (_gaps(candidates, *avoid) > 0)
+
+    position = _first(random, area, is_free)
+    return points if position is None else np.vstack([points, position])
+
+
+def _first(random: np.random.Generator, area: PlacementArea, is_free: Callable[[Floats], BoolArray]) -> Floats | None:
+    """The first uniform random point of an area that is free, or ``None`` if none of many was."""
+    half = area.half_extent
+    for attempt in range(ROUNDS):
+        points = area.centre + random.uniform(-half, half, (min(FEW << attempt, MANY), len(half)))
+        # Rounded as the problem will hold them, so that what is checked is what is used.
+        points = points.astype(np.float32).astype(np.float64)
+        free = area.contains(points) & is_free(points)
+        if free.any():
+            return points[np.argmax(free)]
+    return None
+
+
+def _gaps(candidates: Floats, points: Floats, safety_distance: Floats | float) -> Floats:
+    """``(C,)`` least distance of each candidate to points, less what they keep; infinite where there are none [m]."""
+    if not len(points):
+        return np.full(len(candidates), np.inf)
+    return (np.linalg.norm(candidates[:, None] - points, axis=-1) - safety_distance).min(axis=1)

@@ -10,15 +10,14 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.arrays import Floats, short_repr
 from d4orm_env.core.files import is_yaml_path, naming, read_limited
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, grid_of_fields, read_occupancy_image
 from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.placement import FreeSpace, Points, free_space
 from d4orm_env.scenarios.settings import Settings, bounded, require_plane
-from d4orm_env.scenarios.well_formed import populate, safety_distance_of, with_obstacles
+from d4orm_env.scenarios.well_formed import FreeSpace, free_space, populate, safety_distance_of, with_obstacles
 
 PASSABLE, BLOCKED = b".GSE", b"@OTW"
 """Ground, swamp or service points, emitters; out of bounds, trees and water."""
@@ -197,7 +196,7 @@ def map(
         return build(settings, Layout(starts, goals, world, travel))
 
 
-def _listed_positions(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Points, Points, float]:
+def _listed_positions(settings: Settings, grid: GridMap, space: FreeSpace, path: Path) -> tuple[Floats, Floats, float]:
     """Starts and goals of a Moving AI scenario, and the longest path [m]."""
     with naming(path):
         tasks = parse_scenario(read_limited(path, "a map", MAX_BYTES), grid.blocked.shape, settings.num_robots)

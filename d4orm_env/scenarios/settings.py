@@ -123,6 +123,15 @@ def require_plane(settings: Settings) -> None:
         )
 
 
+def require_space(settings: Settings) -> None:
+    """Check that a scenario in space is asked for robots in space."""
+    if settings.team.dimension != 3:
+        raise ValueError(
+            f"scenario {settings.scenario!r} is three-dimensional and model {settings.model!r} is not; "
+            f"use model='holonomic3d', or scenario 'circle'"
+        )
+
+
 def grid_size(value: object, name: str) -> tuple[int, int]:
     """Columns and rows from what was given for them: two whole numbers, and not too many squares."""
     if not isinstance(value, tuple | list) or len(value) != 2:

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import positive_number
+from d4orm_env.core.arrays import BoolArray, positive_number
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.placement import Mask
 from d4orm_env.scenarios.settings import WALLS, Settings, bounded, grid_size, require_plane
 from d4orm_env.scenarios.well_formed import lattice_step, populate, safety_distance_of
 
@@ -29,8 +28,8 @@ SAMPLES, TRIES = 16, 1000
 class Openings(NamedTuple):
     """Openings in the walls between ``columns`` times ``rows`` squares; all squares are connected."""
 
-    right: Mask  #: ``(rows, columns - 1)`` between a square and the next to its right
-    above: Mask  #: ``(rows - 1, columns)`` between a square and the next above
+    right: BoolArray  #: ``(rows, columns - 1)`` between a square and the next to its right
+    above: BoolArray  #: ``(rows - 1, columns)`` between a square and the next above
     longest: int  #: About the most walls on the shortest path from a square to another
 
 

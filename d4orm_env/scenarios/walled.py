@@ -1,18 +1,29 @@
-"""Scenarios among walls and trees: a corridor, a door, a warehouse, a forest, and the maps that MMD was measured on."""
+"""Scenarios in bounds: a corridor, a door, a warehouse, a forest, and what MMD and AMSwarm were measured on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
-from d4orm_env.core.arrays import positive_number, whole_number
+from d4orm_env.core.arrays import Floats, positive_number, whole_number
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.placement import Points, round_up
-from d4orm_env.scenarios.settings import MAX_COUNT, WALLS, Settings, bounded, grid_size, require_plane
+from d4orm_env.scenarios.generators import antipodal_circle
+from d4orm_env.scenarios.layout import build, round_up
+from d4orm_env.scenarios.settings import (
+    JITTER,
+    MAX_COUNT,
+    WALLS,
+    Settings,
+    bounded,
+    grid_size,
+    require_plane,
+    require_space,
+)  # fmt: skip
 from d4orm_env.scenarios.well_formed import lattice_step, populate, safety_distance_of
 
 DOOR_DEPTH = 0.2
@@ -93,7 +104,7 @@ def _two_rooms(
     return populate(settings, world, step, travel, "a larger room_size", exchange=(-clear, clear))
 
 
-def _bank(length: float, near: float, depth: float, far: float, bays: Points) -> Points:
+def _bank(length: float, near: float, depth: float, far: float, bays: Floats) -> Floats:
     """``(., 4)`` boxes on one side of the corridor, from ``near`` to ``far`` of its axis."""
     if not len(bays):
         return np.array([[-length / 2, near, length / 2, far]])
@@ -211,3 +222,39 @@ def mmd_map(boxes: Sequence[Box], settings: Settings, *, side: float | None = No
     centres, sizes = np.split(half * np.array(boxes), 2, axis=1)
     world = World(2, boxes=np.hstack([centres - sizes / 2, centres + sizes / 2]), lower=[-half] * 2, upper=[half] * 2)
     return populate(settings, world, lattice_step(settings, [2 * half] * 2), 4 * half, "or a larger side")
+
+
+AMSWARM: Mapping[str, tuple[str, Sequence[tuple[float, float]]]] = {
+    "amswarm_1": ("ten 3D robots on a circle, no obstacles", ()),
+    "amswarm_2": ("five cylinders close together in the centre", ((0, 0), (0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5))),
+    "amswarm_3": ("four cylinders around the centre", ((0, 1), (0, -1), (1, 0), (-1, 0))),
+    "amswarm_4": (
+        "a cylinder in the centre and four at the corners of a square", ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+    ),
+    "amswarm_5": ("five cylinders, to one side", ((0, 0), (0, 1), (0, -1), (-1, 1), (-1, -1))),
+}  # fmt: skip
+"""Environments of AMSwarm, and where their cylinders are; see :func:`amswarm`."""
+
+
+def amswarm(centres: Sequence[tuple[float, float]], settings: Settings, *, jitter: float = 0.0) -> Problem:
+    """Ten 3D robots among cylinders: the paper's comparison with AMSwarm (section VIII).
+
+    ``holonomic3d`` robots of radius 0.29 m with margin 0.05 m, antipodal on a circle of radius 2.5 m in the plane
+    z = 0, in bounds of +-3 m. The obstacles are vertical cylinders of radius 0.2 m.
+
+    Args:
+        centres: x and y of the cylinders [m].
+        settings: The common arguments; ten robots.
+        jitter: Each coordinate of each start is moved by a uniform random number within +-``jitter`` [m].
+    """
+    require_space(settings)
+    if settings.num_robots != 10:
+        raise ValueError(
+            f"num_robots is {settings.num_robots}; scenario {settings.scenario!r} has exactly 10 robots, so leave "
+            f"num_robots out, or use scenario 'circle' with model='holonomic3d'"
+        )
+    jitter = bounded(jitter, "jitter", zero_allowed=True)
+    layout = antipodal_circle(settings, 5.0)
+    moved = layout.starts + settings.generator(JITTER).uniform(-jitter, jitter, layout.starts.shape)
+    world = World(dimension=3, cylinders=[(x, y, 0.2) for x, y in centres], lower=[-3.0] * 3, upper=[3.0] * 3)
+    return build(settings, replace(layout, starts=moved, world=world))

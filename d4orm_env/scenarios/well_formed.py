@@ -1,4 +1,4 @@
-"""Starts and goals among walls, such that every robot gets by those at rest.
+"""Free space among walls, and starts and goals in it, such that every robot gets by those at rest.
 
 Such an instance is called well-formed (Cap, Novak, Kleiner and Selecky, 2015): each robot has a path from its start to
 its goal that keeps clear of all other starts and goals. One after another, in any order, all of them arrive, and none
@@ -9,25 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from d4orm_env.core.arrays import BoolArray, Floats, IntArray
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.portable import root
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.layout import Layout, build
-from d4orm_env.scenarios.placement import (
-    FreeSpace,
-    Mask,
-    PlacementArea,
-    Points,
-    free_space,
-    round_up,
-    with_random_obstacles,
-)
+from d4orm_env.scenarios.layout import Layout, PlacementArea, build, round_up, with_random_obstacles
 from d4orm_env.scenarios.settings import STARTS_AND_GOALS, Settings
 
 ndimage: Any = LazyModule("scipy.ndimage")
@@ -44,6 +39,87 @@ WINDOW = {2: 32, 3: 8}
 TRIES, ROUNDS = 200, 3
 """Positions tried for each start or goal in one attempt to find all of them, and attempts."""
 
+MAX_POINTS = 2**24
+"""Lattice points of a world at most: what a map of four million cells needs."""
+
+_POINTS_AT_ONCE = 2**15
+"""Lattice points that are looked at in one go, in a processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """The largest connected region in which a robot can drive clear of obstacles, as points of a lattice."""
+
+    low: Floats  #: ``(d,)`` the first lattice point [m]
+    step: float  #: Distance of neighbouring lattice points [m]
+    #: ``(n_1, ..., n_d)`` which points belong to the region. A robot can go straight from each to its neighbours along
+    #: the axes.
+    inside: BoolArray
+
+    def points(self, indices: IntArray) -> Floats:
+        """``(..., d)`` positions of the lattice points of these indices, as float32 holds them [m]."""
+        return (self.low + self.step * indices).astype(np.float32).astype(np.float64)
+
+    def contains(self, position: Floats) -> bool:
+        """Check whether the lattice point nearest to a position belongs to the region."""
+        index = np.round((position - self.low) / self.step).astype(int)
+        within = ((index >= 0) & (index < self.inside.shape)).all()
+        return bool(within and self.inside[tuple(index)])
+
+    @cached_property
+    def longest_path(self) -> float:
+        """About the longest of all shortest paths within the region [m], to some 10%."""
+        inside = np.pad(self.inside, 1)
+        steps = np.array(list(product((-1, 0, 1), repeat=inside.ndim)))
+        around = steps @ (np.array(inside.strides) // inside.itemsize)
+        # Straight steps and any steps in turn go about as far in all directions.
+        kinds = (around[np.abs(steps).sum(axis=1) == 1], around)
+        end, _ = _last_reached(inside.ravel(), np.flatnonzero(inside)[:1], kinds)
+        return _last_reached(inside.ravel(), end, kinds)[1] * self.step
+
+
+def _last_reached(inside: BoolArray, begin: IntArray, kinds: Sequence[IntArray]) -> tuple[IntArray, int]:
+    """One of the points reached last from another, and after how many steps, of these kinds in turn."""
+    unseen, front, steps = inside.copy(), begin, 0
+    last = np.empty(len(inside), np.int32)
+    while True:
+        unseen[front] = False
+        near = (front[:, None] + kinds[steps % len(kinds)]).ravel()
+        near = near[unseen[near]]
+        if not len(near):
+            return np.sort(front)[:1], steps
+        # Each point once; sorting takes longer.
+        number = np.arange(len(near), dtype=np.int32)
+        last[near] = number
+        front, steps = near[last[near] == number], steps + 1
+
+
+@lru_cache(maxsize=4)
+def free_space(world: World, safety_distance: float, step: float) -> FreeSpace:
+    """The free space of a world with bounds for robots whose centres keep ``safety_distance`` to everything [m].
+
+    The lattice begins at the lower bounds, in steps of ``step`` [m].
+    """
+    low, high = world.bounds.astype(np.float64)
+    shape = ((high - low) / step + 1).astype(int)
+    if np.prod(shape, dtype=np.float64) > MAX_POINTS:
+        raise ValueError(
+            f"a world of {' x '.join(f'{side:g}' for side in high - low)} m takes more than {MAX_POINTS} points "
+            f"{step:.2g} m apart to find free places in; use a smaller world or larger robots"
+        )
+    space = FreeSpace(low, step, np.zeros(shape, np.bool_))
+    # Between two neighbours that are further from everything than this a robot keeps its safety distance.
+    needed = math.sqrt(safety_distance * safety_distance + step * step / 4)
+    free = np.empty(shape, np.bool_)
+    rows = max(1, _POINTS_AT_ONCE // int(np.prod(shape[1:])))
+    for begin in range(0, shape[0], rows):
+        part = free[begin : begin + rows]
+        indices = np.moveaxis(np.indices(part.shape), 0, -1)
+        indices[..., 0] += begin
+        part[...] = world.is_clear(space.points(indices), needed)
+    regions, count = ndimage.label(free)
+    return replace(space, inside=regions == 1 + np.argmax(np.bincount(regions.ravel())[1:])) if count else space
+
 
 class _FreeRegion:
     """Positions, ``most`` of them, taken from a region, the rest of which stays connected and in touch with each.
@@ -51,7 +127,7 @@ class _FreeRegion:
     Robots that pass by keep the ``separation`` to a position, in steps of the lattice.
     """
 
-    def __init__(self, inside: Mask, separation: float, most: int) -> None:
+    def __init__(self, inside: BoolArray, separation: float, most: int) -> None:
         self._label, self._dilation = ndimage.label, ndimage.binary_dilation
         self.positions, self.count = np.empty((most, inside.ndim), np.int64), 0
         # A robot finds a path round a position within the wide window about it, or is held to find none.
@@ -63,7 +139,7 @@ class _FreeRegion:
         self._wide_disc = (offsets * offsets).sum(axis=0) <= separation * separation
         self._disc = self._wide_disc[self._about(np.zeros(inside.ndim, np.int64), self._narrow)]
 
-    def add(self, position: NDArray[np.int64]) -> bool:
+    def add(self, position: IntArray) -> bool:
         """Take a position if that leaves every robot a path."""
         if self._taken[tuple(position + self._wide)] or not self._goes_round(position):
             return False
@@ -77,10 +153,10 @@ class _FreeRegion:
         taken -= self._disc
         return False
 
-    def _about(self, position: NDArray[np.int64], window: int) -> tuple[slice, ...]:
+    def _about(self, position: IntArray, window: int) -> tuple[slice, ...]:
         return tuple(slice(index + self._wide - window, index + self._wide + window + 1) for index in position)
 
-    def _goes_round(self, position: NDArray[np.int64]) -> bool:
+    def _goes_round(self, position: IntArray) -> bool:
         """Check whether all that a new disc touches of the untaken region is connected around it."""
         about = self._about(position, self._wide)
         untaken = self._free[about] & (self._taken[about] == 0)
@@ -88,7 +164,7 @@ class _FreeRegion:
         touched = regions[self._dilation(untaken & self._wide_disc)]
         return len(np.unique(touched[touched > 0])) == 1
 
-    def _in_touch(self, position: NDArray[np.int64]) -> bool:
+    def _in_touch(self, position: IntArray) -> bool:
         """Check whether a robot gets from a position to the untaken region through no disc but its own."""
         about = self._about(position, self._narrow)
         free, taken = self._free[about], self._taken[about]
@@ -98,8 +174,8 @@ class _FreeRegion:
 
 
 def draw_positions(
-    random: np.random.Generator, space: FreeSpace, groups: Sequence[tuple[Mask | None, int]], separation: float
-) -> Points:
+    random: np.random.Generator, space: FreeSpace, groups: Sequence[tuple[BoolArray | None, int]], separation: float
+) -> Floats:
     """Random positions ``(P, d)``, far enough apart that a robot gets from each to each while robots are at all others.
 
     Each of the ``groups`` has the part of the region that its positions are drawn from, or ``None`` for all of it, and
@@ -168,7 +244,7 @@ def populate(
     return build(settings, Layout(starts, goals, world, travel))
 
 
-def with_obstacles(settings: Settings, world: World, positions: Points | None = None) -> World:
+def with_obstacles(settings: Settings, world: World, positions: Floats | None = None) -> World:
     """A world with bounds and the random obstacles asked for, clear of starts and goals if they are known."""
     low, high = world.bounds.astype(np.float64)
     positions = np.empty((0, world.dimension)) if positions is None else positions
@@ -177,7 +253,7 @@ def with_obstacles(settings: Settings, world: World, positions: Points | None = 
 
 def draw_team(
     settings: Settings, space: FreeSpace, remedy: str, exchange: tuple[float, float] | None = None
-) -> tuple[Points, Points]:
+) -> tuple[Floats, Floats]:
     """``(K, d)`` random starts and goals; see :func:`populate`."""
     random = settings.generator(STARTS_AND_GOALS)
     count = settings.num_robots
@@ -185,7 +261,7 @@ def draw_team(
     apart = settings.spacing + settings.goal_radius + reserve_of(settings)
     separation = math.sqrt(apart * apart + space.step * space.step / 4)
     number = np.arange(2 * count)
-    groups: list[tuple[Mask | None, int]] = [(None, 2 * count)]
+    groups: list[tuple[BoolArray | None, int]] = [(None, 2 * count)]
     if exchange is not None:
         x = space.low[0] + space.step * np.arange(len(space.inside))[:, None]
         groups = [(x < exchange[0], count), (x > exchange[1], count)]
