@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
-from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Pairs, Stretch, Watch
-from d4orm_env.verify.convex_bodies import ConvexBodies
+from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
-from d4orm_env.verify.discs import surroundings
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
-from d4orm_env.verify.footprints import TurningPairs, turning_watches
+from d4orm_env.verify.footprints import ConvexBodies, make_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
@@ -82,8 +80,11 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
 
 def _report(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
-    pairs, obstacles = make_watches(problem, *course.bodies(docking))
-    watches: list[Watch] = [pairs, *obstacles]
+    robot, body = course.bodies(docking)
+    shapes = course.shapes.take(body) if course.shapes is not None else None
+    radius = problem.team.radius.astype(np.float64)[robot]
+    pairs, obstacles = make_watches(problem.world, robot, radius, shapes)
+    watches = [pairs, *obstacles]
     for stretch in course.stretches(docking, max(len(watch.rows) for watch in watches)):
         for watch in watches:
             watch.observe(stretch)
@@ -103,21 +104,12 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
     )
 
 
-def make_watches(problem: Problem, robot: NDArray[np.intp], body: NDArray[np.intp]) -> tuple[Pairs, list[Watch]]:
-    """Return the watch over bodies, of these robots and these numbers ``(B,)``, and those over their surroundings."""
-    if problem.team.shapes:
-        shapes = ConvexBodies.of(problem.team).take(body)
-        return TurningPairs(robot, shapes), turning_watches(problem.world, robot, shapes)
-    radius = problem.team.radius.astype(np.float64)[robot]
-    return Pairs(robot, radius), surroundings(problem.world, robot, radius)
-
-
 class _Course:
     """Positions of all robots over the whole horizon, some steps at a time."""
 
     def __init__(self, motion: TeamMotion, sub_steps: int, problem: Problem) -> None:
         self._motion, self._sub_steps, start = motion, sub_steps, problem.start.astype(np.float64)
-        self._shapes = ConvexBodies.of(problem.team) if problem.team.shapes else None
+        self.shapes = ConvexBodies.of(problem.team) if problem.team.shapes else None
         horizon, num_robots = motion.pace.shape
         self._numbers = (2 * sub_steps + 1) * num_robots * motion.size  # of one step
         self._moving = int(np.flatnonzero(motion.moving).max(initial=-1)) + 1
@@ -180,14 +172,14 @@ class _Course:
             displacement[np.broadcast_to(absorbed[:, None], displacement.shape[:3])] = 0.0
             position = np.where(absorbed[..., None], rest, position)
             path, travel, turn = position[:, None] + displacement, norm(displacement).max(axis=1), np.zeros((0, 0, 0))
-            if self._shapes is not None:
+            if self.shapes is not None:
                 turn, (reading, body) = self._turns(steps, docking, stop), self._readings(docking)
                 if len(body) > len(robot):
                     offset = self._hitched(docking, turn)
                     path, displacement = path[:, :, reading] + offset, displacement[:, :, reading] + offset
                     travel = norm(displacement - displacement[:, :1]).max(axis=1)
                 turned = np.abs(turn - turn[:, :1]).max(axis=1)
-                travel = self._shapes.stretch[body] * (travel + self._shapes.outer[body] * turned)
+                travel = self.shapes.stretch[body] * (travel + self.shapes.outer[body] * turned)
             yield Stretch(path, travel, steps.start * dt, dt, turn)
 
 

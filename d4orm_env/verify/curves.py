@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from d4orm_env.core import portable
-from d4orm_env.verify.contact import MAX_NUMBERS, Indices, Pairs, Stretch, Watch
-from d4orm_env.verify.convex_bodies import ConvexBodies
-from d4orm_env.verify.discs import surroundings
-from d4orm_env.verify.footprints import TurningPairs, turning_watches
+from d4orm_env.verify.contact import MAX_NUMBERS, Indices, Stretch
+from d4orm_env.verify.footprints import ConvexBodies, make_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.report import VerificationReport, Violation
 
@@ -51,10 +49,8 @@ def verify_curves(
     trailers = _Trailers.of(problem)
     robots = np.concatenate([np.arange(len(radius)), trailers.robot])
     shapes = ConvexBodies.of(team) if team.shapes else None
-    pairs: Pairs = Pairs(robots, radius) if shapes is None else TurningPairs(robots, shapes)
-    world = problem.world
-    obstacles = surroundings(world, robots, radius) if shapes is None else turning_watches(world, robots, shapes)
-    watches: list[Watch] = [pairs, *obstacles]
+    pairs, obstacles = make_watches(problem.world, robots, radius, shapes)
+    watches = [pairs, *obstacles]
 
     def robots_at(samples: Indices) -> tuple[Floats, Floats]:
         times = samples.ravel() * (dt / sub_steps)

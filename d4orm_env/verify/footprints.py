@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from d4orm_env.core import portable
 from d4orm_env.verify.contact import WIDER, Indices, Pairs, Static, Stretch, Watch, side_names
-from d4orm_env.verify.convex_bodies import ConvexBodies
+from d4orm_env.verify.discs import surroundings
 from d4orm_env.verify.geometry import Floats, ball_gap, box_distance, core_gap, norm, polygon_distance
 
 if TYPE_CHECKING:
+    from d4orm_env.core.team import Team
     from d4orm_env.core.world import World
 
 _Gap = Callable[[Indices, Indices, Floats, Floats], Floats]
@@ -26,6 +29,45 @@ HALVINGS = 20
 """Most times that a sub-step is halved."""
 RESOLUTION = 1 / 15_000
 """Closer to the smallest gap than this share of a radius nothing is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexBodies:
+    """Convex bodies, one row each."""
+
+    corners: Floats  #: ``(B, n, 2)`` of planar cores, the last one repeated; of no use in space
+    rounding: Floats  #: ``(B,)``
+    semi_axes: Floats  #: ``(B, 3)`` in space
+    outer: Floats  #: ``(B,)`` radii of the discs or balls round them
+    stretch: Floats  #: ``(B,)`` how much faster a gap may change than a body moves
+
+    @classmethod
+    def of(cls, team: Team) -> ConvexBodies:
+        """The footprints of a team: of its robots, and then of their trailers."""
+        bodies: list[Any] = [getattr(footprint, "front", footprint) for footprint in team.footprint]
+        bodies += [trailer for footprint in team.footprint for trailer in getattr(footprint, "trailers", ())]
+        size, most = len(bodies), 1 if team.dimension == 3 else max(len(footprint.core[0]) for footprint in bodies)
+        corners, rounding, semi_axes = np.zeros((size, most, 2)), np.zeros(size), np.ones((size, 3))
+        for robot, footprint in enumerate(bodies):
+            if team.dimension == 3:
+                semi_axes[robot] = footprint.semi_axes
+                continue
+            own, rounding[robot] = footprint.core
+            corners[robot, : len(own)], corners[robot, len(own) :] = own, own[-1]
+        outer = np.array([footprint.outer_radius for footprint in bodies]).astype(np.float32).astype(np.float64)
+        return cls(corners, rounding, semi_axes, outer, semi_axes.max(axis=1) / semi_axes.min(axis=1))
+
+    def take(self, index: Indices) -> ConvexBodies:
+        """Some of them, in the order given."""
+        return ConvexBodies(
+            self.corners[index], self.rounding[index], self.semi_axes[index], self.outer[index], self.stretch[index]
+        )
+
+    def placed(self, index: Indices, position: Floats, turn: Floats) -> Floats:
+        """``(N, n, 2)`` corners of bodies at positions ``(N, 2)`` turned by ``(N,)``."""
+        sine, cosine = (part[:, None] for part in portable.sin_cos(turn))
+        x, y = self.corners[index, :, 0], self.corners[index, :, 1]
+        return position[:, None] + np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
 
 
 class Turning(Watch):
@@ -238,13 +280,14 @@ class Sides(TurningStatic):
 
     def __init__(self, robot: Indices, shapes: ConvexBodies, lower: Floats, upper: Floats) -> None:
         super().__init__("bounds contact", robot, shapes, side_names(len(lower)))
-        self._position, self._dimension = np.concatenate([lower, -upper]), len(lower)
+        self._axis, self._sign = np.tile(np.arange(len(lower)), 2), np.repeat([1.0, -1.0], len(lower))
+        self._position = np.concatenate([lower, -upper])
 
     def _inside(self, pairs: Indices, position: Floats) -> Floats:
         """``(N,)`` distance of positions ``(N, d)`` from their sides, negative outside."""
         column = self.columns[pairs]
-        side, axis = np.divmod(column, self._dimension)
-        return np.where(side == 0, 1.0, -1.0) * position[np.arange(len(axis)), axis] - self._position[column]
+        at = position[np.arange(len(column)), self._axis[column]]
+        return self._sign[column] * at - self._position[column]
 
     def outer_gap(self, pairs: Indices, *positions: Floats) -> Floats:
         return self._inside(pairs, *positions) - WIDER * self.shapes.outer[self.rows[pairs]]
@@ -252,24 +295,29 @@ class Sides(TurningStatic):
     def between(self, pairs: Indices, poses: Sequence[tuple[Floats, Floats]]) -> Floats:
         ((position, turn),) = poses
         column, body = self.columns[pairs], self.rows[pairs]
-        side, axis = np.divmod(column, self._dimension)
-        sign = np.where(side == 0, 1.0, -1.0)
-        at = self._inside(pairs, position)
-        if self._dimension == 3:
+        axis, at = self._axis[column], self._inside(pairs, position)
+        if position.shape[1] == 3:
             return at - self.shapes.semi_axes[body, axis]
         corners = self.shapes.placed(body, np.zeros_like(position), turn)
         along = np.take_along_axis(corners, axis[:, None, None], axis=2)[..., 0]
-        return at + (sign[:, None] * along).min(axis=1) - self.shapes.rounding[body]
+        return at + (self._sign[column][:, None] * along).min(axis=1) - self.shapes.rounding[body]
 
 
 def _ball(radius: Floats) -> Floats:
     return np.repeat(radius[:, None], 3, axis=1)
 
 
-def turning_watches(world: World, robot: Indices, shapes: ConvexBodies) -> list[Watch]:
-    """Return a watch for the obstacles, if there are any, and for the bounds."""
+def make_watches(
+    world: World, robot: Indices, radius: Floats, shapes: ConvexBodies | None
+) -> tuple[Pairs, list[Watch]]:
+    """Return the watch over bodies of these robots ``(B,)``, and those over obstacles and bounds.
+
+    Bodies are discs or balls of a radius ``(B,)``, but for those with ``shapes``.
+    """
+    if shapes is None:
+        return Pairs(robot, radius), surroundings(world, robot, radius)
     watches: list[Watch] = [Obstacles(robot, shapes, world)] if world.num_obstacles else []
     if world.lower is not None:
         lower, upper = (np.asarray(bound, np.float64) for bound in (world.lower, world.upper))
         watches.append(Sides(robot, shapes, lower, upper))
-    return watches
+    return TurningPairs(robot, shapes), watches
