@@ -206,7 +206,14 @@ def read_yaml(path: str | os.PathLike[str]) -> object:
     Raises:
         ValueError: If it cannot be read, is larger than 10 MB, or is refused by :func:`parse_yaml`.
     """
-    return parse_yaml(_read_text(Path(path)))
+    try:
+        content = read_limited(Path(path), "a YAML file", MAX_BYTES)
+    except OSError as error:
+        raise ValueError(f"cannot be read ({error.strerror}); check name and permissions") from error
+    try:
+        return parse_yaml(content.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
 
 
 def parse_yaml(text: str) -> object:
@@ -285,14 +292,3 @@ def _scalar(text: str) -> object:
 
 def _line(mark: Any) -> str:
     return "" if mark is None else f" in line {mark.line + 1}"
-
-
-def _read_text(path: Path) -> str:
-    try:
-        content = read_limited(path, "a YAML file", MAX_BYTES)
-    except OSError as error:
-        raise ValueError(f"cannot be read ({error.strerror}); check name and permissions") from error
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"is not UTF-8 text (byte {error.start}); save it as UTF-8") from error

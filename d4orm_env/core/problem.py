@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core import problem_checks as checks
 from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array
-from d4orm_env.core.goal_poses import checked_goal_poses
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_arrays import ProblemArrays, as_arrays, digest_of
 from d4orm_env.core.problem_checks import Arrival
@@ -123,7 +122,7 @@ class Problem(Frozen):
             goal=frozen_array(goal, "goal", (size, team.dimension), largest=LARGEST),
             world=world,
             goal_speed=checks.goal_speeds(team, numbers["dt"], goal_speed),
-            **checked_goal_poses(team, goal_heading, goal_heading_tolerance, goal_hitches),
+            **checks.checked_goal_poses(team, goal_heading, goal_heading_tolerance, goal_hitches),
             name=name,
             arrival=arrival,
         )

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, read_only
 from d4orm_env.core.bodies import FootprintArrays
-from d4orm_env.core.goal_poses import goal_directions, squared_chords
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
 from d4orm_env.dynamics.transition import docking_speed
 from d4orm_env.geometry.world_index import WorldIndex
@@ -55,6 +55,20 @@ def inverse_initial_distance(positions: FloatArray, goal: FloatArray, goal_radiu
     return (1.0 / np.maximum(np.linalg.norm(goal - positions, axis=-1), goal_radius)).astype(np.float32)
 
 
+def _goal_directions(headings: FloatArray, hitches: FloatArray) -> FloatArray:
+    """``(K, 8)`` goal headings ``(K,)`` and hitch angles ``(K, 3)`` as unit vectors; zero for none."""
+    angles = np.column_stack([headings, hitches])
+    known = ~np.isnan(angles)
+    sine, cosine = portable.sin_cos(np.where(known, angles, 0).astype(np.float64))
+    return (np.stack([cosine, sine], axis=2) * known[..., None]).astype(np.float32).reshape(len(headings), -1)
+
+
+def _squared_chords(headings: FloatArray, tolerance: FloatArray) -> FloatArray:
+    """``(K,)`` squares of the chords by which unit vectors may miss goal headings; infinite for none."""
+    half = portable.sin_cos(tolerance.astype(np.float64) / 2)[0]
+    return np.where(np.isnan(headings), np.inf, 4 * half * half).astype(np.float32)
+
+
 def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:
     """A problem with an index of its obstacles, as the engines read it."""
     positions, turns = problem.start[:, : problem.dimension], not np.isnan(problem.goal_heading).all()
@@ -76,8 +90,8 @@ def as_arrays(problem: Problem, grid: WorldIndex) -> ProblemArrays:
         docks=np.bool_(problem.docks),
         collision_penalty=np.float32(problem.collision_penalty),
         turns_at_goals=np.bool_(True) if turns else None,
-        goal_direction=goal_directions(problem.goal_heading, problem.goal_hitches) if turns else None,
-        squared_goal_chord=squared_chords(problem.goal_heading, problem.goal_heading_tolerance) if turns else None,
+        goal_direction=_goal_directions(problem.goal_heading, problem.goal_hitches) if turns else None,
+        squared_goal_chord=_squared_chords(problem.goal_heading, problem.goal_heading_tolerance) if turns else None,
         footprints=problem.team.footprint_arrays,
     )
     return read_only(arrays)

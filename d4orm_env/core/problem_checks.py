@@ -1,4 +1,7 @@
-"""Checks of a problem by the physics; each refusal is a ``ValueError`` that names the robot."""
+"""Checks of a problem: its numbers, its goals' speeds and poses, and its states by the physics.
+
+Each refusal is a ``ValueError`` that names the robot.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,13 @@ from d4orm_env.core.arrays import (
     SMALLEST,
     FloatArray,
     Floats,
+    as_float32,
+    frozen_per_robot,
     positive_number,
     short_repr,
     whole_number,
-)
-from d4orm_env.core.bodies import numbers_by_robot
-from d4orm_env.core.footprint_gaps import near_pairs, pair_gap, world_gap
-from d4orm_env.core.goal_poses import one_or_each
+)  # fmt: skip
+from d4orm_env.core.bodies import least_gap, near_pairs, numbers_by_robot, world_gap
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
@@ -42,6 +45,10 @@ RESOLUTION = 100
 """The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
 STEP_RESOLUTION = 10
 """A robot at its speed limit moves at least so many times that in one step."""
+MOST_TRAILERS = 3
+"""Most trailers of a robot."""
+LEAST_TOLERANCE = 1e-3
+"""Smallest tolerance of a goal heading [rad]."""
 INTEGRATION_ERROR = 2 / 15
 """Most that one step of RK4 may be off where a robot turns at its limits, as a share of the goal radius."""
 
@@ -102,7 +109,7 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
     if given is None:
         first_order = np.array([model.first_order for model in team.robot_models])
         return np.where(first_order, np.float32(np.inf), team.max_acceleration * np.float32(dt))
-    speeds = one_or_each(given, "goal_speed", team.num_robots)
+    speeds = _one_or_each(given, "goal_speed", team.num_robots)
     wrong = ~((speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf)))
     if wrong.any():
         robot = int(np.argmax(wrong))
@@ -110,6 +117,76 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
             f"goal_speed of robot_{robot} is {speeds[robot]:g}; it must be from 0 to {LARGEST:g}, or inf for no limit"
         )
     return speeds
+
+
+def checked_goal_poses(
+    team: Team, heading: ArrayLike | None, tolerance: ArrayLike, hitches: ArrayLike | None
+) -> dict[str, FloatArray]:
+    """What a problem asks of poses at goals, by its attributes' names."""
+    headings = _goal_headings(team, heading)
+    tolerances = frozen_per_robot(tolerance, "goal_heading_tolerance", team.num_robots)
+    # What float32 does not resolve, or what allows any heading.
+    for robot in np.flatnonzero((tolerances < LEAST_TOLERANCE) | (tolerances > np.float32(np.pi)))[:1].tolist():
+        value = f"goal_heading_tolerance of robot_{robot} is {tolerances[robot]:g} rad"
+        raise ValueError(f"{value}; it must be from {LEAST_TOLERANCE:g} to pi")
+    angles = _goal_hitches(team, hitches, headings)
+    return {"goal_heading": headings, "goal_heading_tolerance": tolerances, "goal_hitches": angles}
+
+
+def _one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
+    """``(K,)`` numbers, given as one for all robots or one each."""
+    try:
+        values = as_float32(given)
+    except ValueError as error:
+        raise ValueError(f"{name} must be a number or one per robot, not {short_repr(given)}; {error}") from error
+    values = np.repeat(values, num_robots) if values.ndim == 0 else values
+    if values.shape != (num_robots,):
+        raise ValueError(f"{name} has shape {values.shape}; expected one number, or ({num_robots},){note}")
+    return values
+
+
+def _goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
+    """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
+    headings = _one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
+    for robot in np.flatnonzero(~np.isnan(headings)).tolist():
+        if team.robot_models[robot].heading_index is None:
+            raise ValueError(
+                f"goal_heading of robot_{robot} is {headings[robot]:g}, and a {team.models[robot]} has no heading; "
+                f"give NaN"
+            )
+        if not abs(headings[robot]) <= np.float32(2 * np.pi):
+            raise ValueError(
+                f"goal_heading of robot_{robot} is {headings[robot]:g} rad; it must be at most 2 pi in magnitude, so "
+                f"give radians, without whole turns"
+            )
+    return headings
+
+
+def _goal_hitches(team: Team, given: ArrayLike | None, headings: FloatArray) -> FloatArray:
+    """``(K, 3)`` hitch angles with which trailers must arrive [rad], NaN for any and for those that there are not."""
+    hitches = np.full((team.num_robots, MOST_TRAILERS), np.nan, np.float32)
+    if given is None:
+        return hitches
+    try:
+        values = as_float32(given)
+    except ValueError as error:
+        raise ValueError(f"goal_hitches must be numbers, a row per robot, not {short_repr(given)}; {error}") from error
+    if values.ndim != 2 or values.shape[0] != team.num_robots or values.shape[1] > MOST_TRAILERS:
+        raise ValueError(
+            f"goal_hitches has shape {values.shape}; expected ({team.num_robots}, trailers), NaN for any and for none"
+        )
+    hitches[:, : values.shape[1]] = values
+    for robot, number in np.argwhere(~np.isnan(hitches)).tolist():
+        value, trailers = hitches[robot, number], team.robot_models[robot].trailers
+        where = f"goal_hitches of robot_{robot} gives {value:g} rad for trailer {number + 1}"
+        if number >= len(trailers):
+            raise ValueError(f"{where}, and a {team.models[robot]} pulls {len(trailers)}; give NaN")
+        if np.isnan(headings[robot]):
+            raise ValueError(f"{where}, and no goal_heading; give both")
+        most = team.limits[robot, dict(team.robot_models[robot].state_limits)[trailers[number][0]]]
+        if not abs(value) <= most:
+            raise ValueError(f"{where}; it must be at most its largest hitch angle, {most:g}, in magnitude")
+    return hitches
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start", max_angle: float = float(MAX_ANGLE)) -> None:
@@ -224,7 +301,8 @@ def check_positions(
     first, second, between = near_pairs(positions.astype(np.float64), radius, margin)
     if shaped:
         pairs = zip(first.tolist(), second.tolist(), strict=True)
-        between = np.array([_least_gap(team, poses, bodies[one], bodies[other]) for one, other in pairs], np.float64)
+        gaps_of_pairs = [least_gap(team.bodies, poses, bodies[one], bodies[other]) for one, other in pairs]
+        between = np.array(gaps_of_pairs, np.float64)
     if len(overlapping := np.flatnonzero(between <= 0)):
         of_first = overlapping[second[overlapping] == second[overlapping].min()]
         pair = int(of_first[np.argmin(between[of_first])])
@@ -242,12 +320,6 @@ def check_positions(
     if gap > margin:
         return ""
     return f"the {what} of robot_{least} is {gap:.3g} m from {nearest}, and the margin is {margin:g} m"
-
-
-def _least_gap(team: Team, poses: Floats, some: list[int], others: list[int]) -> float:
-    """Least signed gap between bodies of these numbers [m]."""
-    pairs = ((i, j) for i in some for j in others)
-    return min(pair_gap(team.bodies[i].footprint, poses[i], team.bodies[j].footprint, poses[j]) for i, j in pairs)
 
 
 def _size(team: Team, robot: int) -> str:

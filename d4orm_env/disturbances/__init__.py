@@ -14,28 +14,7 @@ from d4orm_env.disturbances.perception import Occlusion, RayNoise, StateDelay, S
 from d4orm_env.disturbances.robot_faults import Drag, LimitMismatch, Push, Stall
 
 __all__ = [
-    "Bias",
-    "ControlNoise",
-    "CorrelatedNoise",
-    "Delay",
-    "Disturbance",
-    "DisturbanceEffect",
-    "Drag",
-    "Draws",
-    "Dropout",
-    "Gain",
-    "Intruder",
-    "Lag",
-    "LimitMismatch",
-    "MovingObstacle",
-    "Observed",
-    "Occlusion",
-    "Push",
-    "Quantisation",
-    "RayNoise",
-    "Scene",
-    "Stall",
-    "StateDelay",
-    "StateNoise",
-    "load_pedestrians",
-]
+    "Bias", "ControlNoise", "CorrelatedNoise", "Delay", "Disturbance", "DisturbanceEffect", "Drag", "Draws", "Dropout",
+    "Gain", "Intruder", "Lag", "LimitMismatch", "MovingObstacle", "Observed", "Occlusion", "Push", "Quantisation",
+    "RayNoise", "Scene", "Stall", "StateDelay", "StateNoise", "load_pedestrians",
+]  # fmt: skip

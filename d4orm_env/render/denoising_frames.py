@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.problem import Problem
+from d4orm_env.render import own_style
 from d4orm_env.render.panels import Axes2D, TeamLayer, view_limits
 from d4orm_env.render.pictures import PICTURE_SUFFIXES
-from d4orm_env.render.style import own_style
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import DisturbanceEvents
+from d4orm_env.render import own_style
 from d4orm_env.render.event_marks import MarkLayer
 from d4orm_env.render.panels import INK, Array, Axes2D, TeamLayer, make_axes, view_limits
-from d4orm_env.render.style import own_style
 
 
 class FrameRenderer:

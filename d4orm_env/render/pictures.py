@@ -20,6 +20,7 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.summary_line import KeyFigure, count
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, arrival_times
+from d4orm_env.render import own_style
 from d4orm_env.render.event_marks import MarkLayer, mark_legend
 from d4orm_env.render.panels import (
     CONTACT,
@@ -33,7 +34,6 @@ from d4orm_env.render.panels import (
     make_axes,
     view_limits,
 )
-from d4orm_env.render.style import own_style
 
 pyplot: Any = LazyModule("matplotlib.pyplot")
 

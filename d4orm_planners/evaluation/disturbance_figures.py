@@ -14,7 +14,7 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.disturbances.disturbance_registry import find_level, name_of
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import ACCELERATION
-from d4orm_env.render.style import own_style
+from d4orm_env.render import own_style
 from d4orm_planners.evaluation.summary import SuccessRate
 from d4orm_planners.evaluation.tables import target
 

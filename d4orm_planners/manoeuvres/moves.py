@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
-from d4orm_env.core.goal_poses import MOST_TRAILERS
+from d4orm_env.core.problem_checks import MOST_TRAILERS
 from d4orm_env.engine.compiling import compiled
 from d4orm_planners.manoeuvres.curves import curve_of, sweep_curve
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS

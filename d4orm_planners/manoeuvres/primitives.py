@@ -15,7 +15,7 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
-from d4orm_env.core.goal_poses import MOST_TRAILERS
+from d4orm_env.core.problem_checks import MOST_TRAILERS
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, Kind, Mode, Move
 from d4orm_planners.manoeuvres.model_moves import MOVES
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
-from d4orm_env.core.footprint_gaps import pair_gap, world_gap
+from d4orm_env.core.bodies import pair_gap, world_gap
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model

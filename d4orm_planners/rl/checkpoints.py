@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from d4orm_env.core.errors import first_line
 from d4orm_env.core.files import ArrayArchive, claim_folder, replaced_when_done
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.render.style import own_style
+from d4orm_env.render import own_style
 from d4orm_planners.evaluation.tables import write_csv
 from d4orm_planners.rl.network import SUFFIX, Network, load_network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv

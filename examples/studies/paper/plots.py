@@ -13,7 +13,7 @@ from examples.common import steps_spent, steps_to_solution
 from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import Measured, column, first_solution
 
-from d4orm_env.render.style import own_style
+from d4orm_env.render import own_style
 from d4orm_planners.evaluation.comparison import survival
 from d4orm_planners.evaluation.store import BestSoFar, Trial
 
