@@ -168,12 +168,6 @@ class World(Frozen):
     def _indices(self) -> dict[tuple[float, int, float, int, float], WorldIndex]:
         return {}
 
-    @property
-    def _default_distance(self) -> float:
-        """Distance that the index is made for by default: a share of the room that the obstacles take [m]."""
-        lower, upper = self.shapes.extent()
-        return max(float((upper - lower).max()), SMALLEST) / 32
-
     def index(
         self, max_distance: float, nearest: int = 1, positions: FloatArray | None = None, within: float = 0.0
     ) -> WorldIndex:
@@ -215,7 +209,10 @@ class World(Frozen):
         to_bounds = self._to_bounds(points)
         if not self.shapes.count:
             return to_bounds
-        index = next(iter(self._indices.values()), None) or self.index(self._default_distance)
+        index = next(iter(self._indices.values()), None)
+        if index is None:  # made for a share of the room that the obstacles take
+            lower, upper = self.shapes.extent()
+            index = self.index(max(float((upper - lower).max()), SMALLEST) / 32)
         flat = points.reshape(-1, self.dimension)
         return np.minimum(nearest_distance(self.shapes, index, flat).reshape(to_bounds.shape), to_bounds)
 

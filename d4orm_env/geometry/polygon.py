@@ -69,8 +69,6 @@ class _Ears:
         self._rank = dict(zip(ring, range(count), strict=True))
         self._turn = {corner: self._turn_at(corner) for corner in ring}
         self._reflex = np.array([self._turn[corner] < 0 for corner in range(count)])
-        self._orders = [np.argsort(axis, kind="stable") for axis in points.T]
-        self._sorted = [axis[order] for axis, order in zip(points.T, self._orders, strict=True)]
         self._waiting: dict[int, list[int]] = {}
         self._next = [self._entry(corner) for corner in ring if self._turn[corner] >= 0]
         heapify(self._next)
@@ -113,25 +111,13 @@ class _Ears:
     def _first_within(self, ear: int) -> int | None:
         """A corner that turns to the right and lies in the triangle at another."""
         around = self._before[ear], ear, self._after[ear]
-        others = self._near(self._points[list(around)])
-        others = others[self._reflex[others]]
+        others = np.flatnonzero(self._reflex)
         rest = self._points[others]
         inside = ~np.isin(others, around)
         for begin, end in zip(around, (*around[1:], around[0])):
             a, b = self._points[begin], self._points[end]
             inside &= _cross(b - a, rest - a) >= 0
         return int(others[np.argmax(inside)]) if inside.any() else None
-
-    def _near(self, triangle: Floats) -> NDArray[np.intp]:
-        """All corners with an x, or all with a y, such as a triangle has: the fewer."""
-        few: NDArray[np.intp] | None = None
-        for axis, order in enumerate(self._orders):
-            low, high = triangle[:, axis].min(), triangle[:, axis].max()
-            begin, end = self._sorted[axis].searchsorted(low), self._sorted[axis].searchsorted(high, "right")
-            if few is None or end - begin < len(few):
-                few = order[begin:end]
-        assert few is not None
-        return few
 
     def _cut_off(self, ear: int, before: int, after: int) -> None:
         self._after[before], self._before[after] = after, before

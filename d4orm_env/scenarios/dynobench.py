@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,13 +23,11 @@ from d4orm_env.core.files import naming, read_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MOST_TRAILERS
 from d4orm_env.core.team import Team
+from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
 from d4orm_env.footprints import Box, Disc, Footprint, Train
-
-if TYPE_CHECKING:
-    from d4orm_env.core.trajectory import Trajectory
 
 DT = 0.1
 """Time step of all their models in the plane [s]."""

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from d4orm_env.render import pictures, replay
-    from d4orm_env.render.denoising_frames import Denoising
-    from d4orm_env.render.replay import Replay, ReplayMotion
+    from d4orm_env.render.replay import Denoising, Replay, ReplayMotion
 else:
     pictures = LazyModule("d4orm_env.render.pictures")
     replay = LazyModule("d4orm_env.render.replay")

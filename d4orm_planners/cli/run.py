@@ -13,8 +13,7 @@ from d4orm_env import make_problem, navigation_v0, verify
 from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render import save_animation, save_picture
-from d4orm_env.render.denoising_frames import save_denoising
-from d4orm_env.render.replay import Replay
+from d4orm_env.render.replay import Replay, save_denoising
 from d4orm_planners.base.episode import open_env, run_episode
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner, make_policy

@@ -9,7 +9,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.choice import rollout
-from d4orm_env.render.denoising_frames import Denoising
+from d4orm_env.render.replay import Denoising
 from d4orm_planners.engine.sampling_types import DenoisingStep
 
 __all__ = ["DenoisingFilm"]

@@ -15,8 +15,8 @@ from test_render import ring_problem, straight_drive
 
 from d4orm_env import navigation_v0
 from d4orm_env.render import FrameRenderer, own_style, plot_trajectory, save_animation, save_picture
-from d4orm_env.render.denoising_frames import Denoising, save_denoising
 from d4orm_env.render.pictures import motion_html, paths_html, problem_html
+from d4orm_env.render.replay import Denoising, save_denoising
 from d4orm_planners.rl.checkpoints import Evaluation, write_curve
 
 # Without LaTeX each text would end the drawing; with it, take seconds.

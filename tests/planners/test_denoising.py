@@ -12,7 +12,7 @@ import pytest
 from engine_support import engine_noise
 
 from d4orm_env import make_problem
-from d4orm_env.render.denoising_frames import Denoising, save_denoising
+from d4orm_env.render.replay import Denoising, save_denoising
 from d4orm_planners import make_planner
 from d4orm_planners.base.plan import IterationRecord, Plan
 from d4orm_planners.engine.sampling_types import WATCHED_SAMPLES, DenoisingStep, SamplingTask, get_sampling_engine
