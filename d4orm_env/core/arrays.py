@@ -195,9 +195,9 @@ def positive_number(
     return number
 
 
-def duration(value: object, name: str, *, zero_allowed: bool = False) -> float:
+def duration(value: object, name: str) -> float:
     """``value`` as a positive number of seconds that every clock can wait: at most :data:`LARGEST`, eleven days."""
-    return positive_number(value, name, zero_allowed=zero_allowed, most=LARGEST)
+    return positive_number(value, name, most=LARGEST)
 
 
 def whole_number(value: object, name: str, minimum: int, maximum: int | None = None) -> int:
