@@ -20,11 +20,10 @@ from d4orm_env.core.arrays import (
     positive_number,
     short_repr,
     whole_number,
-)  # fmt: skip
+)
 from d4orm_env.core.bodies import least_gap, near_pairs, numbers_by_robot, world_gap
-from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.team import Team
-from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS, unwound
+from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.robot_model import OWN_LIMITS, SPEED, STANDARD_LIMITS, TURN_RATE, Model
 from d4orm_env.footprints import Disc
@@ -220,21 +219,6 @@ def _check_state_limits(model: Model, limits: FloatArray, state: FloatArray, whe
             name, unit = ("speed", " m/s") if column == SPEED else (model.state_names[components[0]], "")
             known = "limit" if bound == SPEED else model.limit_names[bound]
             raise ValueError(f"{where.format(name)}{size:g}{unit}, above its {known} of {limit:g}{unit}")
-
-
-def unwound_states(team: Team, states: FloatArray) -> FloatArray:
-    """``states`` ``(..., K, n)`` with all angles within :data:`MAX_ANGLE`; a copy if any was not."""
-    angles = np.zeros(states.shape[-2:], np.bool_)
-    for robot, model in enumerate(team.robot_models):
-        angles[robot, list(model.angles)] = True
-    wound = angles & (np.abs(states) > MAX_ANGLE)
-    if not wound.any():
-        return states
-    values, within = states[wound].astype(np.float64), states.copy()
-    while (np.abs(values) > MAX_ANGLE).any():
-        values = unwound(values, NUMPY_OPS)
-    within[wound] = values
-    return within
 
 
 def check_resolution(team: Team, positions: FloatArray, dt: float, goal_radius: float) -> None:

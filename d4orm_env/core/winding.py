@@ -8,9 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from d4orm_env.core.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from d4orm_env.core.team import Team
 
 MOST_TURNS = 8
 """More than a robot makes in a plan of usual length, and few enough that float32 resolves the angle well."""
@@ -30,6 +35,21 @@ def unwound(angle: Numbers, ops: Any) -> Numbers:
     """``angle`` within :data:`MAX_ANGLE`, if it is within twice that [rad]."""
     back = ops.where(angle < -MAX_ANGLE, (angle + _HIGH) + _LOW, angle)
     return ops.where(angle > MAX_ANGLE, (angle - _HIGH) - _LOW, back)
+
+
+def unwound_states(team: Team, states: FloatArray) -> FloatArray:
+    """``states`` ``(..., K, n)`` with all angles within :data:`MAX_ANGLE`; a copy if any was not."""
+    angles = np.zeros(states.shape[-2:], np.bool_)
+    for robot, model in enumerate(team.robot_models):
+        angles[robot, list(model.angles)] = True
+    wound = angles & (np.abs(states) > MAX_ANGLE)
+    if not wound.any():
+        return states
+    values, within = states[wound].astype(np.float64), states.copy()
+    while (np.abs(values) > MAX_ANGLE).any():
+        values = unwound(values, np)
+    within[wound] = values
+    return within
 
 
 def unwinding(limit_state: Callable[..., Numbers], index: int) -> Callable[..., Numbers]:

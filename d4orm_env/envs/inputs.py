@@ -19,7 +19,8 @@ from d4orm_env.core.arrays import (
     whole_number,
 )
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_checks import MAX_HEADING, check_states, unwound_states
+from d4orm_env.core.problem_checks import MAX_HEADING, check_states
+from d4orm_env.core.winding import unwound_states
 from d4orm_env.disturbances.disturbance import check_components, per_component
 
 MAX_CYCLES = 10**9

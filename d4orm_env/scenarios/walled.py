@@ -23,7 +23,7 @@ from d4orm_env.scenarios.settings import (
     grid_size,
     require_plane,
     require_space,
-)  # fmt: skip
+)
 from d4orm_env.scenarios.well_formed import lattice_step, populate, safety_distance_of
 
 DOOR_DEPTH = 0.2
