@@ -21,12 +21,13 @@ from d4orm_env.scenarios.settings import OBSTACLES, STARTS_AND_GOALS, Settings, 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 SINGLE_RADIUS = 0.5
-"""Radius of a single obstacle [m]."""
+"""Radius of a single obstacle of :func:`paper_obstacles` [m]."""
 SIDE, NEAREST, FURTHEST = 10.0, 5.0, 6.0
-"""Side of the random square, and least and largest distance of a start from its goal [m]."""
+"""Side of the square of :func:`paper_random`, and least and largest distance of a start from its goal [m]."""
 SPACING = 6
-"""Least distance of two random starts, in robots' radii."""
+"""Least distance of two of its starts, in robots' radii."""
 RESTARTS, CANDIDATES = 20, 1000
+"""How often all of its starts are drawn, and points for each."""
 
 
 def circle(settings: Settings, *, diameter: float = 5.0) -> Problem:
