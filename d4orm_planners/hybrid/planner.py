@@ -13,15 +13,13 @@ from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.settings import Positive, one_of
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.d4orm_d.planner import D4ormD, straight_if_sparse
+from d4orm_planners.d4orm_d.planner import D4ormD, D4ormDConfig, straight_if_sparse
 from d4orm_planners.d4orm_d.planner import State as DecouplingState
 from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
-from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.hybrid.rerouting import reroute
-from d4orm_planners.manoeuvres.planning import find_manoeuvres, improve_manoeuvres
 from d4orm_planners.manoeuvres.robots import can_plan
-from d4orm_planners.manoeuvres.team import TeamMotions
-from d4orm_planners.mapf.beams import prepare_beams
+from d4orm_planners.manoeuvres.team import TeamMotions, find_manoeuvres, improve_manoeuvres
+from d4orm_planners.mapf.beam_search import prepare_beams
 from d4orm_planners.mapf.motion_lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (
     MAPFConfig,
@@ -144,7 +142,7 @@ class Hybrid(Planner):
         """Search for paths around others for robots that fail, and deform those that fail nevertheless."""
         if self.config.reroute:
             reroute(team)
-        state = state.repair(team, self.config)
+        state = state.repair(team)
         self.improve_first(team)
         return state
 

@@ -1,5 +1,5 @@
-"""Queries of a beam search, and the paths that it has found so far, compiled with numba: those in the beam, and all
-that ever were.
+"""Queries of a beam search, whom their paths meet, and the paths found so far: those in the beam, and all that ever
+were. Compiled with numba.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
+from d4orm_planners.engine.path_table import PathTable, count_near, steps_of
 
 
 class BeamRules(NamedTuple):
@@ -108,7 +109,7 @@ class BeamSpace(NamedTuple):
             whom they meet there.
         ever: All ever kept.
         did: ``(B,)`` the moves of the path found, the last first.
-        lanes: Workspace of :mod:`~d4orm_planners.mapf.block_drives`.
+        lanes: Workspace of :mod:`~d4orm_planners.mapf.motion_primitives`.
     """
 
     beam: Beam
@@ -190,3 +191,45 @@ def trace_back(ever: PathTree, number: Whole, move: Whole, did: IntArray) -> int
     while number >= 0:
         did[length], number, length = ever.moves[number], ever.before[number], length + 1
     return length
+
+
+@compiled
+def _count_extra(
+    table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, first: Whole, last: Whole
+) -> int:
+    """Count the extra paths that a path meets from one step to another; at its end it is at rest."""
+    count, end = 0, path.shape[0] - 1
+    for other in range(others.extra.shape[1]):
+        safety_distance = table.radius[robot] + others.radius[r, other] + table.margin
+        for t in range(first, last):
+            gap2 = 0.0
+            for axis in range(path.shape[1]):
+                position = np.float64(path[min(t - first, end), axis])
+                gap = position - np.float64(others.extra[r, other, t, axis])
+                gap2 += gap * gap
+            if gap2 <= safety_distance * safety_distance:
+                count += 1
+                break
+    return count
+
+
+@compiled
+def count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
+    """Count the robots that a path meets in a block."""
+    robot, (first, last) = queries.robots[r], steps_of(table, block)
+    count = count_near(table, robot, queries.others.exclude[r], path, first, block)
+    return count + _count_extra(table, robot, queries.others, r, path, first, last)
+
+
+@compiled
+def count_passing(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
+    """Count the robots that come by after a block that ended at the goal, where this one stays; ``path`` is changed."""
+    robot, others, (first, last) = queries.robots[r], queries.others, steps_of(table, block)
+    for row in range(path.shape[0]):
+        for axis in range(path.shape[1]):
+            path[row, axis] = path[last - first - 1, axis]
+    # In the block after the last in which anybody moves all are where they stay.
+    count, last_busy = 0, min(table.first.shape[0] - 1, table.moving[0] + 1)
+    for later in range(block + 1, last_busy + 1):
+        count += count_near(table, robot, others.exclude[r], path, steps_of(table, later)[0], later)
+    return count + _count_extra(table, robot, others, r, path, last, len(table.positions))

@@ -16,7 +16,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
 from d4orm_planners.mapf.beam import BeamRules, OtherAgents
-from d4orm_planners.mapf.beams import find_paths, prepare_beams
+from d4orm_planners.mapf.beam_search import find_paths, prepare_beams
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.mapf.roundabout import drive_roundabout

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, IntArray
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MAX_HORIZON
 from d4orm_env.core.seeds import Stream
@@ -19,10 +19,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
 from d4orm_planners.mapf.roadmap import fill_costs, lay_roadmap
-from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves, is_compiled
-
-if TYPE_CHECKING:
-    from d4orm_planners.mapf.roadmap import Roadmap
+from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout, drive_moves, is_compiled
 
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
@@ -50,6 +47,10 @@ LEISURELY = 10
 NOT_IN_TIME = "no paths found on the roadmaps in time"
 STEPS = 3000
 """Steps of path finding for all at once after which the next roadmap is tried."""
+RELAY_FINENESS = 1.6
+"""Fineness of the roadmap of a team with ever new goals."""
+DWELL = 1.0
+"""Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
 
 
 @dataclass
@@ -111,12 +112,10 @@ class RoadmapSolution:
     """The state of the search.
 
     Attributes:
-        roadmap: Roadmap that paths are found on.
-        replanning: Search for better ones.
-        driven: Rollout of the team on them.
+        replanning: Search for better paths.
+        driven: Rollout of the team on those that there are.
     """
 
-    roadmap: Roadmap
     replanning: Replanning
     driven: TeamRollout
 
@@ -208,7 +207,7 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
             paths = LEAST_PATIENCE + int(patience * problem.num_robots)
             driven = replanning.one_by_one(random, search.should_stop, paths)
             if driven is not None:
-                return RoadmapSolution(roadmap, replanning, driven)
+                return RoadmapSolution(replanning, driven)
         elif number == 0 and (reason := NoPaths.unless_reachable(problem)) is not None:
             return reason
         if search.should_stop():
@@ -227,10 +226,55 @@ def find_all_at_once(search: SolveRun) -> RoadmapSolution | NoPaths:
         seed = search.iteration_seed(Stream.GUIDANCE, number + 1)
         found = find_moves(problem, roadmap, seed, search.should_stop, STEPS)
         if found is not None and (best is None or found.arrived.sum() > best[1].arrived.sum()):
-            best = RoadmapSolution(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
+            best = RoadmapSolution(replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
     return best[0] if best else NoPaths(NOT_IN_TIME)
+
+
+def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
+    """Plan paths for some robots of a team with ever new goals around all others on their present paths.
+
+    Others yield only where there is no other path.
+
+    Args:
+        problem: The team where it is now, and its goals.
+        paths: ``(T + 1, K, d)`` positions of the robots from now on [m]; those of ``changed`` are not read.
+        changed: ``(K,)`` robots whose paths are planned.
+        seed: Of the robots that may have to yield, and of how leisurely they drive.
+
+    Returns:
+        ``(H + 1, K, d)`` future positions of all robots [m]; ``None`` if no paths were found.
+    """
+    compile_path_finding(problem)
+    num_robots, d = problem.num_robots, problem.dimension
+    dwell = int(np.ceil(DWELL / problem.dt))
+    replanning = Replanning(problem, lay_roadmap(problem, RELAY_FINENESS), dwell)
+    if not np.isfinite(replanning.alone).all():
+        return None
+    result = paths[np.minimum(np.arange(problem.horizon + 1), len(paths) - 1)]
+    present = _driven(problem, result, dwell)
+    present.positions[:, changed] = FAR
+    before, random, robots = present.positions.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
+    order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
+    driven = replanning.settle(present, order, random, lambda: False, num_robots)
+    if driven is None:
+        return None
+    for robot in np.flatnonzero((driven.positions != before).any(axis=(0, 2))):
+        end = int(driven.arrivals[robot]) + 1
+        result[:end, robot], result[end:, robot] = driven.positions[:end, robot, :d], problem.goal[robot]
+    return result
+
+
+def _driven(problem: Problem, paths: FloatArray, dwell: int) -> TeamRollout:
+    """A team on its paths ``(H + 1, K, d)``, whose robots leave their goals again; its controls are not known."""
+    steps, num_robots, d = problem.horizon, problem.num_robots, problem.dimension
+    at_goal = np.linalg.norm(paths - problem.goal, axis=2) <= problem.goal_radius
+    arrivals = np.where(at_goal.any(axis=0), at_goal.argmax(axis=0), steps)
+    positions = np.zeros((steps + 1, num_robots, 3))
+    positions[:, :, :d] = paths
+    positions[np.arange(steps + 1)[:, None] > arrivals + dwell] = FAR
+    return TeamRollout(np.zeros((steps, num_robots, problem.control_size), np.float32), positions, arrivals)
 
 
 def compile_roadmap(problem: Problem) -> None:

@@ -10,12 +10,11 @@ from numba.extending import register_jitable
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.beam import sink
+from d4orm_planners.mapf.near_neighbours import squared_gap
 from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
 from d4orm_planners.mapf.safe_intervals import Intervals, Reservations, interval_at
-from d4orm_planners.mapf.straightening import first_meeting, meeting
-from d4orm_planners.mapf.trips import Trip, steps_to_turn
+from d4orm_planners.mapf.trips import Trip, first_meeting, meeting, steps_to_turn
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -174,7 +173,7 @@ def _is_way(roadmap: Roadmap, bodies: RobotArrays, k: Whole, node: Whole, e: Who
         return False
     aside = (bodies.goal_radius + bodies.slack / 2) ** 2
     docks = bodies.docks and head != goal
-    return not (docks and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside)
+    return not (docks and squared_gap(nodes, goal, nodes, node, nodes, head) < aside)
 
 
 @compiled

@@ -14,7 +14,6 @@ from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.lattice import lay_lattice
 from d4orm_env.paths.shortest_paths import in_space
 from d4orm_env.paths.spaces import Space, free_lines, make_space
-from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells, squared_gap
 
 PAIR_SLACK = 0.4
@@ -135,7 +134,7 @@ def measure_gaps(
     """Measure the distances of nodes from edges: ``gaps`` is output, all others as in :class:`Roadmap`."""
     for e in range(tails.shape[0]):
         for number in range(near_first[e], near_first[e + 1]):
-            gaps[number] = np.sqrt(near_neighbours.squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))
+            gaps[number] = np.sqrt(squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))
 
 
 ROUNDING = 2.0**-27
