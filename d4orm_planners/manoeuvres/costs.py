@@ -45,21 +45,13 @@ class Area(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """Steps to a goal.
+    """Steps to a goal."""
 
-    Attributes:
-        lattice: Cells.
-        steps: ``(cells,)``, infinite where they are not known: there they are at least
-        far: this, ...
-        pace: ... less so many for each metre from the start, ...
-        start: ... which is at ``(x, y)``.
-    """
-
-    lattice: PoseLattice
-    steps: FloatArray
-    far: float
-    pace: float
-    start: tuple[float, float]
+    lattice: PoseLattice  #: Cells
+    steps: FloatArray  #: ``(cells,)``, infinite where they are not known: there they are at least
+    far: float  #: this, ...
+    pace: float  #: ... less so many for each metre from the start, ...
+    start: tuple[float, float]  #: ... which is at ``(x, y)``
 
 
 def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal, team_size: int, bent: bool) -> Costs:
@@ -88,17 +80,11 @@ def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal,
 
 
 class Heap(NamedTuple):
-    """Numbers by their values, the least first.
+    """Numbers by their values, the least first."""
 
-    Attributes:
-        value: ``(N,)``.
-        item: ``(N,)``.
-        filled: ``(1,)`` how many there are.
-    """
-
-    value: Floats
-    item: IntArray
-    filled: IntArray
+    value: Floats  #: ``(N,)``
+    item: IntArray  #: ``(N,)``
+    filled: IntArray  #: ``(1,)`` how many there are
 
     @classmethod
     def of(cls, size: int) -> Heap:

@@ -28,23 +28,14 @@ def buffer_size(footprints: FootprintArrays) -> int:
 
 
 class RobotBody(NamedTuple):
-    """A robot's body among the obstacles.
+    """A robot's body among the obstacles."""
 
-    Attributes:
-        footprints: Of all robots.
-        arrays: The problem, without goal headings and footprints, so that all have one type.
-        robot: Its number.
-        extra: Distance that it keeps from everything [m].
-        stride: What the fastest robot drives in a step [m].
-        parts: Poses that are looked at in a step.
-    """
-
-    footprints: FootprintArrays
-    arrays: ProblemArrays
-    robot: int
-    extra: np.float32
-    stride: float
-    parts: int
+    footprints: FootprintArrays  #: Of all robots
+    arrays: ProblemArrays  #: The problem, without goal headings and footprints, so that all have one type
+    robot: int  #: Its number
+    extra: np.float32  #: Distance that it keeps from everything [m]
+    stride: float  #: What the fastest robot drives in a step [m]
+    parts: int  #: Poses that are looked at in a step
 
 
 Placed: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32]
@@ -52,23 +43,14 @@ Placed: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32]
 
 
 class PoseLattice(NamedTuple):
-    """Cells of positions and sectors of headings: poses in the same are taken for one.
+    """Cells of positions and sectors of headings: poses in the same are taken for one."""
 
-    Attributes:
-        low: ``(2,)`` lowest corner [m].
-        scale: One over the size of a cell [1/m].
-        size: ``(2,)`` cells along x and y.
-        heading: Middle of the first sector [rad].
-        sectors: Number of sectors; one for a robot without a heading.
-        modes: Number of modes.
-    """
-
-    low: Floats
-    scale: float
-    size: tuple[int, int]
-    heading: float
-    sectors: int
-    modes: int
+    low: Floats  #: ``(2,)`` lowest corner [m]
+    scale: float  #: One over the size of a cell [1/m]
+    size: tuple[int, int]  #: ``(2,)`` cells along x and y
+    heading: float  #: Middle of the first sector [rad]
+    sectors: int  #: Number of sectors; one for a robot without a heading
+    modes: int  #: Number of modes
 
 
 @compiled

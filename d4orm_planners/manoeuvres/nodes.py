@@ -32,43 +32,24 @@ AHEAD, BEHIND = -2, -3
 
 
 class Nodes(NamedTuple):
-    """Nodes of a search, ``N`` at most, and where to find those of a cell.
+    """Nodes of a search, ``N`` at most, and where to find those of a cell."""
 
-    Attributes:
-        pose: ``(N, 6)``.
-        mode: ``(N,)``, -1 for a node at which the robot stays at its goal.
-        time: ``(N,)`` step of arrival.
-        until: ``(N,)`` first step at which it must have gone.
-        parent: ``(N,)``, -1 for the first.
-        move: ``(N,)`` primitive, or one of :data:`AHEAD` and :data:`BEHIND`, ...
-        depart: ``(N,)`` ... and the step at which it begins.
-        next: ``(N,)`` another one of the same cell, -1 for none.
-        filled: ``(1,)`` number of nodes.
-        soonest: ``(1,)`` step from which on the robot can stay at its goal.
-        cells: ``(C,)`` numbers of cells, hashed.
-        heads: ``(C,)`` first node of each.
-        marks: ``(C,)`` number of the search that wrote each slot.
-        heap: Nodes to be followed.
-        swept: ``(., 7)`` poses and speeds on a move, from where it begins.
-        buffer: See :func:`~d4orm_planners.manoeuvres.lattice.buffer_size`.
-    """
-
-    pose: Floats
-    mode: IntArray
-    time: IntArray
-    until: IntArray
-    parent: IntArray
-    move: IntArray
-    depart: IntArray
-    next: IntArray
-    filled: IntArray
-    soonest: IntArray
-    cells: IntArray
-    heads: IntArray
-    marks: IntArray
-    heap: Heap
-    swept: Floats
-    buffer: FloatArray
+    pose: Floats  #: ``(N, 6)``
+    mode: IntArray  #: ``(N,)``, -1 for a node at which the robot stays at its goal
+    time: IntArray  #: ``(N,)`` step of arrival
+    until: IntArray  #: ``(N,)`` first step at which it must have gone
+    parent: IntArray  #: ``(N,)``, -1 for the first
+    move: IntArray  #: ``(N,)`` primitive, or one of :data:`AHEAD` and :data:`BEHIND`, ...
+    depart: IntArray  #: ``(N,)`` ... and the step at which it begins
+    next: IntArray  #: ``(N,)`` another one of the same cell, -1 for none
+    filled: IntArray  #: ``(1,)`` number of nodes
+    soonest: IntArray  #: ``(1,)`` step from which on the robot can stay at its goal
+    cells: IntArray  #: ``(C,)`` numbers of cells, hashed
+    heads: IntArray  #: ``(C,)`` first node of each
+    marks: IntArray  #: ``(C,)`` number of the search that wrote each slot
+    heap: Heap  #: Nodes to be followed
+    swept: Floats  #: ``(., 7)`` poses and speeds on a move, from where it begins
+    buffer: FloatArray  #: See :func:`~d4orm_planners.manoeuvres.lattice.buffer_size`
 
     @classmethod
     def of(cls, size: int, buffer: int) -> Nodes:
@@ -86,33 +67,19 @@ class Nodes(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Query of a search.
+    """Query of a search."""
 
-    Attributes:
-        body: The robot.
-        primitives: What it can do.
-        limits: For the last stretch, ...
-        curves: ... and those of a first-order car.
-        goal: Where to.
-        lattice: Cells and sectors.
-        costs: Steps to the goal; none in a world without obstacles.
-        weight: Times that these count more than the steps behind.
-        departure_interval: Steps between departures that are tried.
-        horizon: Last step.
-        number: Of the search, different in each that writes to the same nodes.
-    """
-
-    body: RobotBody
-    primitives: Primitives
-    limits: Limits
-    curves: Curves
-    goal: Goal
-    lattice: PoseLattice
-    costs: Costs
-    weight: float
-    departure_interval: int
-    horizon: int
-    number: int
+    body: RobotBody  #: The robot
+    primitives: Primitives  #: What it can do
+    limits: Limits  #: For the last stretch, ...
+    curves: Curves  #: ... and those of a first-order car
+    goal: Goal  #: Where to
+    lattice: PoseLattice  #: Cells and sectors
+    costs: Costs  #: Steps to the goal; none in a world without obstacles
+    weight: float  #: Times that these count more than the steps behind
+    departure_interval: int  #: Steps between departures that are tried
+    horizon: int  #: Last step
+    number: int  #: Of the search, different in each that writes to the same nodes
 
 
 @compiled

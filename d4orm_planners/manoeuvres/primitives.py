@@ -39,26 +39,16 @@ class Primitives(NamedTuple):
 
     A *mode* is what of the state is neither position nor heading: speeds, steering and hitch angles. ``S`` is the sum
     of all steps.
-
-    Attributes:
-        begin: ``(M + 1,)`` where those of each mode begin.
-        mode: ``(P,)`` mode that each ends in.
-        first: ``(P + 1,)`` where its steps begin.
-        poses: ``(S, 6)`` position, heading and hitch angles after each step, from where it began.
-        speed: ``(S,)`` [m/s] after each step.
-        rests: ``(M,)`` whether the robot stands in a mode, so that it can wait.
-        reach: ``(P,)`` how far from where it began each leads [m].
-        controls: ``(S, m)``.
     """
 
-    begin: IntArray
-    mode: IntArray
-    first: IntArray
-    poses: Floats
-    speed: Floats
-    rests: BoolArray
-    reach: Floats
-    controls: FloatArray
+    begin: IntArray  #: ``(M + 1,)`` where those of each mode begin
+    mode: IntArray  #: ``(P,)`` mode that each ends in
+    first: IntArray  #: ``(P + 1,)`` where its steps begin
+    poses: Floats  #: ``(S, 6)`` position, heading and hitch angles after each step, from where it began
+    speed: Floats  #: ``(S,)`` [m/s] after each step
+    rests: BoolArray  #: ``(M,)`` whether the robot stands in a mode, so that it can wait
+    reach: Floats  #: ``(P,)`` how far from where it began each leads [m]
+    controls: FloatArray  #: ``(S, m)``
 
 
 @cache

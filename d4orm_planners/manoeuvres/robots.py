@@ -42,21 +42,14 @@ largest one."""
 
 
 class ManoeuvreScene(NamedTuple):
-    """Data that all robots of a team share.
+    """Data that all robots of a team share."""
 
-    Attributes:
-        problem: The problem.
-        area: The part of the plane that robots may use.
-        arrays: The problem's arrays, of one type for all problems, with an index of all obstacles within reach.
-        extra: Distance kept from everything [m].
-        bent: ``(K,)`` whether trailers have to be in a bend at the robot's goal.
-    """
-
-    problem: Problem
-    area: Area
+    problem: Problem  #: The problem
+    area: Area  #: The part of the plane that robots may use
+    #: The problem's arrays, of one type for all problems, with an index of all obstacles within reach
     arrays: ProblemArrays
-    extra: float
-    bent: BoolArray
+    extra: float  #: Distance kept from everything [m]
+    bent: BoolArray  #: ``(K,)`` whether trailers have to be in a bend at the robot's goal
 
     @property
     def interaction_range(self) -> float:
@@ -172,19 +165,12 @@ def _room(problem: Problem, states: FloatArray, enough: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot, as the search reads it.
+    """A robot, as the search reads it."""
 
-    Attributes:
-        model: Its model.
-        start: ``(6,)`` pose.
-        mode: That it starts in.
-        task: What a search for its motion is told.
-    """
-
-    model: Model
-    start: Floats
-    mode: int
-    task: Task
+    model: Model  #: Its model
+    start: Floats  #: ``(6,)`` pose
+    mode: int  #: That it starts in
+    task: Task  #: What a search for its motion is told
 
 
 def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:

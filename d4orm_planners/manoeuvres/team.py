@@ -44,15 +44,10 @@ BETTER_ROUNDS = 16
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A robot's motion.
+    """A robot's motion."""
 
-    Attributes:
-        poses: ``(T + 1, 6)`` float32.
-        controls: ``(T, m)``.
-    """
-
-    poses: FloatArray
-    controls: FloatArray
+    poses: FloatArray  #: ``(T + 1, 6)`` float32
+    controls: FloatArray  #: ``(T, m)``
 
     @property
     def steps(self) -> int:

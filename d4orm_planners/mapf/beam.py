@@ -14,112 +14,66 @@ from d4orm_planners.engine.path_table import PathTable, count_near, steps_of
 
 
 class BeamRules(NamedTuple):
-    """Rules by which the beam keeps paths.
+    """Rules by which the beam keeps paths."""
 
-    Attributes:
-        width: Number of paths.
-        contact: Cost of being near another robot in a block [s].
-        dedup_distance: Least distance between two, or else twice as much in speed [m, m/s].
-    """
-
-    width: int
-    contact: float
-    dedup_distance: float
+    width: int  #: Number of paths
+    contact: float  #: Cost of being near another robot in a block [s]
+    dedup_distance: float  #: Least distance between two, or else twice as much in speed [m, m/s]
 
 
 class OtherAgents(NamedTuple):
-    """Agents that robots which look for a path avoid, other than the team as it drives at present.
+    """Agents that robots which look for a path avoid, other than the team as it drives at present."""
 
-    Attributes:
-        exclude: ``(R, N)`` numbers of robots that each does not mind, its own among them.
-        extra: ``(R, M, H+1, d)`` paths that it minds as well [m].
-        radius: ``(R, M)`` radii of the agents on them [m].
-    """
-
-    exclude: IntArray
-    extra: FloatArray
-    radius: Floats
+    exclude: IntArray  #: ``(R, N)`` numbers of robots that each does not mind, its own among them
+    extra: FloatArray  #: ``(R, M, H+1, d)`` paths that it minds as well [m]
+    radius: Floats  #: ``(R, M)`` radii of the agents on them [m]
 
 
 class Queries(NamedTuple):
-    """Robots that look for paths.
+    """Robots that look for paths."""
 
-    Attributes:
-        robots: ``(R,)`` their numbers in the team.
-        blocks: ``(R,)`` the block at whose beginning their new paths begin,
-        states: ``(R, n)`` and in which state.
-        limits: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost.
-        others: Agents that they mind, or do not mind.
-    """
-
-    robots: IntArray
-    blocks: IntArray
-    states: FloatArray
+    robots: IntArray  #: ``(R,)`` their numbers in the team
+    blocks: IntArray  #: ``(R,)`` the block at whose beginning their new paths begin,
+    states: FloatArray  #: ``(R, n)`` and in which state
+    #: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost
     limits: Floats
-    others: OtherAgents
+    others: OtherAgents  #: Agents that they mind, or do not mind
 
 
 class Beam(NamedTuple):
-    """Up to ``N`` paths as far as they have come.
+    """Up to ``N`` paths as far as they have come."""
 
-    Attributes:
-        states: ``(N, n)``.
-        velocities: ``(N, d)``.
-        faults: ``(N,)`` robots met, block by block.
-        costs: ``(N,)`` what they cost at least, as it seems, but for that [s].
-        bounds: ``(N,)`` what they cost at least, robots met so far included [s].
-        before: ``(N,)`` number of the path that each goes on from: in the beam before, or ever.
-        moves: ``(N,)`` what was done in the last block.
-        paths: ``(N, BLOCK, d)`` positions in it [m].
-    """
-
-    states: FloatArray
-    velocities: FloatArray
-    faults: Floats
-    costs: Floats
-    bounds: Floats
-    before: IntArray
-    moves: IntArray
-    paths: FloatArray
+    states: FloatArray  #: ``(N, n)``
+    velocities: FloatArray  #: ``(N, d)``
+    faults: Floats  #: ``(N,)`` robots met, block by block
+    costs: Floats  #: ``(N,)`` what they cost at least, as it seems, but for that [s]
+    bounds: Floats  #: ``(N,)`` what they cost at least, robots met so far included [s]
+    before: IntArray  #: ``(N,)`` number of the path that each goes on from: in the beam before, or ever
+    moves: IntArray  #: ``(N,)`` what was done in the last block
+    paths: FloatArray  #: ``(N, BLOCK, d)`` positions in it [m]
 
 
 class PathTree(NamedTuple):
-    """All paths ever kept.
+    """All paths ever kept."""
 
-    Attributes:
-        before: ``(N,)`` what each goes on from ...
-        moves: ``(N,)`` ... and by what.
-        used: ``(1,)`` how many there are.
-    """
-
-    before: IntArray
-    moves: IntArray
-    used: IntArray
+    before: IntArray  #: ``(N,)`` what each goes on from ...
+    moves: IntArray  #: ``(N,)`` ... and by what
+    used: IntArray  #: ``(1,)`` how many there are
 
 
 class BeamSpace(NamedTuple):
-    """Workspace of a search.
+    """Workspace of a search."""
 
-    Attributes:
-        beam: The paths kept after the last block.
-        numbers: ``(width,)`` their numbers among all ever kept.
-        new: Those that go on from there, and room for one more.
-        heap: ``(N,)`` numbers of these that may still be kept, the most promising first.
-        counted: ``(N, 2)`` bool, those of which it is known what they do wrong by themselves in the last block, and
-            whom they meet there.
-        ever: All ever kept.
-        did: ``(B,)`` the moves of the path found, the last first.
-        lanes: Workspace of :mod:`~d4orm_planners.mapf.motion_primitives`.
-    """
-
-    beam: Beam
-    numbers: IntArray
-    new: Beam
-    heap: IntArray
+    beam: Beam  #: The paths kept after the last block
+    numbers: IntArray  #: ``(width,)`` their numbers among all ever kept
+    new: Beam  #: Those that go on from there, and room for one more
+    heap: IntArray  #: ``(N,)`` numbers of these that may still be kept, the most promising first
+    #: ``(N, 2)`` bool, those of which it is known what they do wrong by themselves in the last block, and whom they
+    #: meet there
     counted: BoolArray
-    ever: PathTree
-    did: IntArray
-    lanes: FloatArray
+    ever: PathTree  #: All ever kept
+    did: IntArray  #: ``(B,)`` the moves of the path found, the last first
+    lanes: FloatArray  #: Workspace of :mod:`~d4orm_planners.mapf.motion_primitives`
 
 
 def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:

@@ -18,21 +18,13 @@ S_co = TypeVar("S_co", covariant=True)
 
 
 class Odds(NamedTuple):
-    """Chances of robots to be drawn for a neighbourhood.
+    """Chances of robots to be drawn for a neighbourhood."""
 
-    Attributes:
-        delay: ``(K,)`` chance of each to be the late one, in any unit.
-        positions: ``(T + 1, K, d)`` [m].
-        until: ``(K,)`` the last step of each at which it may come near to others.
-        nearness: Random distance by which a robot may be farther away and still be chosen [m].
-        sizes: The least and the greatest number of robots.
-    """
-
-    delay: Floats
-    positions: FloatArray | Floats
-    until: IntArray
-    nearness: float
-    sizes: tuple[int, int]
+    delay: Floats  #: ``(K,)`` chance of each to be the late one, in any unit
+    positions: FloatArray | Floats  #: ``(T + 1, K, d)`` [m]
+    until: IntArray  #: ``(K,)`` the last step of each at which it may come near to others
+    nearness: float  #: Random distance by which a robot may be farther away and still be chosen [m]
+    sizes: tuple[int, int]  #: The least and the greatest number of robots
 
     def draw(self, random: np.random.Generator) -> IntArray:
         """A robot that is late, and some that it comes near to, in random order."""

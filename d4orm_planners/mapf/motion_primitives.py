@@ -32,33 +32,23 @@ _FAR = np.float32(10)
 
 
 class Moves(NamedTuple):
-    """The ``P`` moves of a robot in a block.
+    """The ``P`` moves of a robot in a block."""
 
-    Attributes:
-        turns: ``(P, 3)`` directions, along that to the goal and two across.
-        homewards: ``(P,)`` whether it heads for the goal, or so many goal radii from there in the direction.
-        pace: ``(P,)`` share of the speed that it would have.
-    """
-
-    turns: FloatArray
-    homewards: BoolArray
-    pace: FloatArray
+    turns: FloatArray  #: ``(P, 3)`` directions, along that to the goal and two across
+    homewards: BoolArray  #: ``(P,)`` whether it heads for the goal, or so many goal radii from there in the direction
+    pace: FloatArray  #: ``(P,)`` share of the speed that it would have
 
 
 @dataclass(frozen=True)
 class MotionPrimitives:
-    """Moves of robots that look for a path.
+    """Moves of robots that look for a path."""
 
-    Attributes:
-        angles: By which a robot turns off from the path to its goal [degrees]; in space up and down as well.
-        paces: Shares of its speed with which it heads for its goal: waiting has no direction.
-        beside: Goal radii beside its goal to which it may head too: one that docks there keeps clear of a neighbour.
-        on_the_spot: The share with which one that has a heading turns, to its goal or to one side, as if it stood.
-    """
-
+    #: By which a robot turns off from the path to its goal [degrees]; in space up and down as well
     angles: tuple[float, ...]
-    paces: tuple[float, ...]
+    paces: tuple[float, ...]  #: Shares of its speed with which it heads for its goal: waiting has no direction
+    #: Goal radii beside its goal to which it may head too: one that docks there keeps clear of a neighbour
     beside: float = 0.8
+    #: The share with which one that has a heading turns, to its goal or to one side, as if it stood
     on_the_spot: float = 0.001
 
     def moves(self, dimension: int, *, has_heading: bool) -> Moves:

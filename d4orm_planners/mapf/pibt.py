@@ -29,29 +29,17 @@ robot."""
 
 
 class PibtWorkspace(NamedTuple):
-    """Workspace of a step.
+    """Workspace of a step."""
 
-    Attributes:
-        state: ``(K,)`` int8.
-        may_dock: ``(K,)`` bool: may come to its goal.
-        who: ``(N,)`` int32 the robot at each node; -1 for none.
-        robots: ``(K,)`` int64 those that others yield to, the first one first.
-        edges: ``(K,)`` int64 by which each wants to go.
-        tried: ``(K,)`` int64 how many edges each has tried.
-        options: ``(K, D)`` int64 the edges that each tries in turn.
-        worth: ``(D,)`` float64 how good they are.
-        moves: ``(K, 2)`` int64 robot and edge of each move, in their order.
-    """
-
-    state: NDArray[np.int8]
-    may_dock: BoolArray
-    who: Ints
-    robots: IntArray
-    edges: IntArray
-    tried: IntArray
-    options: IntArray
-    worth: Floats
-    moves: IntArray
+    state: NDArray[np.int8]  #: ``(K,)`` int8
+    may_dock: BoolArray  #: ``(K,)`` bool: may come to its goal
+    who: Ints  #: ``(N,)`` int32 the robot at each node; -1 for none
+    robots: IntArray  #: ``(K,)`` int64 those that others yield to, the first one first
+    edges: IntArray  #: ``(K,)`` int64 by which each wants to go
+    tried: IntArray  #: ``(K,)`` int64 how many edges each has tried
+    options: IntArray  #: ``(K, D)`` int64 the edges that each tries in turn
+    worth: Floats  #: ``(D,)`` float64 how good they are
+    moves: IntArray  #: ``(K, 2)`` int64 robot and edge of each move, in their order
 
 
 @compiled

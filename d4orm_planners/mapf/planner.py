@@ -55,19 +55,12 @@ DWELL = 1.0
 
 @dataclass
 class RoadmapPaths:
-    """Low-level planner of :func:`~d4orm_planners.mapf.lns.search_neighbourhoods`: paths in space and time.
+    """Low-level planner of :func:`~d4orm_planners.mapf.lns.search_neighbourhoods`: paths in space and time."""
 
-    Attributes:
-        replanning: Search for paths.
-        solution: Rollout of the team.
-        most: Robots that are replanned together, at most.
-        should_stop: Asked before every path.
-    """
-
-    replanning: Replanning
-    solution: TeamRollout
-    most: int
-    should_stop: Callable[[], bool]
+    replanning: Replanning  #: Search for paths
+    solution: TeamRollout  #: Rollout of the team
+    most: int  #: Robots that are replanned together, at most
+    should_stop: Callable[[], bool]  #: Asked before every path
     groups: int = 1
 
     @property
@@ -109,28 +102,18 @@ class MAPFConfig(PlannerConfig):
 
 @dataclass(frozen=True, eq=False)
 class RoadmapSolution:
-    """The state of the search.
+    """The state of the search."""
 
-    Attributes:
-        replanning: Search for better paths.
-        driven: Rollout of the team on those that there are.
-    """
-
-    replanning: Replanning
-    driven: TeamRollout
+    replanning: Replanning  #: Search for better paths
+    driven: TeamRollout  #: Rollout of the team on those that there are
 
 
 @dataclass(frozen=True)
 class NoPaths:
-    """The state of the search when no paths were found.
+    """The state of the search when no paths were found."""
 
-    Attributes:
-        why: For the record of the iterations.
-        unreachable: Robots that have no path to their goals, if that is why.
-    """
-
-    why: str
-    unreachable: tuple[int, ...] = ()
+    why: str  #: For the record of the iterations
+    unreachable: tuple[int, ...] = ()  #: Robots that have no path to their goals, if that is why
 
     @classmethod
     def unless_reachable(cls, problem: Problem) -> NoPaths | None:

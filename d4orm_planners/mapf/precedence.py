@@ -71,23 +71,14 @@ def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
 
 
 class RouteBends(NamedTuple):
-    """Corners of paths, without the angles themselves, whose functions differ from one processor to the next.
+    """Corners of paths, without the angles themselves, whose functions differ from one processor to the next."""
 
-    Attributes:
-        corners: ``(C, 3)`` where they are [m].
-        before: ``(C, 3)`` unit vectors that lead to each.
-        after: ``(C, 3)`` unit vectors that lead on from each.
-        straight: ``(C,)`` half of the shorter of the paths to the corners next to each [m].
-        cosine: ``(C,)`` of half the angle by which the path turns.
-        sine: ``(C,)``.
-    """
-
-    corners: Floats
-    before: Floats
-    after: Floats
-    straight: Floats
-    cosine: Floats
-    sine: Floats
+    corners: Floats  #: ``(C, 3)`` where they are [m]
+    before: Floats  #: ``(C, 3)`` unit vectors that lead to each
+    after: Floats  #: ``(C, 3)`` unit vectors that lead on from each
+    straight: Floats  #: ``(C,)`` half of the shorter of the paths to the corners next to each [m]
+    cosine: Floats  #: ``(C,)`` of half the angle by which the path turns
+    sine: Floats  #: ``(C,)``
 
 
 def _bends_at(corners: Floats, inner: IntArray) -> RouteBends:

@@ -32,33 +32,21 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
 
 
 class _Tree(NamedTuple):
-    """Entries of a search so far, with room for more.
+    """Entries of a search so far, with room for more."""
 
-    Attributes:
-        entries: ``(N, 5)`` int64 nodes, departures for them, arrivals, entries that they were come to from, intervals.
-        costs: ``(N,)`` steps from the start through each to the goal, at least.
-        heap: ``(N,)`` int64 numbers of those that nothing has been tried from, the soonest at the goal first.
-        sizes: ``(2,)`` int64 how many there are of both.
-    """
-
+    #: ``(N, 5)`` int64 nodes, departures for them, arrivals, entries that they were come to from, intervals
     entries: IntArray
-    costs: Floats
-    heap: IntArray
-    sizes: IntArray
+    costs: Floats  #: ``(N,)`` steps from the start through each to the goal, at least
+    heap: IntArray  #: ``(N,)`` int64 numbers of those that nothing has been tried from, the soonest at the goal first
+    sizes: IntArray  #: ``(2,)`` int64 how many there are of both
 
 
 class _Search(NamedTuple):
-    """The search for one robot's path.
+    """The search for one robot's path."""
 
-    Attributes:
-        reservations: All others.
-        came: Entry of the tree that comes first to each safe interval; -1 for none.
-        soonest: No step before it can be that at which the robot comes to its goal for good.
-    """
-
-    reservations: Reservations
-    came: Ints
-    soonest: Whole
+    reservations: Reservations  #: All others
+    came: Ints  #: Entry of the tree that comes first to each safe interval; -1 for none
+    soonest: Whole  #: No step before it can be that at which the robot comes to its goal for good
 
 
 @compiled

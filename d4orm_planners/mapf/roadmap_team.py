@@ -56,17 +56,11 @@ Drive: TypeAlias = tuple[FloatArray, Floats, int]
 
 @dataclass(frozen=True, eq=False)
 class TeamRollout:
-    """Rollout of a team.
+    """Rollout of a team."""
 
-    Attributes:
-        controls: ``(T, K, m)`` float32.
-        positions: ``(T + 1, K, 3)`` float64 [m].
-        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for one that has not arrived.
-    """
-
-    controls: FloatArray
-    positions: Floats
-    arrivals: IntArray
+    controls: FloatArray  #: ``(T, K, m)`` float32
+    positions: Floats  #: ``(T + 1, K, 3)`` float64 [m]
+    arrivals: IntArray  #: ``(K,)`` int64 step of arrival; ``T + 1`` or more for one that has not arrived
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> TeamRollout:

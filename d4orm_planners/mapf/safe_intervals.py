@@ -15,17 +15,11 @@ from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
 
 
 class Intervals(NamedTuple):
-    """Intervals in which no robot is near a node, for each node.
+    """Intervals in which no robot is near a node, for each node."""
 
-    Attributes:
-        first: ``(N + 1,)`` int64 where the intervals of each node begin.
-        begins: ``(I,)`` int64 their first steps, ascending per node ...
-        ends: ... and the steps after their last.
-    """
-
-    first: IntArray
-    begins: IntArray
-    ends: IntArray
+    first: IntArray  #: ``(N + 1,)`` int64 where the intervals of each node begin
+    begins: IntArray  #: ``(I,)`` int64 their first steps, ascending per node ...
+    ends: IntArray  #: ... and the steps after their last
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -95,19 +89,12 @@ def interval_at(safe: Intervals, n: Whole, step: Whole) -> Whole:
 
 
 class Reservations(NamedTuple):
-    """Reservations of all other robots, as searches for one robot's path read them.
+    """Reservations of all other robots, as searches for one robot's path read them."""
 
-    Attributes:
-        others: Their motions.
-        buckets: The same by where edges near to them have their middles.
-        safe: The safe intervals.
-        dock: Step until which the robot must not come to its goal for good; -1 for none.
-    """
-
-    others: Others
-    buckets: Buckets
-    safe: Intervals
-    dock: Whole
+    others: Others  #: Their motions
+    buckets: Buckets  #: The same by where edges near to them have their middles
+    safe: Intervals  #: The safe intervals
+    dock: Whole  #: Step until which the robot must not come to its goal for good; -1 for none
 
 
 @cached_kernel(variant="reservations", **OPTIONS)

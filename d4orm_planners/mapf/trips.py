@@ -21,23 +21,14 @@ from d4orm_planners.tracking.pursuit import FACING
 
 
 class Trip(NamedTuple):
-    """Motion that a robot is taken to make when its path is planned.
+    """Motion that a robot is taken to make when its path is planned."""
 
-    Attributes:
-        stride: Distance that it drives in a step [m].
-        launch: Steps that it loses whenever it sets out.
-        latest: Step by which it must have arrived.
-        dwell: Steps for which it stays at its goal; negative for ever.
-        turn: Steps in which it turns by a radian on the spot; zero where turns do not count.
-        facing: Unit vector along its heading at the start.
-    """
-
-    stride: float
-    launch: Whole
-    latest: int
-    dwell: Whole
-    turn: float = 0.0
-    facing: tuple[float, float] = (1.0, 0.0)
+    stride: float  #: Distance that it drives in a step [m]
+    launch: Whole  #: Steps that it loses whenever it sets out
+    latest: int  #: Step by which it must have arrived
+    dwell: Whole  #: Steps for which it stays at its goal; negative for ever
+    turn: float = 0.0  #: Steps in which it turns by a radian on the spot; zero where turns do not count
+    facing: tuple[float, float] = (1.0, 0.0)  #: Unit vector along its heading at the start
 
 
 TURNED_IN_DRIVING = float(np.sqrt(2.0 - 2.0 * float(FACING)))
