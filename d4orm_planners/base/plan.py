@@ -20,7 +20,7 @@ from d4orm_env.core.trajectory import Trajectory, mean_stretch
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.candidate import step_faults
 from d4orm_planners.base.display import DisplayMixin
-from d4orm_planners.base.machine import Provenance
+from d4orm_planners.base.provenance import Provenance
 
 if TYPE_CHECKING:
     from d4orm_env.scenarios import dynobench

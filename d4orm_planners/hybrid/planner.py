@@ -20,7 +20,7 @@ from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.manoeuvres.robots import can_plan
 from d4orm_planners.manoeuvres.team import TeamMotions, find_manoeuvres, improve_manoeuvres
 from d4orm_planners.mapf.beam_search import prepare_beams
-from d4orm_planners.mapf.motion_lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
+from d4orm_planners.mapf.lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (
     MAPFConfig,
     RoadmapSolution,

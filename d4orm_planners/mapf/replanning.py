@@ -12,9 +12,16 @@ from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_planners.mapf.beam import sink
 from d4orm_planners.mapf.near_neighbours import squared_gap
+from d4orm_planners.mapf.reservations import (
+    Intervals,
+    Reservations,
+    Trip,
+    first_meeting,
+    interval_at,
+    meeting,
+    steps_to_turn,
+)
 from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
-from d4orm_planners.mapf.safe_intervals import Intervals, Reservations, interval_at
-from d4orm_planners.mapf.trips import Trip, first_meeting, meeting, steps_to_turn
 
 
 @register_jitable(nogil=True, **OPTIONS)

@@ -20,9 +20,8 @@ from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.occupancy import Occupancy, Others, find_meetings
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import find_path
+from d4orm_planners.mapf.reservations import Reservations, Trip, make_reservations, straighten, turn_on_the_spot
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
-from d4orm_planners.mapf.safe_intervals import Reservations, make_reservations
-from d4orm_planners.mapf.trips import Trip, straighten, turn_on_the_spot
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 

@@ -20,7 +20,7 @@ from d4orm_planners.engine import path_index
 from d4orm_planners.mapf import beam_search
 from d4orm_planners.mapf.beam import BeamRules, OtherAgents
 from d4orm_planners.mapf.beam_search import find_paths
-from d4orm_planners.mapf.motion_lns import improve_paths
+from d4orm_planners.mapf.lns import improve_paths
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import straight_drives
 
