@@ -149,7 +149,7 @@ class D4ormD(DeformingPlanner):
             return self.replan(search, state)
         if not search.current.unsolved.any():
             return self.whole_team(search, state)
-        team = DeformedPlan(self, search, search.current.trajectory, search.current.report)
+        team = DeformedPlan(self, search)
         return state.repair(team), team.iteration()
 
     def replan(self, search: SolveRun, state: GroupRuns | JointRun) -> tuple[State, Iteration]:
@@ -158,7 +158,7 @@ class D4ormD(DeformingPlanner):
             return self.whole_team(search, state)
         if isinstance(state, JointRun):
             return state.replan(self, search)
-        team = DeformedPlan(self, search, search.current.trajectory, search.current.report)
+        team = DeformedPlan(self, search)
         state, iteration = state.replan(team), team.iteration()
         return state, replace(iteration, controls=self.braking(search, iteration.controls))
 

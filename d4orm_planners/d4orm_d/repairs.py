@@ -12,7 +12,6 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.verify import VerificationReport
 from d4orm_planners.base.candidate import Graph, components
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
@@ -44,18 +43,14 @@ class DeformedPlan(WorkingPlan):
     Args:
         planner: Planner with the rules of deformations.
         search: The search.
-        trajectory: The team's motion at first.
-        report: Report of :func:`~d4orm_env.verify` on that, if it was asked.
+        trajectory: The team's motion at first, by default that of the present candidate.
     """
 
-    def __init__(
-        self,
-        planner: D4ormD,
-        search: SolveRun,
-        trajectory: Trajectory,
-        report: VerificationReport | None = None,
-    ) -> None:
-        super().__init__(search, trajectory, report)
+    def __init__(self, planner: D4ormD, search: SolveRun, trajectory: Trajectory | None = None) -> None:
+        if trajectory is None:
+            super().__init__(search, search.current.trajectory, search.current.report)
+        else:
+            super().__init__(search, trajectory)
         self.planner = planner
         self._denoising_steps = self._excluded = self._runs = 0
 

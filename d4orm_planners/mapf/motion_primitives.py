@@ -29,6 +29,10 @@ from d4orm_planners.tracking.tracker import velocity_step
 
 _FAR = np.float32(10)
 """Look-ahead of a robot that turns off, in seconds at full speed."""
+_BESIDE = 0.8
+"""Goal radii beside its goal to which a robot may head too: one that docks there keeps clear of a neighbour."""
+_ON_THE_SPOT = 0.001
+"""Share of its speed with which one that has a heading turns, to its goal or to one side, as if it stood."""
 
 
 class Moves(NamedTuple):
@@ -46,10 +50,6 @@ class MotionPrimitives:
     #: By which a robot turns off from the path to its goal [degrees]; in space up and down as well
     angles: tuple[float, ...]
     paces: tuple[float, ...]  #: Shares of its speed with which it heads for its goal: waiting has no direction
-    #: Goal radii beside its goal to which it may head too: one that docks there keeps clear of a neighbour
-    beside: float = 0.8
-    #: The share with which one that has a heading turns, to its goal or to one side, as if it stood
-    on_the_spot: float = 0.001
 
     def moves(self, dimension: int, *, has_heading: bool) -> Moves:
         """The moves as arrays."""
@@ -60,10 +60,10 @@ class MotionPrimitives:
         ahead = np.broadcast_to(portable.cos(angle)[:, None, None], (*sides.shape[:2], 1))
         turned = np.concatenate([ahead, sides], axis=2).reshape(-1, 3)
         home = np.zeros((1, 3))
-        beside = np.column_stack([np.zeros(len(across)), self.beside * across])
+        beside = np.column_stack([np.zeros(len(across)), _BESIDE * across])
         parts = [(home, True, pace) for pace in self.paces] + [(beside, True, 1.0), (turned, False, 1.0)]
         if has_heading:
-            parts += [(home, True, self.on_the_spot), (turned, False, self.on_the_spot)]
+            parts += [(home, True, _ON_THE_SPOT), (turned, False, _ON_THE_SPOT)]
         sizes = [len(turns) for turns, _, _ in parts]
         return Moves(
             np.concatenate([turns for turns, _, _ in parts]).astype(np.float32),

@@ -107,6 +107,20 @@ class RoadmapSolution:
     replanning: Replanning  #: Search for better paths
     driven: TeamRollout  #: Rollout of the team on those that there are
 
+    def iteration(self, search: SolveRun) -> Iteration:
+        """The team's controls within the horizon."""
+        return Iteration(self.driven.until(search.problem.horizon))
+
+    def going_on_from_best(self, search: SolveRun) -> RoadmapSolution:
+        """The solution of a team that drives as in the best plan so far."""
+        return replace(self, driven=TeamRollout.of(search.best.trajectory))
+
+    def improved(self, search: SolveRun, config: MAPFConfig) -> RoadmapSolution:
+        """Replan some groups of robots; what is no better for all together is left."""
+        paths = RoadmapPaths(self.replanning, self.driven, config.neighbours, search.should_stop)
+        random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
+        return replace(self, driven=search_neighbourhoods(paths, random, config.replannings, search.should_stop))
+
 
 @dataclass(frozen=True)
 class NoPaths:
@@ -143,31 +157,12 @@ class MAPF(Planner):
     ) -> tuple[RoadmapSolution | NoPaths, Iteration]:
         """See :meth:`Planner.iterate`: first paths for the whole team, then better ones for some robots at a time."""
         if isinstance(state, RoadmapSolution):
-            state = improve_roadmap_solution(search, state, self.config.neighbours, self.config.replannings)
+            state = state.improved(search, self.config)
         elif state is None:
             state = find_roadmap_solution(search)
         if isinstance(state, NoPaths):
             return state, state.explained(Iteration(search.current.controls))
-        return state, roadmap_iteration(search, state)
-
-
-def roadmap_iteration(search: SolveRun, solution: RoadmapSolution) -> Iteration:
-    """Return the team's controls within the horizon."""
-    return Iteration(solution.driven.until(search.problem.horizon))
-
-
-def going_on_from_best(search: SolveRun, solution: RoadmapSolution) -> RoadmapSolution:
-    """The solution of a team that drives as in the best plan so far."""
-    return replace(solution, driven=TeamRollout.of(search.best.trajectory))
-
-
-def improve_roadmap_solution(
-    search: SolveRun, solution: RoadmapSolution, neighbours: int, replannings: int
-) -> RoadmapSolution:
-    """Replan so many groups of at most so many robots; what is no better for all together is left."""
-    paths = RoadmapPaths(solution.replanning, solution.driven, neighbours, search.should_stop)
-    random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-    return replace(solution, driven=search_neighbourhoods(paths, random, replannings, search.should_stop))
+        return state, state.iteration(search)
 
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
@@ -262,9 +257,7 @@ def _driven(problem: Problem, paths: FloatArray, dwell: int) -> TeamRollout:
 
 def compile_roadmap(problem: Problem) -> None:
     """Compile what :func:`needs_detour` needs, if it is not yet."""
-    if not problem.world.num_obstacles:
-        return
-    if not fill_costs.signatures:
+    if problem.world.num_obstacles and not fill_costs.signatures:
         needs_detour(_small_problem(problem, 0))
 
 

@@ -184,19 +184,9 @@ def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, le
 
 @compiled
 def _find_touched(
-    cells: Cells,
-    a: int,
-    k: int,
-    first: IntArray,
-    owner: IntArray,
-    times: Floats,
-    radius: Floats,
-    margin: float,
-    farthest: float,
-    passed: IntArray,
-    wanted: IntArray,
-    touched: IntArray,
-) -> int:
+    cells: Cells, a: int, k: int, first: IntArray, owner: IntArray, times: Floats, radius: Floats, margin: float,
+    farthest: float, passed: IntArray, wanted: IntArray, touched: IntArray,
+) -> int:  # fmt: skip
     """Find the robots with earlier points too near to point ``a`` of robot ``k``.
 
     ``touched`` lists these robots, ``wanted`` says how far each of them has to have come; those that have ``passed``
@@ -228,15 +218,9 @@ def _find_touched(
 
 @cached_kernel(variant="waits", **OPTIONS)
 def find_waits(
-    cells: Cells,
-    first: IntArray,
-    owner: IntArray,
-    times: Floats,
-    radius: Floats,
-    margin: float,
-    wait_first: IntArray,
+    cells: Cells, first: IntArray, owner: IntArray, times: Floats, radius: Floats, margin: float, wait_first: IntArray,
     waits: IntArray,
-) -> int:
+) -> int:  # fmt: skip
     """Find the robots that each one has to let pass; see :class:`Routes`.
 
     ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it

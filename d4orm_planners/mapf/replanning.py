@@ -58,32 +58,14 @@ class _Search(NamedTuple):
 
 @compiled
 def _departure(
-    search: _Search,
-    tree: IntArray,
-    entry: Whole,
-    head: Whole,
-    steps: Whole,
-    left: float,
-    trip: Trip,
-    dock: Whole,
-    depart: Whole,
-    turn: Whole,
-    arrival: Whole,
-) -> tuple[Whole, Whole, Whole]:
+    search: _Search, tree: IntArray, entry: Whole, head: Whole, steps: Whole, left: float, trip: Trip, dock: Whole,
+    depart: Whole, turn: Whole, arrival: Whole,
+) -> tuple[Whole, Whole, Whole]:  # fmt: skip
     """The next departure from an entry of the tree that comes to a safe interval before all others.
 
-    Args:
-        search: The search.
-        tree: Nodes, departures, arrivals, entries before and intervals.
-        entry: The entry.
-        head: Node to drive to.
-        steps: Steps that it takes.
-        left: Steps from there to the goal, at least.
-        trip: The motion; the dwell of goals only.
-        dock: Step until which it must not arrive.
-        depart: Earliest departure.
-        turn: Steps that it loses by turning before it drives.
-        arrival: Safe interval of the node that it comes to no sooner than.
+    The robot drives to node ``head`` in some ``steps``, from which on it takes at least the ``left`` ones to the goal.
+    It departs at ``depart`` or later, loses the steps of a ``turn`` before it drives, and comes to safe interval
+    ``arrival`` of the node or a later one, after step ``dock``.
 
     Returns:
         Departure, arrival and interval, or -1 for the interval if there is none.
