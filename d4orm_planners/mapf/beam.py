@@ -10,7 +10,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
-from d4orm_planners.engine.path_table import PathTable, count_near, steps_of
+from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
 
 
 class BeamRules(NamedTuple):
@@ -83,12 +83,12 @@ def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
     )  # fmt: skip
 
 
-def make_beam_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int, lanes: int) -> BeamSpace:
+def make_beam_space(width: int, num_moves: int, num_blocks: int, n: int, d: int, lanes: int) -> BeamSpace:
     """Workspace for a beam of so many paths, moves and blocks of steps, with so many numbers for block drives."""
     before, moves = np.empty((2, width * num_blocks), np.int64)
     most = width * num_moves
     return BeamSpace(
-        _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, block),
+        _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, BLOCK),
         np.empty(most, np.int64), np.empty((most, 2), np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
         np.empty(num_blocks, np.int64), np.zeros(lanes, np.float32),
     )  # fmt: skip

@@ -272,7 +272,7 @@ def _search(
 
     def look(_: IntArray) -> None:
         d, num_blocks = team.problem.dimension, len(table.first)
-        space = make_beam_space(rules.width, len(moves.pace), num_blocks, BLOCK, x.shape[2], d, LANES)
+        space = make_beam_space(rules.width, len(moves.pace), num_blocks, x.shape[2], d, LANES)
         for number in waiting:
             if team.search.should_stop():
                 break

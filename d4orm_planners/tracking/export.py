@@ -142,13 +142,13 @@ def fit_polynomials(motion: SmoothMotion, height: float) -> tuple[Floats, Floats
         if deviation <= wanted:
             break
 
-    def values(times: Floats, derivative: int = 0) -> Floats:
-        return curves(times, nu=derivative)
+    def position(times: Floats, derivative: int = 0) -> Floats:
+        return np.asarray(curves(times, nu=derivative)[..., :-1])
 
-    report = verify_motion(
-        motion.problem, lambda *at: values(*at)[..., :-1], lambda *at: values(*at)[..., -1], motion.duration,
-        count * CHECKS + 1,
-    )  # fmt: skip
+    def heading(times: Floats, derivative: int = 0) -> Floats:
+        return np.asarray(curves(times, nu=derivative)[..., -1])
+
+    report = verify_motion(motion.problem, position, heading, motion.duration, count * CHECKS + 1)
     if not report.ok:
         raise ValueError(
             f"{count} polynomials, which is all that {MEMORY} bytes on board hold, are up to {deviation:.3g} m off a "
