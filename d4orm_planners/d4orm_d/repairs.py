@@ -121,6 +121,7 @@ class Repairs:
         return after
 
     def _copy(self) -> Repairs:
+        """A copy that one iteration of repairs may change."""
         return Repairs(self.failures.copy(), self.recency.copy())
 
     def _deform(self, team: DeformedPlan, failed: IntArray) -> None:
