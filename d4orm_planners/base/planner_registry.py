@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, short_repr
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
@@ -13,13 +13,18 @@ from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy
 from d4orm_planners.base.provenance import attributes
-from d4orm_planners.base.settings import NOTHING
+from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
 _NO_TEXT = ("bool", "float", "int")
 """Annotations of keywords for which text, as a command line has it, is refused."""
 
 RECOMMENDED = "hybrid"
 """The planner that solves most problems, and soonest."""
+
+Presets: TypeAlias = Mapping[str, Mapping[str, object]]
+"""Settings by preset."""
+
+Config = TypeVar("Config", bound=CheckedSettings)
 
 PolicyLike: TypeAlias = str | Policy | Planner | type[object] | Callable[..., object]
 """A policy as :func:`make_policy` takes it; other objects with ``reset`` and ``act`` as well."""
@@ -61,7 +66,7 @@ def make_planner(name: str | type[Planner] = RECOMMENDED, *, preset: str | None 
         TypeError: For an unknown setting.
     """
     kind, owner = _planner_class(name), f"planner {called(name)!r}"
-    planner = kind(_configured(kind, preset, config, owner))
+    planner = kind(_configured(kind.config_class, kind.presets, preset, config, owner))
     planner.preset = preset
     return planner
 
@@ -90,8 +95,8 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
     if not makes_policy(kind):
         _refuse_settings(config, owner)
         return as_policy(kind, owner)
-    if getattr(kind, "config_class", None) is not None:
-        return as_policy(kind(_configured(kind, _preset(kind, config), config, owner)), owner)
+    if (config_class := getattr(kind, "config_class", None)) is not None:
+        return as_policy(kind(_policy_config(kind, config_class, config, owner)), owner)
     _check_keywords(kind, config, owner)
     return as_policy(kind(**config), owner)
 
@@ -188,8 +193,8 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
         _refuse_settings(config, owner)
         policy = as_policy(kind, owner)
         settings = policy.identity() if isinstance(kind, Policy | Planner) else attributes(kind)
-    elif getattr(kind, "config_class", None) is not None:
-        checked = _configured(kind, _preset(kind, config), config, owner)
+    elif (config_class := getattr(kind, "config_class", None)) is not None:
+        checked = _policy_config(kind, config_class, config, owner)
         if isinstance(kind, type) and issubclass(kind, Policy):
             settings = kind.identity_with(checked)
         else:
@@ -202,31 +207,35 @@ def policy_settings(name: object, **config: Any) -> dict[str, object]:
     return {**settings, "source": source_digest(code)} if foreign else settings
 
 
-def _presets(kind: object) -> Mapping[str, Mapping[str, object]]:
-    presets: Mapping[str, Mapping[str, object]] = getattr(kind, "presets", {})
+def _presets(kind: object) -> Presets:
+    """Return the presets of a planner's or policy's class; none where it has none."""
+    presets: Presets = getattr(kind, "presets", {})
     return presets
 
 
-def _preset(kind: object, config: dict[str, object]) -> object:
-    """Take the preset out of a policy's settings, where the policy has presets."""
-    return config.pop("preset", None) if _presets(kind) else None
+def _policy_config(kind: object, config_class: type[Config], given: Mapping[str, object], owner: str) -> Config:
+    """A policy's settings, with those of a preset where the policy has presets."""
+    config, presets = dict(given), _presets(kind)
+    preset = config.pop("preset", None) if presets else None
+    return _configured(config_class, presets, preset, config, owner)
 
 
-def _configured(kind: Any, preset: object, config: Mapping[str, object], owner: str) -> Any:
-    """Settings of a planner's or policy's class as given, on top of those of a preset.
+def _configured(
+    config_class: type[Config], presets: Presets, preset: object, config: Mapping[str, object], owner: str
+) -> Config:
+    """Settings as given, on top of those of a preset.
 
     Raises:
         ValueError: For an unknown preset, or a setting that makes no sense.
         TypeError: For an unknown setting.
     """
-    presets = _presets(kind)
     if preset is not None and not (isinstance(preset, str) and preset in presets):
         remedy = f"choose one of {', '.join(presets)}" if presets else "it has none, so leave it out"
         raise ValueError(f"preset {short_repr(preset)} of {owner} is unknown; {remedy}{did_you_mean(preset, presets)}")
     settings = NOTHING if preset is None else presets[preset]
-    known = kind.config_class.setting_names({**settings, **config})
+    known = config_class.setting_names({**settings, **config})
     applying = {name: value for name, value in settings.items() if name in known}
-    return kind.config_class.from_keywords({**applying, **config}, owner)
+    return config_class.from_keywords({**applying, **config}, owner)
 
 
 def _planner_class(name: object) -> type[Planner]:

@@ -35,7 +35,7 @@ State = tuple[float, ...]
 class Kind:
     """Model, limits and time step, on which primitives depend."""
 
-    name: str  #: The model's name
+    name: str
     limits: tuple[float, ...]  #: ``(L,)`` of the robot, in the order of the model
     dt: float  #: Time step [s]
     cell: float  #: Distance that should be told apart [m]

@@ -44,7 +44,7 @@ largest one."""
 class ManoeuvreScene(NamedTuple):
     """Data that all robots of a team share."""
 
-    problem: Problem  #: The problem
+    problem: Problem
     area: Area  #: The part of the plane that robots may use
     #: The problem's arrays, of one type for all problems, with an index of all obstacles within reach
     arrays: ProblemArrays
@@ -167,7 +167,7 @@ def _room(problem: Problem, states: FloatArray, enough: float) -> float:
 class Robot:
     """A robot, as the search reads it."""
 
-    model: Model  #: Its model
+    model: Model
     start: Floats  #: ``(6,)`` pose
     mode: int  #: That it starts in
     task: Task  #: What a search for its motion is told
