@@ -22,7 +22,7 @@ from d4orm_env import Problem
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.render import FrameRenderer
-from d4orm_planners.base.machine import commit, describe_machine
+from d4orm_planners.base.provenance import commit, describe_machine
 from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.store import STORE, Trial, TrialStore

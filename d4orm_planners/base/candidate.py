@@ -1,18 +1,31 @@
-"""Controls and what they lead to: how every planner's results are evaluated."""
+"""Controls and what they lead to, as every planner's results are evaluated: faults, and conflicts between robots."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Set
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, BoolArray, FloatArray
+from d4orm_env.core.arrays import LARGEST, LARGEST_NUMBER, BoolArray, FloatArray, IntArray
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.engine.types import Engine
 from d4orm_env.verify import VerificationReport, verify
-from d4orm_planners.base.conflict_groups import Graph, conflicts
+
+if TYPE_CHECKING:
+    from d4orm_planners.engine import path_index
+else:
+    path_index = LazyModule("d4orm_planners.engine.path_index")
+
+Graph: TypeAlias = tuple[frozenset[int], ...]
+"""The robots that each robot is in conflict with."""
+
+Groups: TypeAlias = tuple[tuple[int, ...], ...]
+"""Robots by the group that they are in."""
 
 MOST_OF_LIMIT = LARGEST_NUMBER / LARGEST
 """Largest multiple of its limit that a planned control may be, so that its square does not overflow."""
@@ -112,3 +125,36 @@ def _too_near(problem: Problem, trajectory: Trajectory, robot: int, near: Graph)
     safety_distance = problem.team.radius[robot] + problem.margin
     if problem.world.clearance(trajectory.positions[1:, robot]).min() <= safety_distance:
         yield "comes within the margin of an obstacle or the bounds"
+
+
+def conflicts(positions: FloatArray, radius: ArrayLike, margin: float) -> Graph:
+    """Find the robots that come within the margin of each other at any step after the start.
+
+    Of ``positions`` ``(H+1, K, d)`` and ``radius`` ``(K,)``, all in metres.
+    """
+    return graph_of(positions.shape[1], path_index.PathIndex(positions, radius, margin).pairs())
+
+
+def graph_of(num_robots: int, pairs: IntArray) -> Graph:
+    """The graph of conflicts between pairs ``(P, 2)``."""
+    neighbours: list[set[int]] = [set() for _ in range(num_robots)]
+    for first, second in pairs.tolist():
+        neighbours[first].add(second)
+        neighbours[second].add(first)
+    return tuple(map(frozenset, neighbours))
+
+
+def components(graph: Graph) -> Groups:
+    """Connected components, singletons included, in order of their first members."""
+    seen: set[int] = set()
+    groups = []
+    for first in range(len(graph)):
+        if first in seen:
+            continue
+        members, frontier = {first}, {first}
+        while frontier:
+            frontier = set().union(*(graph[robot] for robot in frontier)) - members
+            members |= frontier
+        seen |= members
+        groups.append(tuple(sorted(members)))
+    return tuple(groups)

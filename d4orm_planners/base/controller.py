@@ -16,11 +16,11 @@ from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.base.background import Background
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Policy
+from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round, track_velocities
 
 Mode = Literal["nominal", "measured"]

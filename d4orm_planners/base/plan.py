@@ -20,21 +20,19 @@ from d4orm_env.core.trajectory import Trajectory, mean_stretch
 from d4orm_env.verify import VerificationReport, verify
 from d4orm_planners.base.candidate import step_faults
 from d4orm_planners.base.display import DisplayMixin
-from d4orm_planners.base.machine import Provenance
+from d4orm_planners.base.provenance import Provenance
 
 if TYPE_CHECKING:
     from d4orm_env.scenarios import dynobench
     from d4orm_planners.base import plan_file
     from d4orm_planners.tracking import export as exports
-    from d4orm_planners.tracking import setpoints, smoothing
-    from d4orm_planners.tracking.export import ExportReport
-    from d4orm_planners.tracking.setpoints import Setpoints
+    from d4orm_planners.tracking import smoothing
+    from d4orm_planners.tracking.export import ExportReport, Setpoints
     from d4orm_planners.tracking.smoothing import SmoothMotion
 else:
     dynobench = LazyModule("d4orm_env.scenarios.dynobench")
     plan_file = LazyModule("d4orm_planners.base.plan_file")
     exports = LazyModule("d4orm_planners.tracking.export")
-    setpoints = LazyModule("d4orm_planners.tracking.setpoints")
     smoothing = LazyModule("d4orm_planners.tracking.smoothing")
 
 Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrupted", "infeasible", "refuted"]
@@ -185,7 +183,7 @@ class Plan(DisplayMixin):
             ValueError: If the plan is not solved, or the smoothed motion touches something or takes more than four
                 times as long; the message has the number that fails.
         """
-        return setpoints.sample_motion(self._smooth(max_acceleration, max_jerk), rate)
+        return exports.sample_motion(self._smooth(max_acceleration, max_jerk), rate)
 
     def export(
         self,

@@ -22,8 +22,8 @@ from d4orm_env.scenarios.problem_files import describe
 from d4orm_env.scenarios.schema import parse
 from d4orm_env.verify import verify
 from d4orm_planners.base.candidate import failed_robots
-from d4orm_planners.base.machine import Provenance
 from d4orm_planners.base.plan import IterationRecord, Plan
+from d4orm_planners.base.provenance import Provenance
 
 FORMAT = "d4orm-plan-1"
 

@@ -9,10 +9,10 @@ from typing import Any, TypeAlias, TypeVar
 from d4orm_env.core.arrays import duration, short_repr
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
 from d4orm_env.core.registry import load_reference, source_digest, source_object
-from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy
+from d4orm_planners.base.provenance import attributes
 from d4orm_planners.base.settings import NOTHING, CheckedSettings
 
 _NO_TEXT = ("bool", "float", "int")

@@ -14,10 +14,10 @@ from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, usable
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.base.driving import ATTRIBUTE, driven_alone
-from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner import Planner
+from d4orm_planners.base.policy_threads import ATTRIBUTE, driven_alone
+from d4orm_planners.base.provenance import attributes
 from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.tracking.steering import drive_to_goal, limit_controls
 

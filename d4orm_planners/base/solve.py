@@ -19,8 +19,8 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.core.trajectory import trajectory_metrics
 from d4orm_env.engine.types import checked_controls
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
-from d4orm_planners.base.machine import Provenance
 from d4orm_planners.base.plan import IterationRecord, Plan, Status
+from d4orm_planners.base.provenance import Provenance
 from d4orm_planners.base.working_plan import drive_further_in
 from d4orm_planners.engine.sampling_types import (
     DenoisingStep,

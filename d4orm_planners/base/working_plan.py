@@ -14,8 +14,7 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
 from d4orm_env.verify import VerificationReport
-from d4orm_planners.base.candidate import Candidate
-from d4orm_planners.base.conflict_groups import Graph, graph_of
+from d4orm_planners.base.candidate import Candidate, Graph, graph_of
 from d4orm_planners.tracking.steering import Rollouts, drives, prepare_drives
 
 if TYPE_CHECKING:

@@ -39,8 +39,7 @@ from d4orm_planners.hybrid.compile_ahead import (
 )
 from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
-from d4orm_planners.tracking.reference_drives import follow_reference, reference_kernel
-from d4orm_planners.tracking.tracker import straight_kernel
+from d4orm_planners.tracking.tracker import follow_reference, reference_kernel, straight_kernel
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.tracking.reference_drives import follow_reference
+from d4orm_planners.tracking.tracker import follow_reference
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

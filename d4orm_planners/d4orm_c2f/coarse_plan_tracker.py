@@ -11,7 +11,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.base.background import Background
+from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_c2f.coarse_plan import (
     BARRED_AFTER,
@@ -31,7 +31,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import SamplingEngine
-from d4orm_planners.mapf.relay import relay_paths
+from d4orm_planners.mapf.planner import relay_paths
 from d4orm_planners.tracking.steering import straight_drives
 
 NEARER = 1 / 3

@@ -17,8 +17,7 @@ from d4orm_planners.base.planner_registry import make_policy
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, coarse_problem, interpolate
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.d4orm_d.planner import D4ormD
-from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.d4orm_d.planner import D4ormD, D4ormDConfig
 from d4orm_planners.hybrid.planner import Hybrid, HybridConfig, covered_by_discs
 from d4orm_planners.mapf.planner import RoadmapSolution
 

@@ -13,7 +13,7 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.d4orm_c2f.direct_final_approach import arrival_radius, direct_final_approach
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import MovingObstacles, SamplingEngine, SamplingRules, SamplingTask
-from d4orm_planners.tracking.reference_drives import follow_reference
+from d4orm_planners.tracking.tracker import follow_reference
 
 SHORTER = 3
 """Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise."""

@@ -13,8 +13,8 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.base.background import Background
 from d4orm_planners.base.policy import StatePolicy
+from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.base.settings import CheckedSettings
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlan, CoarseWaypoints

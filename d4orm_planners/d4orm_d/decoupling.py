@@ -6,12 +6,12 @@ The former is the paper's, the latter that of the code that its authors publishe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray
-from d4orm_planners.base.conflict_groups import Grouping, Groups, conflicts, failure_groups, regrouped
+from d4orm_planners.base.candidate import Graph, Groups, components, conflicts
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.d4orm_d.repairs import DeformedPlan
@@ -20,6 +20,42 @@ from d4orm_planners.sampling.weights import GroupWeights
 
 if TYPE_CHECKING:
     from d4orm_planners.d4orm_d.planner import D4ormD
+
+
+class Grouping(NamedTuple):
+    """A team's groups, and the conflicts that they come from."""
+
+    graph: Graph  #: The conflicts
+    groups: Groups  #: Components of the graph after :func:`reconnected`, singletons included
+
+
+def regrouped(graph: Graph, previous: Grouping | None) -> Grouping:
+    """The groups of a graph of conflicts that follows a previous one."""
+    return Grouping(graph, components(reconnected(graph, previous)))
+
+
+def reconnected(graph: Graph, previous: Grouping | None) -> Graph:
+    """The graph of conflicts with those of the previous iteration added that are likely to come back.
+
+    A robot of a previous group that now conflicts with a robot outside that group is joined again to those of its
+    previous direct neighbours that are free of conflicts now.
+    """
+    if previous is None:
+        return graph
+    joined = [set(neighbours) for neighbours in graph]
+    for group in previous.groups:
+        for robot in group if len(group) > 1 else ():
+            if not graph[robot] <= set(group):
+                for other in previous.graph[robot]:
+                    if not graph[other]:
+                        joined[robot].add(other)
+                        joined[other].add(robot)
+    return tuple(map(frozenset, joined))
+
+
+def failure_groups(failed: BoolArray, groups: Groups) -> Groups:
+    """Groups to replan: those, of all with singletons included, that hold a robot that failed ``(K,)``."""
+    return tuple(group for group in groups if failed[list(group)].any())
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,14 +12,14 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import Trajectory
-from d4orm_env.verify import VerificationReport
-from d4orm_planners.base.conflict_groups import components, independent_robots
+from d4orm_planners.base.candidate import Graph, components
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan, approach_goals
-from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.engine.sampling_types import SamplingTask, moving_robots
-from d4orm_planners.sampling.d4orm import DeformingPlanner
+
+if TYPE_CHECKING:
+    from d4orm_planners.d4orm_d.planner import D4ormD
 
 NOISE_FACTORS = (1.0, 2.0)
 """Noise factors of successive repairs: wider noise may get around what ordinary noise does not."""
@@ -43,18 +43,14 @@ class DeformedPlan(WorkingPlan):
     Args:
         planner: Planner with the rules of deformations.
         search: The search.
-        trajectory: The team's motion at first.
-        report: Report of :func:`~d4orm_env.verify` on that, if it was asked.
+        trajectory: The team's motion at first, by default that of the present candidate.
     """
 
-    def __init__(
-        self,
-        planner: DeformingPlanner,
-        search: SolveRun,
-        trajectory: Trajectory,
-        report: VerificationReport | None = None,
-    ) -> None:
-        super().__init__(search, trajectory, report)
+    def __init__(self, planner: D4ormD, search: SolveRun, trajectory: Trajectory | None = None) -> None:
+        if trajectory is None:
+            super().__init__(search, search.current.trajectory, search.current.report)
+        else:
+            super().__init__(search, trajectory)
         self.planner = planner
         self._denoising_steps = self._excluded = self._runs = 0
 
@@ -104,46 +100,39 @@ class Repairs:
         """The state before the first repair."""
         return cls(np.zeros(num_robots, int), np.zeros(num_robots))
 
-    def repair(self, team: DeformedPlan, config: D4ormDConfig) -> Repairs:
-        """Deform the controls of some robots that fail, and accept what is no worse."""
-        repair = _Repair(team, self)
-        repair.run(config)
-        return Repairs(repair.failures, repair.recency)
+    def repair(self, team: DeformedPlan) -> Repairs:
+        """Deform some robots that fail, accept what is no worse, and improve final approaches once none fails."""
+        after, everybody = self._copy(), np.arange(team.problem.num_robots)
+        failed, _ = team.faults(everybody)
+        if failed.any() and not team.search.should_stop():
+            after._deform(team, np.flatnonzero(failed))
+            failed, _ = team.faults(everybody)
+        # Detours are longer than necessary at first.
+        return after if failed.any() else after.improve(team)
 
     def improve(self, team: DeformedPlan) -> Repairs:
         """Let all robots turn to their goals as soon as that is no worse."""
-        repair = _Repair(team, self)
-        repair.improve()
-        return Repairs(repair.failures, repair.recency)
+        after, problem = self._copy(), team.problem
+        for _ in range(SHORTENINGS):
+            if team.search.should_stop():
+                break
+            trajectory = team.search.engine.rollout(problem, team.controls)
+            after._accept(team, np.arange(problem.num_robots), problem, trajectory)
+        return after
 
+    def _copy(self) -> Repairs:
+        """A copy that one iteration of repairs may change."""
+        return Repairs(self.failures.copy(), self.recency.copy())
 
-class _Repair:
-    """One iteration of repairs."""
-
-    def __init__(self, team: DeformedPlan, before: Repairs) -> None:
-        self.team, self.search, self.problem = team, team.search, team.problem
-        self.failures, self.recency = before.failures.copy(), before.recency
-
-    def run(self, config: D4ormDConfig) -> None:
-        """Deform the robots that fail, and improve final approaches once none does."""
-        everybody = np.arange(self.problem.num_robots)
-        failed, _ = self.team.faults(everybody)
-        if failed.any() and not self.search.should_stop():
-            self.deform(np.flatnonzero(failed), config)
-            failed, _ = self.team.faults(everybody)
-        if not failed.any():
-            # Detours are longer than necessary at first.
-            self.improve()
-
-    def deform(self, failed: IntArray, config: D4ormDConfig) -> None:
+    def _deform(self, team: DeformedPlan, failed: IntArray) -> None:
         """Deform the controls of some of the robots that fail."""
-        problem = self.problem
-        robots, credit = self.next_robots(failed)
-        moving = (self.team.positions[1:, robots] != self.team.positions[:-1, robots]).any(axis=2)
+        problem, config = team.problem, team.planner.config
+        robots, credit = self._next_robots(team, failed)
+        moving = (team.positions[1:, robots] != team.positions[:-1, robots]).any(axis=2)
         horizon = min(int(moving.any(axis=1).nonzero()[0].max(initial=0)) + 1 + SLACK, problem.horizon)
         distance = np.linalg.norm(problem.goal - problem.start[:, : problem.dimension], axis=1)
-        wider = NOISE_FACTORS[self.search.iteration % len(NOISE_FACTORS)]
-        part, _, trajectory = self.team.deformed(
+        wider = NOISE_FACTORS[team.search.iteration % len(NOISE_FACTORS)]
+        part, _, trajectory = team.deformed(
             robots,
             horizon,
             config.repair_samples,
@@ -153,23 +142,15 @@ class _Repair:
             # Else a robot that starts next to its goal would lose far more by yielding than others.
             reference_distance=float(max(distance.mean(), problem.goal_radius)),
         )
-        self.accept(robots, part, trajectory)
+        self._accept(team, np.array(robots), part, trajectory)
 
-    def improve(self) -> None:
-        """Let all robots turn to their goals as soon as that is no worse."""
-        for _ in range(SHORTENINGS):
-            if self.search.should_stop():
-                break
-            trajectory = self.search.engine.rollout(self.problem, self.team.controls)
-            self.accept(range(self.problem.num_robots), self.problem, trajectory)
-
-    def next_robots(self, failed: IntArray) -> tuple[tuple[int, ...], str]:
+    def _next_robots(self, team: DeformedPlan, failed: IntArray) -> tuple[tuple[int, ...], str]:
         """Choose the robots to repair, and the credit.
 
         They are robots that fail and have no conflicts among them, the least recently repaired first, each by its own
         reward. Every :data:`JOINT_INTERVAL` iterations a group of stuck robots is repaired by its team's reward.
         """
-        search, graph = self.search, self.team.conflicts()
+        search, graph = team.search, team.conflicts()
         degree = np.array([len(neighbours) for neighbours in graph])
         random = np.random.default_rng(search.iteration_seed(Stream.REPAIR_ORDER)).random(len(self.recency))
         order = np.argsort(self.recency + random - CROWDING * degree, kind="stable")
@@ -182,14 +163,21 @@ class _Repair:
             if stuck:
                 return stuck[search.iteration // JOINT_INTERVAL % len(stuck)], "team"
         robots = independent_robots(order[np.isin(order, failed)].tolist(), graph)
-        self.recency = self.recency.copy()
         self.recency[list(robots)] += RECENCY_GAIN
-        self.recency *= RECENCY_DECAY
+        self.recency[:] *= RECENCY_DECAY
         return robots, "robot"
 
-    def accept(self, robots: Sequence[int], part: Problem, trajectory: Trajectory) -> None:
+    def _accept(self, team: DeformedPlan, robots: IntArray, part: Problem, trajectory: Trajectory) -> None:
         """Give robots their motions in the trajectory, or turns to their goals, and count the failures."""
-        index = np.array(robots)
-        approach_goals(self.team, index, part, trajectory, or_longer=True)
-        faults, _ = self.team.faults(index)
-        self.failures[index] = np.where(faults > 0, self.failures[index] + 1, 0)
+        approach_goals(team, robots, part, trajectory, or_longer=True)
+        faults, _ = team.faults(robots)
+        self.failures[robots] = np.where(faults > 0, self.failures[robots] + 1, 0)
+
+
+def independent_robots(candidates: Iterable[int], graph: Graph) -> tuple[int, ...]:
+    """Candidates, taken in order, that conflict with none taken before; sorted."""
+    taken: set[int] = set()
+    for robot in candidates:
+        if taken.isdisjoint(graph[robot]):
+            taken.add(int(robot))
+    return tuple(sorted(taken))

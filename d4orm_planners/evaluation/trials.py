@@ -24,10 +24,10 @@ from d4orm_env.core.registry import load_reference, source_digest
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
 from d4orm_planners.base.episode import Episode, open_env, run_episode
-from d4orm_planners.base.machine import commit, describe_machine, versions
 from d4orm_planners.base.plan import IterationRecord, Plan
 from d4orm_planners.base.planner_registry import is_planned, make_policy, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy
+from d4orm_planners.base.provenance import commit, describe_machine, versions
 from d4orm_planners.evaluation.store import Trial, TrialKey
 
 if TYPE_CHECKING:

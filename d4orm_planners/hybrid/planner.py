@@ -13,16 +13,14 @@ from d4orm_planners.base.planner import Iteration, Planner
 from d4orm_planners.base.settings import Positive, one_of
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
-from d4orm_planners.d4orm_d.planner import D4ormD, straight_if_sparse
+from d4orm_planners.d4orm_d.planner import D4ormD, D4ormDConfig, straight_if_sparse
 from d4orm_planners.d4orm_d.planner import State as DecouplingState
 from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
-from d4orm_planners.d4orm_d.settings import D4ormDConfig
 from d4orm_planners.hybrid.rerouting import reroute
-from d4orm_planners.manoeuvres.planning import find_manoeuvres, improve_manoeuvres
 from d4orm_planners.manoeuvres.robots import can_plan
-from d4orm_planners.manoeuvres.team import TeamMotions
-from d4orm_planners.mapf.beams import prepare_beams
-from d4orm_planners.mapf.motion_lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
+from d4orm_planners.manoeuvres.team import TeamMotions, find_manoeuvres, improve_manoeuvres
+from d4orm_planners.mapf.beam_search import prepare_beams
+from d4orm_planners.mapf.lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (
     MAPFConfig,
     RoadmapSolution,
@@ -30,10 +28,7 @@ from d4orm_planners.mapf.planner import (
     find_all_at_once,
     find_one_by_one,
     find_roadmap_solution,
-    going_on_from_best,
-    improve_roadmap_solution,
     needs_detour,
-    roadmap_iteration,
 )
 from d4orm_planners.sampling.settings import Credit
 
@@ -123,7 +118,10 @@ class Hybrid(Planner):
         return self.without_paths(search, state)
 
     def without_paths(self, search: SolveRun, state: DecouplingState) -> tuple[State, Iteration]:
-        """Start straight or with the whole team, repair robots that fail, then improve."""
+        """Start straight or with the whole team, then improve, or repair robots that fail.
+
+        These search for paths around others, and those that fail nevertheless are deformed.
+        """
         if search.iteration == 0 and not search.current.controls.any():
             drives = self.straight_start(search.problem)
             return self.whole_team(search, state) if drives is None else (state, Iteration(drives))
@@ -133,38 +131,32 @@ class Hybrid(Planner):
             return self.denoiser.replan(search, state)
         if not search.current.unsolved.any():
             return self.whole_team(search, state)
-        team = DeformedPlan(self.denoiser, search, search.current.trajectory, search.current.report)
-        return self.repair(team, state), team.iteration()
+        team = DeformedPlan(self.denoiser, search)
+        if self.config.reroute:
+            reroute(team)
+        state = state.repair(team)
+        self.improve_first(team)
+        return state, team.iteration()
 
     def straight_start(self, problem: Problem) -> FloatArray | None:
         """Controls ``(H, K, m)`` that send all straight to their goals, or ``None`` to start with the whole team."""
         return straight_if_sparse(problem) if self.config.start == "auto" else self.denoiser.straight_start(problem)
 
-    def repair(self, team: DeformedPlan, state: Repairs) -> Repairs:
-        """Search for paths around others for robots that fail, and deform those that fail nevertheless."""
-        if self.config.reroute:
-            reroute(team)
-        state = state.repair(team, self.config)
-        self.improve_first(team)
-        return state
-
     def whole_team(self, search: SolveRun, state: DecouplingState) -> tuple[State, Iteration]:
         """Deform all controls at once, as D4orm-D does, and improve them if none fails."""
         state, iteration = self.denoiser.whole_team(search, state)
-        if not isinstance(state, Repairs):
-            return state, iteration
-        team = DeformedPlan(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
-        self.improve_first(team)
-        return state, replace(iteration, controls=team.controls)
+        return state, (self.improved_at_once(search, iteration) if isinstance(state, Repairs) else iteration)
+
+    def improved_at_once(self, search: SolveRun, iteration: Iteration, rounds: int = FIRST_ROUNDS) -> Iteration:
+        """The iteration, its controls improved for some rounds if no robot fails with them."""
+        team = WorkingPlan(search, search.engine.rollout(search.problem, iteration.controls))
+        self.improve_first(team, rounds)
+        return replace(iteration, controls=team.controls)
 
     def follow(self, search: SolveRun, solution: RoadmapSolution) -> Iteration:
         """The team's controls on a roadmap solution, improved a little if it is a solution of the problem."""
-        iteration = roadmap_iteration(search, solution)
-        if not self.improves_by_lns:
-            return iteration
-        team = DeformedPlan(self.denoiser, search, search.engine.rollout(search.problem, iteration.controls))
-        self.improve_first(team, GUIDED_ROUNDS)
-        return replace(iteration, controls=team.controls)
+        iteration = solution.iteration(search)
+        return self.improved_at_once(search, iteration, GUIDED_ROUNDS) if self.improves_by_lns else iteration
 
     def improve_roadmap_solution(
         self, search: SolveRun, solution: RoadmapSolution
@@ -176,9 +168,9 @@ class Hybrid(Planner):
         if search.best.solved and self.improves_by_lns:
             if search.iteration % LNS_PERIOD == 1:
                 return solution, improve_by_lns(search)
-            solution = going_on_from_best(search, solution)
-        solution = improve_roadmap_solution(search, solution, REPLANNING.neighbours, REPLANNING.replannings)
-        return solution, roadmap_iteration(search, solution)
+            solution = solution.going_on_from_best(search)
+        solution = solution.improved(search, REPLANNING)
+        return solution, solution.iteration(search)
 
     def finds_manoeuvres(self, search: SolveRun) -> bool:
         """Check whether this iteration is to find manoeuvres: the first one, for a team that needs them."""
@@ -199,7 +191,7 @@ class Hybrid(Planner):
         stuck = search.iteration == MAPF_AFTER and not search.best.solved and search.problem.world.num_obstacles > 0
         return stuck and start == "auto"
 
-    def improve_first(self, team: DeformedPlan, rounds: int = FIRST_ROUNDS) -> None:
+    def improve_first(self, team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
         """Improve a team in which none fails any more, for some rounds."""
         if self.improves_by_lns and not team.faults(np.arange(team.problem.num_robots))[0].any():
             improve_first_paths(team, rounds)

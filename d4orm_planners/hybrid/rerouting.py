@@ -8,11 +8,11 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.trajectory import resting_steps
-from d4orm_planners.base.conflict_groups import components
+from d4orm_planners.base.candidate import components
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine.path_table import BLOCK
 from d4orm_planners.mapf.beam import BeamRules, OtherAgents
-from d4orm_planners.mapf.beams import find_paths
+from d4orm_planners.mapf.beam_search import find_paths
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import at_rest, drives
 

@@ -35,30 +35,19 @@ CIRCLES = len(LEVELS) * len(SIDES)
 class Curves(NamedTuple):
     """Circles of a car with its trailers: forwards to the left and to the right by levels, then in reverse; and once
     more, if curves end in a bend, with other swings out of them or none. ``W`` in all.
-
-    Attributes:
-        last: Number of the first one that may be a curve's last.
-        begin: ``(2 W + 1,)`` where the steps of the swing into each begin, and of that out of it.
-        poses: ``(S, 6)`` after each of these steps, from where the swing began.
-        controls: ``(S, 2)``.
-        ahead: ``(W, 2)`` centre of the circle, from where the swing into it begins.
-        behind: ``(W, 2)`` the same from where the swing out of it ends.
-        swung: ``(W,)`` by which both swings together turn the heading [rad]; NaN where there is no swing out of it.
-        curvature: ``(W,)`` [1/m], to the left positive.
-        steering: ``(W,)`` [rad].
-        stride: ``(W,)`` distance in a step, in reverse negative [m].
     """
 
-    last: int
-    begin: IntArray
-    poses: Floats
-    controls: FloatArray
-    ahead: Floats
-    behind: Floats
+    last: int  #: Number of the first one that may be a curve's last
+    begin: IntArray  #: ``(2 W + 1,)`` where the steps of the swing into each begin, and of that out of it
+    poses: Floats  #: ``(S, 6)`` after each of these steps, from where the swing began
+    controls: FloatArray  #: ``(S, 2)``
+    ahead: Floats  #: ``(W, 2)`` centre of the circle, from where the swing into it begins
+    behind: Floats  #: ``(W, 2)`` the same from where the swing out of it ends
+    #: ``(W,)`` by which both swings together turn the heading [rad]; NaN where there is no swing out of it
     swung: Floats
-    curvature: Floats
-    steering: Floats
-    stride: Floats
+    curvature: Floats  #: ``(W,)`` [1/m], to the left positive
+    steering: Floats  #: ``(W,)`` [rad]
+    stride: Floats  #: ``(W,)`` distance in a step, in reverse negative [m]
 
 
 Curve: TypeAlias = tuple[int, int, float, float, int, float]

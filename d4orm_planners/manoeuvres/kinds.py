@@ -33,21 +33,13 @@ State = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Kind:
-    """Model, limits and time step, on which primitives depend.
-
-    Attributes:
-        name: The model's name.
-        limits: ``(L,)`` of the robot, in the order of the model.
-        dt: Time step [s].
-        cell: Distance that should be told apart [m].
-        start: Mode that the robot starts in.
-    """
+    """Model, limits and time step, on which primitives depend."""
 
     name: str
-    limits: tuple[float, ...]
-    dt: float
-    cell: float
-    start: Mode
+    limits: tuple[float, ...]  #: ``(L,)`` of the robot, in the order of the model
+    dt: float  #: Time step [s]
+    cell: float  #: Distance that should be told apart [m]
+    start: Mode  #: Mode that the robot starts in
 
     @property
     def model(self) -> Model:

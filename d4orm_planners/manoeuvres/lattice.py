@@ -1,4 +1,4 @@
-"""Free poses of a footprint among the obstacles, and the time from each of them to the goal."""
+"""Free poses of a footprint among the obstacles, and cells of poses that are taken for one."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, Whole
 from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.core.problem_arrays import ProblemArrays
-from d4orm_env.engine.caching import cached_kernel
-from d4orm_env.engine.compiling import OPTIONS, ZERO, compiled
+from d4orm_env.engine.compiling import ZERO, compiled
 from d4orm_env.engine.elementary import cosine, sine
 from d4orm_env.engine.footprint_contacts import POSE, touches_static
 from d4orm_env.engine.simd import TILE
-from d4orm_planners.manoeuvres.heaps import Heap, pop, push
 from d4orm_planners.manoeuvres.kinds import SECTOR, SECTORS
-from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
+from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 
 TURN = 2 * np.pi
-LATER = 20
-"""Steps by which a detour over a pose may be longer than the shortest path for its cost to be worked out."""
-
 
 Pose: TypeAlias = tuple[float, float, float, float, float, float]
 """Position, heading and hitch angles."""
@@ -33,23 +28,14 @@ def buffer_size(footprints: FootprintArrays) -> int:
 
 
 class RobotBody(NamedTuple):
-    """A robot's body among the obstacles.
+    """A robot's body among the obstacles."""
 
-    Attributes:
-        footprints: Of all robots.
-        arrays: The problem, without goal headings and footprints, so that all have one type.
-        robot: Its number.
-        extra: Distance that it keeps from everything [m].
-        stride: What the fastest robot drives in a step [m].
-        parts: Poses that are looked at in a step.
-    """
-
-    footprints: FootprintArrays
-    arrays: ProblemArrays
-    robot: int
-    extra: np.float32
-    stride: float
-    parts: int
+    footprints: FootprintArrays  #: Of all robots
+    arrays: ProblemArrays  #: The problem, without goal headings and footprints, so that all have one type
+    robot: int  #: Its number
+    extra: np.float32  #: Distance that it keeps from everything [m]
+    stride: float  #: What the fastest robot drives in a step [m]
+    parts: int  #: Poses that are looked at in a step
 
 
 Placed: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32]
@@ -57,23 +43,14 @@ Placed: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32]
 
 
 class PoseLattice(NamedTuple):
-    """Cells of positions and sectors of headings: poses in the same are taken for one.
+    """Cells of positions and sectors of headings: poses in the same are taken for one."""
 
-    Attributes:
-        low: ``(2,)`` lowest corner [m].
-        scale: One over the size of a cell [1/m].
-        size: ``(2,)`` cells along x and y.
-        heading: Middle of the first sector [rad].
-        sectors: Number of sectors; one for a robot without a heading.
-        modes: Number of modes.
-    """
-
-    low: Floats
-    scale: float
-    size: tuple[int, int]
-    heading: float
-    sectors: int
-    modes: int
+    low: Floats  #: ``(2,)`` lowest corner [m]
+    scale: float  #: One over the size of a cell [1/m]
+    size: tuple[int, int]  #: ``(2,)`` cells along x and y
+    heading: float  #: Middle of the first sector [rad]
+    sectors: int  #: Number of sectors; one for a robot without a heading
+    modes: int  #: Number of modes
 
 
 @compiled
@@ -205,88 +182,3 @@ def cell_of(lattice: PoseLattice, x: float, y: float, heading: float, mode: Whol
     if lattice.sectors > 1:
         sector = int(np.rint((heading - lattice.heading) / SECTOR)) % SECTORS
     return ((int(mode) * lattice.sectors + sector) * lattice.size[0] + i) * lattice.size[1] + j
-
-
-@compiled
-def _is_way_free(
-    body: RobotBody, primitives: Primitives, number: Whole, x: float, y: float, heading: float,
-    facing: tuple[float, float], stride: int, buffer: FloatArray,
-) -> bool:  # fmt: skip
-    """Check whether the robot is clear of obstacles and bounds on a primitive, after every so many steps."""
-    if is_far_from_all(body, x, y, primitives.reach[number]):
-        return True
-    # From the end on: what is not free is found there soonest.
-    for i in range(primitives.first[number + 1] - 1, primitives.first[number] - 1, -stride):
-        step = primitives.poses[i]
-        px, py, turned = moved_along(x, y, heading, facing, step)
-        if not is_free(body, (px, py, turned, step[3], step[4], step[5]), buffer):
-            return False
-    return True
-
-
-@compiled
-def _spread(
-    body: RobotBody, primitives: Primitives, lattice: PoseLattice, start: Floats, pace: float, cell: int,
-    costs: FloatArray, poses: Floats, heap: Heap, buffer: FloatArray,
-) -> None:  # fmt: skip
-    """Spread costs from a cell to those that primitives lead to."""
-    x, y, heading = poses[cell, 0], poses[cell, 1], poses[cell, 2]
-    # Nothing that is as wide as the robot fits in between the poses that are looked at.
-    stride = max(1, int(2 * body.footprints.inner[body.robot] * pace))
-    facing = unit_vector(heading)
-    mode = cell // (lattice.sectors * lattice.size[0] * lattice.size[1])
-    for number in range(primitives.begin[mode], primitives.begin[mode + 1]):
-        first, end = primitives.first[number], primitives.first[number + 1]
-        px, py, turned = moved_along(x, y, heading, facing, primitives.poses[end - 1])
-        other, cost = cell_of(lattice, px, py, turned, primitives.mode[number]), costs[cell] + np.float32(end - first)
-        if other < 0 or costs[other] <= cost:
-            continue
-        if not _is_way_free(body, primitives, number, x, y, heading, facing, stride, buffer):
-            continue
-        costs[other] = cost
-        poses[other, 0], poses[other, 1], poses[other, 2] = px, py, turned
-        push(heap, cost + pace * np.sqrt((px - start[0]) ** 2 + (py - start[1]) ** 2), other)
-
-
-@cached_kernel(**OPTIONS)
-def fill_costs(
-    body: RobotBody, primitives: Primitives, lattice: PoseLattice, goals: Floats, start: Floats, pace: float,
-    costs: FloatArray, poses: Floats, heap: Heap, mode: int, buffer: FloatArray,
-) -> float:  # fmt: skip
-    """Spread costs backwards from the goals over all poses that a robot may pass on its way there, detours included.
-
-    Args:
-        body: The robot.
-        primitives: What it can do, backwards in time.
-        lattice: Cells and sectors.
-        goals: ``(., 4)`` poses and modes.
-        start: ``(3,)`` pose, towards which costs are spread first.
-        pace: Steps that a metre takes at least.
-        costs: ``(cells,)`` steps to the goal, filled; infinite to begin with, and beyond what was reached.
-        poses: ``(cells, 3)`` to overwrite.
-        heap: To overwrite.
-        mode: That the robot starts in.
-        buffer: To overwrite, see :func:`buffer_size`.
-
-    Returns:
-        The sum, of a cost and the steps that it takes at least from the start, up to which all are known; infinite if
-        there are no others.
-    """
-    begin = cell_of(lattice, start[0], start[1], start[2], mode)
-    heap.filled[0] = 0
-    for number in range(goals.shape[0]):
-        cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], int(goals[number, 3]))
-        if cell >= 0 and costs[cell] > 0:
-            costs[cell], poses[cell] = 0, goals[number, :3]
-            push(heap, 0.0, cell)
-    most, last = np.inf, 0.0
-    while 0 < heap.filled[0] < heap.value.shape[0] - 256 and last <= most:
-        value, cell = pop(heap)
-        last = max(last, value)
-        x, y, cost = poses[cell, 0], poses[cell, 1], costs[cell]
-        if value > cost + pace * np.sqrt((x - start[0]) ** 2 + (y - start[1]) ** 2) + 1e-3:
-            continue
-        if cell == begin:
-            most = min(most, cost + LATER)
-        _spread(body, primitives, lattice, start, pace, cell, costs, poses, heap, buffer)
-    return last if heap.filled[0] > 0 else np.inf

@@ -1,4 +1,4 @@
-"""Nodes of a search for one robot's motion, and which of them count."""
+"""Nodes of a search for one robot's motion, which of them count, and the poses on a move from one to another."""
 
 from __future__ import annotations
 
@@ -7,54 +7,49 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
+from d4orm_env.core.problem_checks import MOST_TRAILERS
 from d4orm_env.engine.compiling import compiled
-from d4orm_planners.manoeuvres.costs import Costs
-from d4orm_planners.manoeuvres.curves import Curves
-from d4orm_planners.manoeuvres.heaps import Heap, push
+from d4orm_planners.manoeuvres.costs import Costs, Heap, push
+from d4orm_planners.manoeuvres.curves import Curves, curve_of, sweep_curve
 from d4orm_planners.manoeuvres.kinds import MAX_STEPS
-from d4orm_planners.manoeuvres.lattice import Pose, PoseLattice, RobotBody, cell_of, turned_by
+from d4orm_planners.manoeuvres.lattice import (
+    Pose,
+    PoseLattice,
+    RobotBody,
+    cell_of,
+    is_far_from_all,
+    is_free,
+    moved,
+    pose_between,
+    turned_by,
+    write_pose,
+)
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives
-from d4orm_planners.manoeuvres.snapping import Goal, Limits, snap_of, snap_steps
+from d4orm_planners.manoeuvres.snapping import CURVING, Goal, Limits, snap_of, snap_pose, snap_steps
+
+AHEAD, BEHIND = -2, -3
+"""Moves that are no primitives: the last stretch, forwards and backwards."""
 
 
 class Nodes(NamedTuple):
-    """Nodes of a search, ``N`` at most, and where to find those of a cell.
+    """Nodes of a search, ``N`` at most, and where to find those of a cell."""
 
-    Attributes:
-        pose: ``(N, 6)``.
-        mode: ``(N,)``, -1 for a node at which the robot stays at its goal.
-        time: ``(N,)`` step of arrival.
-        until: ``(N,)`` first step at which it must have gone.
-        parent: ``(N,)``, -1 for the first.
-        move: ``(N,)`` primitive, or one of :data:`AHEAD` and :data:`BEHIND`, ...
-        depart: ``(N,)`` ... and the step at which it begins.
-        next: ``(N,)`` another one of the same cell, -1 for none.
-        filled: ``(1,)`` number of nodes.
-        soonest: ``(1,)`` step from which on the robot can stay at its goal.
-        cells: ``(C,)`` numbers of cells, hashed.
-        heads: ``(C,)`` first node of each.
-        marks: ``(C,)`` number of the search that wrote each slot.
-        heap: Nodes to be followed.
-        swept: ``(., 7)`` poses and speeds on a move, from where it begins.
-        buffer: See :func:`~d4orm_planners.manoeuvres.lattice.buffer_size`.
-    """
-
-    pose: Floats
-    mode: IntArray
-    time: IntArray
-    until: IntArray
-    parent: IntArray
-    move: IntArray
-    depart: IntArray
-    next: IntArray
-    filled: IntArray
-    soonest: IntArray
-    cells: IntArray
-    heads: IntArray
-    marks: IntArray
-    heap: Heap
-    swept: Floats
-    buffer: FloatArray
+    pose: Floats  #: ``(N, 6)``
+    mode: IntArray  #: ``(N,)``, -1 for a node at which the robot stays at its goal
+    time: IntArray  #: ``(N,)`` step of arrival
+    until: IntArray  #: ``(N,)`` first step at which it must have gone
+    parent: IntArray  #: ``(N,)``, -1 for the first
+    move: IntArray  #: ``(N,)`` primitive, or one of :data:`AHEAD` and :data:`BEHIND`, ...
+    depart: IntArray  #: ``(N,)`` ... and the step at which it begins
+    next: IntArray  #: ``(N,)`` another one of the same cell, -1 for none
+    filled: IntArray  #: ``(1,)`` number of nodes
+    soonest: IntArray  #: ``(1,)`` step from which on the robot can stay at its goal
+    cells: IntArray  #: ``(C,)`` numbers of cells, hashed
+    heads: IntArray  #: ``(C,)`` first node of each
+    marks: IntArray  #: ``(C,)`` number of the search that wrote each slot
+    heap: Heap  #: Nodes to be followed
+    swept: Floats  #: ``(., 7)`` poses and speeds on a move, from where it begins
+    buffer: FloatArray  #: See :func:`~d4orm_planners.manoeuvres.lattice.buffer_size`
 
     @classmethod
     def of(cls, size: int, buffer: int) -> Nodes:
@@ -72,33 +67,19 @@ class Nodes(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Query of a search.
+    """Query of a search."""
 
-    Attributes:
-        body: The robot.
-        primitives: What it can do.
-        limits: For the last stretch, ...
-        curves: ... and those of a first-order car.
-        goal: Where to.
-        lattice: Cells and sectors.
-        costs: Steps to the goal; none in a world without obstacles.
-        weight: Times that these count more than the steps behind.
-        departure_interval: Steps between departures that are tried.
-        horizon: Last step.
-        number: Of the search, different in each that writes to the same nodes.
-    """
-
-    body: RobotBody
-    primitives: Primitives
-    limits: Limits
-    curves: Curves
-    goal: Goal
-    lattice: PoseLattice
-    costs: Costs
-    weight: float
-    departure_interval: int
-    horizon: int
-    number: int
+    body: RobotBody  #: The robot
+    primitives: Primitives  #: What it can do
+    limits: Limits  #: For the last stretch, ...
+    curves: Curves  #: ... and those of a first-order car
+    goal: Goal  #: Where to
+    lattice: PoseLattice  #: Cells and sectors
+    costs: Costs  #: Steps to the goal; none in a world without obstacles
+    weight: float  #: Times that these count more than the steps behind
+    departure_interval: int  #: Steps between departures that are tried
+    horizon: int  #: Last step
+    number: int  #: Of the search, different in each that writes to the same nodes
 
 
 @compiled
@@ -168,3 +149,80 @@ def add(
         nodes.marks[slot], nodes.cells[slot], nodes.heads[slot] = task.number, cell, number
     # A robot that is there too soon has to wait in any case: then the nearest is best.
     push(nodes.heap, max(time, nodes.soonest[0] - remaining) + task.weight * remaining, number)
+
+
+@compiled
+def reaches(goal: Goal, pose: Floats, speed: float, wider: float) -> bool:
+    """Check whether a robot is at its goal in a pose ``(6,)``, radius and heading tolerance so many times as wide."""
+    dx, dy, radius, tolerance = goal.x - pose[0], goal.y - pose[1], goal.radius * wider, goal.tolerance * wider
+    if dx * dx + dy * dy > radius * radius or speed > goal.speed:
+        return False
+    for i in range(MOST_TRAILERS):
+        if abs(goal.hitches[i] - pose[3 + i]) > tolerance:  # not if it is NaN
+            return False
+    return np.isnan(goal.heading) or abs(turned_by(goal.heading - pose[2])) <= tolerance
+
+
+@compiled
+def sweep(task: Task, nodes: Nodes, node: int, move: int) -> int:
+    """Fill in where a move leads, step by step, from the node on; return how many steps."""
+    pose, limits, swept = nodes.pose[node], task.limits, nodes.swept
+    write_pose(swept, 0, pose[0], pose[1], pose[2], pose)
+    swept[0, POSE_SIZE] = 0.0
+    if move >= 0:
+        first, end = task.primitives.first[move], task.primitives.first[move + 1]
+        for step in range(end - first):
+            x, y, heading = moved(pose[0], pose[1], pose[2], task.primitives.poses[first + step])
+            write_pose(swept, step + 1, x, y, heading, task.primitives.poses[first + step])
+            swept[step + 1, POSE_SIZE] = task.primitives.speed[first + step]
+        return end - first
+    way = -1.0 if move == BEHIND else 1.0
+    if limits.way == CURVING:
+        curve = curve_of(task.curves, task.goal, pose[0], pose[1], pose[2], way)
+        if curve[0] == 0 or curve[0] >= MAX_STEPS:
+            return 0
+        count = sweep_curve(task.curves, curve, swept)
+        for step in range(1, count + 1):
+            swept[step, POSE_SIZE] = limits.speed if move == AHEAD else limits.reverse
+        return count
+    snap = snap_of(limits, task.goal, pose[0], pose[1], pose[2], way)
+    count = snap_steps(snap)
+    if count >= MAX_STEPS:
+        return 0
+    for step in range(1, count + 1):
+        x, y, heading, speed = snap_pose(limits, snap, pose[0], pose[1], pose[2], step)
+        write_pose(swept, step, x, y, turned_by(heading), pose)
+        swept[step, POSE_SIZE] = speed
+    return count
+
+
+@compiled
+def stretch_steps(task: Task, x: float, y: float, heading: float, move: int) -> int:
+    """Steps of the last stretch, forwards or backwards; zero for none."""
+    way = -1.0 if move == BEHIND else 1.0
+    if task.limits.way == CURVING:
+        return curve_of(task.curves, task.goal, x, y, heading, way)[0]
+    return snap_steps(snap_of(task.limits, task.goal, x, y, heading, way))
+
+
+@compiled
+def arrives_after(task: Task, nodes: Nodes, count: int) -> int:
+    """Steps of a move after which the robot has arrived: more than it has for none, zero where rounding decides."""
+    for step in range(1, count + 1):
+        pose, speed = nodes.swept[step], nodes.swept[step, POSE_SIZE]
+        if reaches(task.goal, pose, speed, 1.02):
+            return step if reaches(task.goal, pose, speed, 1.0) else 0
+    return count + 1
+
+
+@compiled
+def is_sweep_free(body: RobotBody, swept: Floats, count: int, buffer: FloatArray) -> bool:
+    """Check whether a move is clear of obstacles and bounds, in all parts of all steps."""
+    for step in range(count, 0, -1):
+        before, after = swept[step - 1], swept[step]
+        if is_far_from_all(body, after[0], after[1], body.stride):
+            continue
+        for part in range(body.parts):
+            if not is_free(body, pose_between(before, after, part / body.parts), buffer):
+                return False
+    return True

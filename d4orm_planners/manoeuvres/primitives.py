@@ -7,7 +7,9 @@ primitives is a sequence of controls, and there is nothing to repair.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from functools import cache
+from itertools import product
 from math import sqrt
 from typing import NamedTuple
 
@@ -16,11 +18,20 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem_checks import MOST_TRAILERS
-from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, Kind, Mode, Move
-from d4orm_planners.manoeuvres.model_moves import MOVES
+from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE
+from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION
+from d4orm_planners.manoeuvres.first_order_car_moves import first_order_car_moves
+from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, SECTOR, Kind, Mode, Move, held
 
 POSE_SIZE = 3 + MOST_TRAILERS
 """Numbers of a pose: position, heading and hitch angles, zero for those that there are not."""
+TURNS = (1, 2)
+"""Sectors by which an arc turns, to either side."""
+TURNS_ON_THE_SPOT = (1, 4)
+LENGTHS = (1.5, 6.0)
+"""Lengths of straight primitives, in cells."""
+DIRECTIONS = 8
+"""Directions of a robot without a heading."""
 
 
 class Primitives(NamedTuple):
@@ -28,26 +39,16 @@ class Primitives(NamedTuple):
 
     A *mode* is what of the state is neither position nor heading: speeds, steering and hitch angles. ``S`` is the sum
     of all steps.
-
-    Attributes:
-        begin: ``(M + 1,)`` where those of each mode begin.
-        mode: ``(P,)`` mode that each ends in.
-        first: ``(P + 1,)`` where its steps begin.
-        poses: ``(S, 6)`` position, heading and hitch angles after each step, from where it began.
-        speed: ``(S,)`` [m/s] after each step.
-        rests: ``(M,)`` whether the robot stands in a mode, so that it can wait.
-        reach: ``(P,)`` how far from where it began each leads [m].
-        controls: ``(S, m)``.
     """
 
-    begin: IntArray
-    mode: IntArray
-    first: IntArray
-    poses: Floats
-    speed: Floats
-    rests: BoolArray
-    reach: Floats
-    controls: FloatArray
+    begin: IntArray  #: ``(M + 1,)`` where those of each mode begin
+    mode: IntArray  #: ``(P,)`` mode that each ends in
+    first: IntArray  #: ``(P + 1,)`` where its steps begin
+    poses: Floats  #: ``(S, 6)`` position, heading and hitch angles after each step, from where it began
+    speed: Floats  #: ``(S,)`` [m/s] after each step
+    rests: BoolArray  #: ``(M,)`` whether the robot stands in a mode, so that it can wait
+    reach: Floats  #: ``(P,)`` how far from where it began each leads [m]
+    controls: FloatArray  #: ``(S, m)``
 
 
 @cache
@@ -116,3 +117,148 @@ def _table(rows: list[tuple[int, int, Floats, Floats, FloatArray]], rests: BoolA
         reach=np.array([np.sqrt((row[2][:, :2] ** 2).sum(axis=1)).max() for row in rows]),
         controls=np.concatenate([row[4] for row in rows]),
     )
+
+
+def _most(kind: Kind, side: int) -> float:
+    """Turn rate limit to the left (``side`` is 1) or to the right (-1)."""
+    return kind.limits[TURN_RATE] if side > 0 else kind.lower[TURN_RATE]
+
+
+def _turns(kind: Kind) -> Iterator[tuple[int, float]]:
+    """Steps of turns on the spot, and their turn rates."""
+    for sectors, side in product(TURNS_ON_THE_SPOT, (1, -1)):
+        count = kind.steps(sectors * SECTOR, _most(kind, side))
+        yield count, side * sectors * SECTOR / (count * kind.dt)
+
+
+def _drives(kind: Kind, speed: float) -> Iterator[tuple[int, float]]:
+    """Steps of drives at a speed, straight and in arcs, and their turn rates."""
+    for length in LENGTHS:
+        yield kind.steps(length * kind.cell, speed), 0.0
+    for sectors, side in product(TURNS, (1, -1)):
+        count = max(kind.steps(sectors * SECTOR, _most(kind, side)), kind.steps(LENGTHS[0] * kind.cell, speed))
+        yield count, side * sectors * SECTOR / (count * kind.dt)
+
+
+def _unicycle(kind: Kind) -> Iterator[Move]:
+    for count, rate in _turns(kind):
+        yield (), (), held(count, 0.0, rate)
+    forwards, backwards = (list(_drives(kind, kind.pace(way))) for way in (1, -1))
+    for drives in zip(forwards, backwards, strict=True):
+        for way, (count, rate) in zip((1, -1), drives, strict=True):
+            yield (), (), held(count, way * kind.pace(way), rate)
+
+
+def _differential_drive(kind: Kind) -> Iterator[Move]:
+    speed, most = kind.limits[SPEED], kind.limits[TURN_RATE]
+    for count, rate in _turns(kind):
+        yield (0.0,), (0.0,), held(count, rate, 0.0)
+    turns = [0.0, *(side * sectors * SECTOR for sectors, side in product(TURNS, (1, -1)))]
+    for way, turn in product((1, -1), turns):
+        count = max(kind.speeding_up(speed), kind.steps(abs(turn), most))
+        push, rate = way * speed / (count * kind.dt), turn / (count * kind.dt)
+        yield (0.0,), (way * speed,), held(count, rate, push)
+        yield (way * speed,), (0.0,), held(count, rate, -push)
+        for length in LENGTHS if turn == 0.0 else LENGTHS[:1]:
+            count, peak = kind.hop(length * kind.cell, kind.limits[ACCELERATION])
+            if peak <= speed and 2 * count >= kind.steps(abs(turn), most):
+                rate, push = turn / (2 * count * kind.dt), way * peak / (count * kind.dt)
+                yield (0.0,), (0.0,), np.concatenate([held(count, rate, push), held(count, rate, -push)])
+    for (count, rate), way in product(_drives(kind, speed), (1, -1)):
+        yield (way * speed,), (way * speed,), held(count, rate, 0.0)
+
+
+def _swing(kind: Kind, side: int, turn: float, least: int) -> tuple[int, float]:
+    """Steps to turn faster, and as many to turn slower again, and the turn acceleration."""
+    count = max(kind.hop(turn, kind.limits[MAX_TURN_ACCELERATION])[0], kind.steps(turn, _most(kind, side)), least)
+    return count, side * turn / (count * kind.dt) ** 2
+
+
+def _paced(kind: Kind, way: int, speed: float, turn: float) -> Iterator[Move]:
+    """Speeding up, slowing down and going on, and from rest to rest, at a turn rate or steering angle that is held."""
+    count, rest, going = kind.speeding_up(speed), (0.0, turn), (way * speed, turn)
+    push = way * speed / (count * kind.dt)
+    yield rest, going, held(count, push, 0.0)
+    yield going, rest, held(count, -push, 0.0)
+    for length in LENGTHS:
+        yield going, going, held(kind.steps(length * kind.cell, speed), 0.0, 0.0)
+        count, peak = kind.hop(length * kind.cell, kind.limits[ACCELERATION])
+        if peak <= speed:
+            push = way * peak / (count * kind.dt)
+            yield rest, rest, np.concatenate([held(count, push, 0.0), held(count, -push, 0.0)])
+
+
+def _unicycle2(kind: Kind) -> Iterator[Move]:
+    rest = (0.0, 0.0)
+    for sectors, side in product(TURNS_ON_THE_SPOT, (1, -1)):
+        count, swing = _swing(kind, side, sectors * SECTOR, 1)
+        yield rest, rest, np.concatenate([held(count, 0.0, swing), held(count, 0.0, -swing)])
+    for way in (1, -1):
+        speed = kind.pace(way)
+        yield from _paced(kind, way, speed, 0.0)
+        going = (way * speed, 0.0)
+        for sectors, side in product(TURNS, (1, -1)):
+            least = kind.steps(LENGTHS[0] * kind.cell / 2, speed)
+            count, swing = _swing(kind, side, sectors * SECTOR, least)
+            yield going, going, np.concatenate([held(count, 0.0, swing), held(count, 0.0, -swing)])
+
+
+def _car(kind: Kind) -> Iterator[Move]:
+    speed, (most, quickest, _) = kind.limits[SPEED], kind.limits[OWN_LIMITS : OWN_LIMITS + 3]
+    wheels = (-most, 0.0, most)
+    swing = kind.steps(most, quickest)
+    for old, new in ((0, 1), (1, 0), (1, 2), (2, 1)):
+        rate = (wheels[new] - wheels[old]) / (swing * kind.dt)
+        for pace in (0.0, speed, -speed):
+            yield (pace, wheels[old]), (pace, wheels[new]), held(swing, 0.0, rate)
+    for way, wheel in product((1, -1), wheels):
+        yield from _paced(kind, way, speed, wheel)
+
+
+def _compass() -> Iterator[tuple[float, float]]:
+    for number in range(DIRECTIONS):
+        sine, cosine = portable.sin_cos(np.float64(number * 2 * np.pi / DIRECTIONS))
+        yield float(cosine), float(sine)
+
+
+def _velocity2d(kind: Kind) -> Iterator[Move]:
+    most = kind.limits[SPEED]
+    for (x, y), length in product(_compass(), LENGTHS):
+        yield (), (), held(kind.steps(length * kind.cell, most), most * x, most * y)
+
+
+def _holonomic2d(kind: Kind) -> Iterator[Move]:
+    most, ways, rest = kind.limits[SPEED], list(_compass()), (0.0, 0.0)
+    for number, (x, y) in enumerate(ways):
+        going, count = (most * x, most * y), kind.speeding_up(most)
+        push = most / (count * kind.dt)
+        yield rest, going, held(count, push * x, push * y)
+        yield going, rest, held(count, -push * x, -push * y)
+        for side in (1, -1):
+            other = ways[(number + side) % DIRECTIONS]
+            gap = (other[0] - x, other[1] - y)
+            count = kind.speeding_up(most * sqrt(gap[0] ** 2 + gap[1] ** 2))
+            push = most / (count * kind.dt)
+            yield going, (most * other[0], most * other[1]), held(count, push * gap[0], push * gap[1])
+        for length in LENGTHS:
+            yield going, going, held(kind.steps(length * kind.cell, most), 0.0, 0.0)
+        count, peak = kind.hop(LENGTHS[0] * kind.cell, kind.limits[ACCELERATION])
+        if peak <= most:
+            push = peak / (count * kind.dt)
+            yield rest, rest, np.concatenate([held(count, push * x, push * y), held(count, -push * x, -push * y)])
+
+
+MOVES: dict[str, Callable[[Kind], Iterator[Move]]] = {
+    "unicycle": _unicycle,
+    "unicycle1": _unicycle,
+    "unicycle2": _unicycle2,
+    "differential_drive": _differential_drive,
+    "car": _car,
+    "velocity2d": _velocity2d,
+    "holonomic2d": _holonomic2d,
+    "car_with_1_trailer": first_order_car_moves,
+    "car_with_2_trailers": first_order_car_moves,
+    "car_with_3_trailers": first_order_car_moves,
+    "car_first_order": first_order_car_moves,
+}
+"""Models that there are primitives for."""

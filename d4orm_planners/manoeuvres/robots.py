@@ -14,11 +14,11 @@ from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION, UNICYCLE2
 from d4orm_planners.manoeuvres.costs import Area, Costs, costs_of
-from d4orm_planners.manoeuvres.curves import NO_CURVES, Curves, curves_of
+from d4orm_planners.manoeuvres.curves import NO_CURVES, curves_of
 from d4orm_planners.manoeuvres.kinds import SECTORS, Kind
-from d4orm_planners.manoeuvres.lattice import PoseLattice, RobotBody
-from d4orm_planners.manoeuvres.model_moves import MOVES
-from d4orm_planners.manoeuvres.primitives import POSE_SIZE, Primitives, primitives_of
+from d4orm_planners.manoeuvres.lattice import RobotBody
+from d4orm_planners.manoeuvres.nodes import Task
+from d4orm_planners.manoeuvres.primitives import MOVES, POSE_SIZE, primitives_of
 from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, TURNING, Goal, Limits
 
 CELLS_PER_RADIUS = 3
@@ -34,24 +34,22 @@ MAX_PARTS = 8
 """Most poses that are looked at in a step."""
 CERTAIN = 0.98
 """Share of a goal's radius, heading tolerance and speed within which a robot is at its goal beyond doubt."""
+WEIGHT = 1.5
+"""Factor by which the steps ahead of a node count more than those behind it."""
+DEPARTURE_INTERVAL = 0.7
+"""Time between departures that are tried, as a share of that in which the fastest robot drives the radius of the
+largest one."""
 
 
 class ManoeuvreScene(NamedTuple):
-    """Data that all robots of a team share.
-
-    Attributes:
-        problem: The problem.
-        area: The part of the plane that robots may use.
-        arrays: The problem's arrays, of one type for all problems, with an index of all obstacles within reach.
-        extra: Distance kept from everything [m].
-        bent: ``(K,)`` whether trailers have to be in a bend at the robot's goal.
-    """
+    """Data that all robots of a team share."""
 
     problem: Problem
-    area: Area
+    area: Area  #: The part of the plane that robots may use
+    #: The problem's arrays, of one type for all problems, with an index of all obstacles within reach
     arrays: ProblemArrays
-    extra: float
-    bent: BoolArray
+    extra: float  #: Distance kept from everything [m]
+    bent: BoolArray  #: ``(K,)`` whether trailers have to be in a bend at the robot's goal
 
     @property
     def interaction_range(self) -> float:
@@ -167,31 +165,12 @@ def _room(problem: Problem, states: FloatArray, enough: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot, as the search reads it.
-
-    Attributes:
-        model: Its model.
-        start: ``(6,)`` pose.
-        mode: That it starts in.
-        goal: Where to.
-        limits: For the last stretch.
-        curves: For that of a first-order car.
-        body: Among the obstacles.
-        primitives: What it can do.
-        lattice: Cells and sectors round its start's heading.
-        costs: Steps to the goal.
-    """
+    """A robot, as the search reads it."""
 
     model: Model
-    start: Floats
-    mode: int
-    goal: Goal
-    limits: Limits
-    curves: Curves
-    body: RobotBody
-    primitives: Primitives
-    lattice: PoseLattice
-    costs: Costs
+    start: Floats  #: ``(6,)`` pose
+    mode: int  #: That it starts in
+    task: Task  #: What a search for its motion is told
 
 
 def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
@@ -216,8 +195,9 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     if problem.world.num_obstacles or last.way in (NOWHERE, CURVING):
         costs = costs_of(kind, area, body, start, goal, problem.num_robots, bent)
     curves = curves_of(kind.base, bent, hitches) if last.way == CURVING else NO_CURVES
-    mode = modes.index(kind.start)
-    return Robot(model, start, mode, goal, last, curves, body, primitives, lattice, costs)
+    interval = max(1, round(DEPARTURE_INTERVAL * float(problem.team.radius.max()) / problem.stride))
+    task = Task(body, primitives, last, curves, goal, lattice, costs, WEIGHT, interval, problem.horizon, number=0)
+    return Robot(model, start, modes.index(kind.start), task)
 
 
 def _limits(kind: Kind) -> Limits:

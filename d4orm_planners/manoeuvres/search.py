@@ -13,11 +13,24 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
+from d4orm_planners.manoeuvres.costs import pop
 from d4orm_planners.manoeuvres.curves import Curve, Curves, curve_of
-from d4orm_planners.manoeuvres.heaps import pop
 from d4orm_planners.manoeuvres.lattice import cell_of, is_far_from_all, moved, pose_of
-from d4orm_planners.manoeuvres.moves import AHEAD, BEHIND, arrives_after, is_sweep_free, reaches, stretch_steps, sweep
-from d4orm_planners.manoeuvres.nodes import Nodes, Task, add, cost_to_go, is_dominated, slot_of
+from d4orm_planners.manoeuvres.nodes import (
+    AHEAD,
+    BEHIND,
+    Nodes,
+    Task,
+    add,
+    arrives_after,
+    cost_to_go,
+    is_dominated,
+    is_sweep_free,
+    reaches,
+    slot_of,
+    stretch_steps,
+    sweep,
+)
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, Goal, Limits, Snap, snap_of
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_since, safe_until, visits_of

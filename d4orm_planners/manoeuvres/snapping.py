@@ -19,51 +19,29 @@ NEAR = 1e-3
 
 
 class Limits(NamedTuple):
-    """Abilities of a robot.
+    """Abilities of a robot."""
 
-    Attributes:
-        way: One of :data:`NOWHERE`, :data:`TURNING`, :data:`SIDEWAYS` and :data:`CURVING`.
-        speed: [m/s].
-        reverse: Speed backwards [m/s].
-        acceleration: [m/s^2], infinite for first-order robots.
-        left: Turn rate to the left [rad/s].
-        right: The same to the right.
-        turn_acceleration: [rad/s^2], infinite for robots that take any turn rate at once.
-        dt: Time step [s].
-    """
-
-    way: int
-    speed: float
-    reverse: float
-    acceleration: float
-    left: float
-    right: float
-    turn_acceleration: float
-    dt: float
+    way: int  #: One of :data:`NOWHERE`, :data:`TURNING`, :data:`SIDEWAYS` and :data:`CURVING`
+    speed: float  #: [m/s]
+    reverse: float  #: Speed backwards [m/s]
+    acceleration: float  #: [m/s^2], infinite for first-order robots
+    left: float  #: Turn rate to the left [rad/s]
+    right: float  #: The same to the right
+    turn_acceleration: float  #: [rad/s^2], infinite for robots that take any turn rate at once
+    dt: float  #: Time step [s]
 
 
 class Goal(NamedTuple):
-    """A robot's goal.
+    """A robot's goal."""
 
-    Attributes:
-        x: [m].
-        y: [m].
-        heading: [rad], NaN for any.
-        hitches: Hitch angles [rad], NaN for any.
-        radius: Distance at which the robot has arrived beyond doubt [m].
-        tolerance: The same of its heading [rad].
-        speed: The same of its speed [m/s].
-        docks: Whether the robot stays wherever it first arrives.
-    """
-
-    x: float
-    y: float
-    heading: float
-    hitches: tuple[float, float, float]
-    radius: float
-    tolerance: float
-    speed: float
-    docks: bool
+    x: float  #: [m]
+    y: float  #: [m]
+    heading: float  #: [rad], NaN for any
+    hitches: tuple[float, float, float]  #: Hitch angles [rad], NaN for any
+    radius: float  #: Distance at which the robot has arrived beyond doubt [m]
+    tolerance: float  #: The same of its heading [rad]
+    speed: float  #: The same of its speed [m/s]
+    docks: bool  #: Whether the robot stays wherever it first arrives
 
 
 Leg: TypeAlias = tuple[int, int, float]

@@ -1,4 +1,6 @@
-"""The motions of a team: planned one robot after another among the others, and replanned for a few at a time."""
+"""The motions of a team, with which the hybrid planner begins and which it improves in every iteration: planned one
+robot after another among the others, and replanned for a few at a time.
+"""
 
 from __future__ import annotations
 
@@ -9,43 +11,43 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_planners.manoeuvres.curves import curve_controls
+from d4orm_env.footprints import Box
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.manoeuvres.curves import NO_CURVES, curve_controls
 from d4orm_planners.manoeuvres.lattice import buffer_size
-from d4orm_planners.manoeuvres.nodes import Nodes, Task
+from d4orm_planners.manoeuvres.nodes import AHEAD, Nodes, Task
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, curve_from, find_motion, snap_from, trace
 from d4orm_planners.manoeuvres.snapping import CURVING, snap_controls
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
-from d4orm_planners.mapf.lns import Odds
+from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
 
 MAX_NODES = 100_000
 """Nodes after which a search gives up, ..."""
 FIRST_NODES = 400_000
 """... and among others at first a robot's share of so many, once more after every four searches of each: in a large
 team it is quicker to change others' motions."""
-WEIGHT = 1.5
-"""Factor by which the steps ahead of a node count more than those behind it."""
 FINER = (0.8, 0.6)
 """Sizes of cells that are tried in turn for a robot without a motion alone, as shares of the usual one: whether poses
 that count as one leave a way through a tight place is chance."""
-DEPARTURE_INTERVAL = 0.7
-"""Time between departures that are tried, as a share of that in which the fastest robot drives the radius of the
-largest one."""
+ROUNDS = 200
+"""Neighbourhoods that are replanned to find a motion for everybody."""
+BETTER_ROUNDS = 16
+"""Neighbourhoods that are replanned in an iteration once everybody has one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A robot's motion.
+    """A robot's motion."""
 
-    Attributes:
-        poses: ``(T + 1, 6)`` float32.
-        controls: ``(T, m)``.
-    """
-
-    poses: FloatArray
-    controls: FloatArray
+    poses: FloatArray  #: ``(T + 1, 6)`` float32
+    controls: FloatArray  #: ``(T, m)``
 
     @property
     def steps(self) -> int:
@@ -204,7 +206,7 @@ class TeamMotions:
     def _find(self, number: int, traffic: Traffic) -> Motion | None:
         """A robot's motion among others: that which it would take alone, or else one that is looked for."""
         alone, team = self.alone[number], len(self.robots)
-        if alone is not None and meets_nobody(self.robots[number].body, traffic, alone.poses, self._nodes.buffer):
+        if alone is not None and meets_nobody(self.robots[number].task.body, traffic, alone.poses, self._nodes.buffer):
             return alone
         self._searches += 1
         most = FIRST_NODES // team * (1 + self._searches // (4 * team))
@@ -212,12 +214,8 @@ class TeamMotions:
 
     def _search(self, number: int, traffic: Traffic, nodes: Nodes, search: int, most: int) -> Motion | None:
         """Look for a robot's motion in about so many nodes."""
-        robot, problem = self.robots[number], self.problem
-        departure_interval = max(1, round(DEPARTURE_INTERVAL * float(problem.team.radius.max()) / problem.stride))
-        task = Task(
-            robot.body, robot.primitives, robot.limits, robot.curves, robot.goal, robot.lattice, robot.costs, WEIGHT,
-            departure_interval, problem.horizon, search,
-        )  # fmt: skip
+        robot = self.robots[number]
+        task = robot.task._replace(number=search)
         nodes.filled[0] = 0
         goes_on, node = False, PAUSED
         while node == PAUSED and nodes.filled[0] < most and not self.should_stop():
@@ -253,12 +251,58 @@ def _motion(robot: Robot, task: Task, nodes: Nodes, node: int) -> Motion:
 
 def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:
     """``(n, m)`` controls of a move from a pose."""
+    task, (x, y, heading) = robot.task, pose[:3]
     if move >= 0:
-        first, end = robot.primitives.first[move : move + 2]
-        return robot.primitives.controls[first:end]
-    x, y, heading = pose[0], pose[1], pose[2]
-    if robot.limits.way == CURVING:
-        curve = curve_from(robot.curves, robot.goal, x, y, heading, move)
-        return curve_controls(robot.curves, curve, robot.limits.dt)
-    controls = snap_controls(robot.limits, snap_from(robot.limits, robot.goal, x, y, heading, move))
+        first, end = task.primitives.first[move : move + 2]
+        return task.primitives.controls[first:end]
+    if task.limits.way == CURVING:
+        curve = curve_from(task.curves, task.goal, x, y, heading, move)
+        return curve_controls(task.curves, curve, task.limits.dt)
+    controls = snap_controls(task.limits, snap_from(task.limits, task.goal, x, y, heading, move))
     return controls[:, ::-1] if robot.model.name == "differential_drive" else controls
+
+
+def compile_manoeuvres() -> None:
+    """Compile the search, if it is not yet: it is the same for all models."""
+    if find_motion.signatures:
+        return
+    start = [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
+    world = World(boxes=[[0.5, 0.8, 0.6, 1.2]])
+    team = Team(("unicycle",) * 2, footprint=Box(0.4, 0.2))
+    problem = Problem(team, start, [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
+    motions = TeamMotions.prepared(problem, lambda: False)
+    assert motions is not None
+    motions.plan_all()
+    curve_from(NO_CURVES, motions.robots[0].task.goal, 0.0, 0.0, 0.0, AHEAD)
+
+
+def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
+    """Motions of the whole team, or of some robots if time is up; ``None`` if not all have one after :data:`ROUNDS`."""
+    with search.watch.paused():
+        compile_manoeuvres()
+    motions = TeamMotions.prepared(search.problem, search.should_stop)
+    if motions is None:
+        return None
+    motions.plan_all()
+    return motions if _complete(search, motions) or search.should_stop() else None
+
+
+def _complete(search: SolveRun, motions: TeamMotions) -> bool:
+    """Replan neighbourhoods of robots without a motion until there are none; return whether that is so."""
+    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
+    for _ in range(ROUNDS):
+        if not motions.missing or search.should_stop():
+            break
+        search_neighbourhoods(motions, random, 1, search.should_stop)
+    return not motions.missing
+
+
+def improve_manoeuvres(search: SolveRun, motions: TeamMotions) -> Iteration:
+    """The team's controls, after robots whose motions fail have new ones, or else some have looked for faster ones."""
+    motions.leave_out(np.flatnonzero(search.current.unsolved).tolist())
+    if motions.missing:
+        _complete(search, motions)
+        return Iteration(motions.controls())
+    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
+    search_neighbourhoods(motions, random, BETTER_ROUNDS, search.should_stop)
+    return Iteration(motions.controls())

@@ -18,27 +18,16 @@ NEVER = 1 << 40
 
 
 class Traffic(NamedTuple):
-    """The motions of other robots, and a grid of who comes near to its cells when.
+    """The motions of other robots, and a grid of who comes near to its cells when."""
 
-    Attributes:
-        poses: ``(K, T + 1, 6)`` float32.
-        last: ``(K,)`` number of the last step at which each moves; it stays there, ...
-        gone: ``(K,)`` ... but is there no more from this step on.
-        low: ``(2,)`` lowest corner of the grid [m].
-        scale: One over the size of its cells [1/m], beyond which robots do not meet in a step.
-        size: ``(2,)`` cells along x and y.
-        first: ``(C + 1,)`` where the visits to each cell begin.
-        visits: ``(V, 3)`` the robot that comes near, and the first and the last step.
-    """
-
-    poses: FloatArray
-    last: IntArray
-    gone: IntArray
-    low: Floats
-    scale: float
-    size: tuple[int, int]
-    first: IntArray
-    visits: IntArray
+    poses: FloatArray  #: ``(K, T + 1, 6)`` float32
+    last: IntArray  #: ``(K,)`` number of the last step at which each moves; it stays there, ...
+    gone: IntArray  #: ``(K,)`` ... but is there no more from this step on
+    low: Floats  #: ``(2,)`` lowest corner of the grid [m]
+    scale: float  #: One over the size of its cells [1/m], beyond which robots do not meet in a step
+    size: tuple[int, int]  #: ``(2,)`` cells along x and y
+    first: IntArray  #: ``(C + 1,)`` where the visits to each cell begin
+    visits: IntArray  #: ``(V, 3)`` the robot that comes near, and the first and the last step
 
 
 @compiled

@@ -1,5 +1,5 @@
-"""Queries of a beam search, and the paths that it has found so far, compiled with numba: those in the beam, and all
-that ever were.
+"""Queries of a beam search, whom their paths meet, and the paths found so far: those in the beam, and all that ever
+were. Compiled with numba.
 """
 
 from __future__ import annotations
@@ -10,115 +10,70 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, Whole
 from d4orm_env.engine.compiling import compiled
+from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
 
 
 class BeamRules(NamedTuple):
-    """Rules by which the beam keeps paths.
+    """Rules by which the beam keeps paths."""
 
-    Attributes:
-        width: Number of paths.
-        contact: Cost of being near another robot in a block [s].
-        dedup_distance: Least distance between two, or else twice as much in speed [m, m/s].
-    """
-
-    width: int
-    contact: float
-    dedup_distance: float
+    width: int  #: Number of paths
+    contact: float  #: Cost of being near another robot in a block [s]
+    dedup_distance: float  #: Least distance between two, or else twice as much in speed [m, m/s]
 
 
 class OtherAgents(NamedTuple):
-    """Agents that robots which look for a path avoid, other than the team as it drives at present.
+    """Agents that robots which look for a path avoid, other than the team as it drives at present."""
 
-    Attributes:
-        exclude: ``(R, N)`` numbers of robots that each does not mind, its own among them.
-        extra: ``(R, M, H+1, d)`` paths that it minds as well [m].
-        radius: ``(R, M)`` radii of the agents on them [m].
-    """
-
-    exclude: IntArray
-    extra: FloatArray
-    radius: Floats
+    exclude: IntArray  #: ``(R, N)`` numbers of robots that each does not mind, its own among them
+    extra: FloatArray  #: ``(R, M, H+1, d)`` paths that it minds as well [m]
+    radius: Floats  #: ``(R, M)`` radii of the agents on them [m]
 
 
 class Queries(NamedTuple):
-    """Robots that look for paths.
+    """Robots that look for paths."""
 
-    Attributes:
-        robots: ``(R,)`` their numbers in the team.
-        blocks: ``(R,)`` the block at whose beginning their new paths begin,
-        states: ``(R, n)`` and in which state.
-        limits: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost.
-        others: Agents that they mind, or do not mind.
-    """
-
-    robots: IntArray
-    blocks: IntArray
-    states: FloatArray
+    robots: IntArray  #: ``(R,)`` their numbers in the team
+    blocks: IntArray  #: ``(R,)`` the block at whose beginning their new paths begin,
+    states: FloatArray  #: ``(R, n)`` and in which state
+    #: ``(R,)`` what their paths must cost less than [s]: the step at which one ends, and what contacts cost
     limits: Floats
-    others: OtherAgents
+    others: OtherAgents  #: Agents that they mind, or do not mind
 
 
 class Beam(NamedTuple):
-    """Up to ``N`` paths as far as they have come.
+    """Up to ``N`` paths as far as they have come."""
 
-    Attributes:
-        states: ``(N, n)``.
-        velocities: ``(N, d)``.
-        faults: ``(N,)`` robots met, block by block.
-        costs: ``(N,)`` what they cost at least, as it seems, but for that [s].
-        bounds: ``(N,)`` what they cost at least, robots met so far included [s].
-        before: ``(N,)`` number of the path that each goes on from: in the beam before, or ever.
-        moves: ``(N,)`` what was done in the last block.
-        paths: ``(N, BLOCK, d)`` positions in it [m].
-    """
-
-    states: FloatArray
-    velocities: FloatArray
-    faults: Floats
-    costs: Floats
-    bounds: Floats
-    before: IntArray
-    moves: IntArray
-    paths: FloatArray
+    states: FloatArray  #: ``(N, n)``
+    velocities: FloatArray  #: ``(N, d)``
+    faults: Floats  #: ``(N,)`` robots met, block by block
+    costs: Floats  #: ``(N,)`` what they cost at least, as it seems, but for that [s]
+    bounds: Floats  #: ``(N,)`` what they cost at least, robots met so far included [s]
+    before: IntArray  #: ``(N,)`` number of the path that each goes on from: in the beam before, or ever
+    moves: IntArray  #: ``(N,)`` what was done in the last block
+    paths: FloatArray  #: ``(N, BLOCK, d)`` positions in it [m]
 
 
 class PathTree(NamedTuple):
-    """All paths ever kept.
+    """All paths ever kept."""
 
-    Attributes:
-        before: ``(N,)`` what each goes on from ...
-        moves: ``(N,)`` ... and by what.
-        used: ``(1,)`` how many there are.
-    """
-
-    before: IntArray
-    moves: IntArray
-    used: IntArray
+    before: IntArray  #: ``(N,)`` what each goes on from ...
+    moves: IntArray  #: ``(N,)`` ... and by what
+    used: IntArray  #: ``(1,)`` how many there are
 
 
 class BeamSpace(NamedTuple):
-    """Workspace of a search.
+    """Workspace of a search."""
 
-    Attributes:
-        beam: The paths kept after the last block.
-        numbers: ``(width,)`` their numbers among all ever kept.
-        new: Those that go on from there, and room for one more.
-        heap: ``(N,)`` numbers of these that may still be kept, the most promising first.
-        counted: ``(N, 2)`` bool, those of which it is known what they do wrong by themselves in the last block, and
-            whom they meet there.
-        ever: All ever kept.
-        did: ``(B,)`` the moves of the path found, the last first.
-        lanes: Workspace of :mod:`~d4orm_planners.mapf.block_drives`.
-    """
-
-    beam: Beam
-    numbers: IntArray
-    new: Beam
-    heap: IntArray
+    beam: Beam  #: The paths kept after the last block
+    numbers: IntArray  #: ``(width,)`` their numbers among all ever kept
+    new: Beam  #: Those that go on from there, and room for one more
+    heap: IntArray  #: ``(N,)`` numbers of these that may still be kept, the most promising first
+    #: ``(N, 2)`` bool, those of which it is known what they do wrong by themselves in the last block, and whom they
+    #: meet there
     counted: BoolArray
-    ever: PathTree
-    did: IntArray
-    lanes: FloatArray
+    ever: PathTree  #: All ever kept
+    did: IntArray  #: ``(B,)`` the moves of the path found, the last first
+    lanes: FloatArray  #: Workspace of :mod:`~d4orm_planners.mapf.motion_primitives`
 
 
 def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
@@ -128,12 +83,12 @@ def _make_beam(size: int, n: int, d: int, steps: int) -> Beam:
     )  # fmt: skip
 
 
-def make_beam_space(width: int, num_moves: int, num_blocks: int, block: int, n: int, d: int, lanes: int) -> BeamSpace:
+def make_beam_space(width: int, num_moves: int, num_blocks: int, n: int, d: int, lanes: int) -> BeamSpace:
     """Workspace for a beam of so many paths, moves and blocks of steps, with so many numbers for block drives."""
     before, moves = np.empty((2, width * num_blocks), np.int64)
     most = width * num_moves
     return BeamSpace(
-        _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, block),
+        _make_beam(width, n, d, 0), np.empty(width, np.int64), _make_beam(most + 1, n, d, BLOCK),
         np.empty(most, np.int64), np.empty((most, 2), np.bool_), PathTree(before, moves, np.empty(1, np.int64)),
         np.empty(num_blocks, np.int64), np.zeros(lanes, np.float32),
     )  # fmt: skip
@@ -190,3 +145,45 @@ def trace_back(ever: PathTree, number: Whole, move: Whole, did: IntArray) -> int
     while number >= 0:
         did[length], number, length = ever.moves[number], ever.before[number], length + 1
     return length
+
+
+@compiled
+def _count_extra(
+    table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, first: Whole, last: Whole
+) -> int:
+    """Count the extra paths that a path meets from one step to another; at its end it is at rest."""
+    count, end = 0, path.shape[0] - 1
+    for other in range(others.extra.shape[1]):
+        safety_distance = table.radius[robot] + others.radius[r, other] + table.margin
+        for t in range(first, last):
+            gap2 = 0.0
+            for axis in range(path.shape[1]):
+                position = np.float64(path[min(t - first, end), axis])
+                gap = position - np.float64(others.extra[r, other, t, axis])
+                gap2 += gap * gap
+            if gap2 <= safety_distance * safety_distance:
+                count += 1
+                break
+    return count
+
+
+@compiled
+def count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
+    """Count the robots that a path meets in a block."""
+    robot, (first, last) = queries.robots[r], steps_of(table, block)
+    count = count_near(table, robot, queries.others.exclude[r], path, first, block)
+    return count + _count_extra(table, robot, queries.others, r, path, first, last)
+
+
+@compiled
+def count_passing(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
+    """Count the robots that come by after a block that ended at the goal, where this one stays; ``path`` is changed."""
+    robot, others, (first, last) = queries.robots[r], queries.others, steps_of(table, block)
+    for row in range(path.shape[0]):
+        for axis in range(path.shape[1]):
+            path[row, axis] = path[last - first - 1, axis]
+    # In the block after the last in which anybody moves all are where they stay.
+    count, last_busy = 0, min(table.first.shape[0] - 1, table.moving[0] + 1)
+    for later in range(block + 1, last_busy + 1):
+        count += count_near(table, robot, others.exclude[r], path, steps_of(table, later)[0], later)
+    return count + _count_extra(table, robot, others, r, path, last, len(table.positions))

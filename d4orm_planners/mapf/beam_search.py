@@ -1,4 +1,4 @@
-"""Beam search of one robot's path in space and time among the known paths of all others, compiled with numba.
+"""Beam search of robots' paths in space and time among the known paths of all others, compiled with numba.
 
 A path is made of pieces of a block of steps each, in which the robot heads for its goal, faster or slower, stops, or
 turns off by some angle. After every block the most promising of the paths so far are kept.
@@ -6,11 +6,12 @@ turns off by some angle. After every block the most promising of the paths so fa
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, IntArray, Whole
 from d4orm_env.core.problem_arrays import ProblemArrays
@@ -18,70 +19,51 @@ from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
 from d4orm_env.engine.borrowing import borrow
 from d4orm_env.engine.caching import Kernel, cached_kernel
-from d4orm_env.engine.compiling import WITHOUT_ARRAYS, compiled, inlined, to_fixed_tuple
+from d4orm_env.engine.compiling import WITHOUT_ARRAYS, inlined, to_fixed_tuple
 from d4orm_env.engine.elementary import OPS
 from d4orm_env.engine.simd import TILE
 from d4orm_env.engine.stepping import Row, models_key
-from d4orm_planners.engine.path_table import BLOCK, PathTable, count_near, steps_of
+from d4orm_env.engine.threads import Threads, available_cores
+from d4orm_planners.base.working_plan import WorkingPlan
+from d4orm_planners.engine.path_table import BLOCK, PathTable, steps_of
 from d4orm_planners.mapf.beam import (
     Beam,
     BeamRules,
     BeamSpace,
     OtherAgents,
     Queries,
+    count_met,
+    count_passing,
     is_like_another,
     keep,
+    make_beam_space,
     sink,
     trace_back,
 )
-from d4orm_planners.mapf.block_drives import block_driver, count_faults, end_of, path_reader, read_positions
-from d4orm_planners.mapf.motion_primitives import Moves, aiming, frame_at
+from d4orm_planners.mapf.motion_primitives import (
+    LANES,
+    MotionPrimitives,
+    Moves,
+    aiming,
+    block_driver,
+    count_faults,
+    end_of,
+    frame_at,
+    path_reader,
+    read_positions,
+)
+from d4orm_planners.tracking.steering import Rollouts, by_model
 from d4orm_planners.tracking.tracker import tracker
 
 Ending: TypeAlias = tuple[float, Whole, Whole]
 """Cost of the best path that arrives [s], the path that it goes on from, and its last move; -1 if there is none."""
 
 
-@compiled
-def _count_extra(
-    table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, first: Whole, last: Whole
-) -> int:
-    """Count the extra paths that a path meets from one step to another; at its end it is at rest."""
-    count, end = 0, path.shape[0] - 1
-    for other in range(others.extra.shape[1]):
-        safety_distance = table.radius[robot] + others.radius[r, other] + table.margin
-        for t in range(first, last):
-            gap2 = 0.0
-            for axis in range(path.shape[1]):
-                position = np.float64(path[min(t - first, end), axis])
-                gap = position - np.float64(others.extra[r, other, t, axis])
-                gap2 += gap * gap
-            if gap2 <= safety_distance * safety_distance:
-                count += 1
-                break
-    return count
-
-
-@compiled
-def _count_met(table: PathTable, queries: Queries, r: int, path: FloatArray, block: Whole) -> int:
-    """Count the robots that a path meets in a block."""
-    robot, (first, last) = queries.robots[r], steps_of(table, block)
-    count = count_near(table, robot, queries.others.exclude[r], path, first, block)
-    return count + _count_extra(table, robot, queries.others, r, path, first, last)
-
-
 @inlined
 def _keep_best(
-    space: BeamSpace,
-    count: Whole,
-    best: float,
-    rules: BeamRules,
-    arrays: ProblemArrays,
-    table: PathTable,
-    queries: Queries,
-    r: int,
-    block: Whole,
-) -> Whole:
+    arrays: ProblemArrays, table: PathTable, rules: BeamRules, queries: Queries, r: int,
+    space: BeamSpace, count: Whole, block: Whole, best: float,
+) -> Whole:  # fmt: skip
     """Keep the most promising of ``count`` paths, of those that are alike the better one; return how many.
 
     Most are worse than those kept whatever they touch or meet. So that is counted of one only when its turn comes,
@@ -109,26 +91,11 @@ def _keep_best(
             if not counted[node, 0]:
                 faults, counted[node, 0] = count_faults(arrays, robot, end - begin, end, new.paths[node]), True
             if faults == 0.0:
-                faults, counted[node, 1] = float(_count_met(table, queries, r, new.paths[node], block)), True
+                faults, counted[node, 1] = float(count_met(table, queries, r, new.paths[node], block)), True
             new.faults[node] += faults
             new.bounds[node] = rules.contact * new.faults[node] + new.costs[node]
         sink(new.bounds, heap, root, count)
     return size
-
-
-@compiled
-def _count_passing(
-    table: PathTable, robot: Whole, others: OtherAgents, r: int, path: FloatArray, block: Whole, last_busy: Whole
-) -> int:
-    """Count the robots that come by after a block that ended at the goal, where this one stays; ``path`` is changed."""
-    first, last = steps_of(table, block)
-    for row in range(path.shape[0]):
-        for axis in range(path.shape[1]):
-            path[row, axis] = path[last - first - 1, axis]
-    count = 0
-    for later in range(block + 1, last_busy + 1):
-        count += count_near(table, robot, others.exclude[r], path, steps_of(table, later)[0], later)
-    return count + _count_extra(table, robot, others, r, path, last, len(table.positions))
 
 
 def _move_follower(model: Model) -> Callable[..., int]:
@@ -171,7 +138,7 @@ def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
         space: BeamSpace, size: Whole, block: Whole, ending: Ending,
     ) -> tuple[Whole, Ending]:  # fmt: skip
         beam, new, numbers, lanes = space.beam, space.new, space.numbers, space.lanes
-        robot, (begin, end), last_busy = queries.robots[r], steps_of(table, block), _last_busy(table)
+        robot, (begin, end) = queries.robots[r], steps_of(table, block)
         count, num_moves = np.int64(0), moves.pace.shape[0]
         best, best_number, best_move = ending
         for first in range(0, size * num_moves, TILE):
@@ -189,8 +156,8 @@ def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
                     if rules.contact * faults + cost >= best:
                         continue
                     # It stays there: whoever comes by later counts too.
-                    faults += _count_met(table, queries, r, path, block)
-                    faults += _count_passing(table, robot, queries.others, r, path, block, last_busy)
+                    faults += count_met(table, queries, r, path, block)
+                    faults += count_passing(table, queries, r, path, block)
                     if rules.contact * faults + cost < best:
                         best, best_number, best_move = rules.contact * faults + cost, numbers[node], number
                     continue
@@ -202,14 +169,8 @@ def _path_grower(model: Model) -> Callable[..., tuple[Whole, Ending]]:
     return grow_paths
 
 
-@inlined
-def _last_busy(table: PathTable) -> Whole:
-    """Number of the last block in which anybody moves, or the one after it."""
-    return min(table.first.shape[0] - 1, table.moving[0] + 1)
-
-
 Search: TypeAlias = Kernel[
-    [ProblemArrays, PathTable, Moves, BeamRules, Queries, IntArray, BeamSpace, FloatArray, FloatArray, BoolArray], None
+    [ProblemArrays, PathTable, Moves, BeamRules, Queries, int, BeamSpace, FloatArray, FloatArray, BoolArray], None
 ]
 """A kernel of :func:`search_kernel`."""
 
@@ -218,8 +179,8 @@ Search: TypeAlias = Kernel[
 def search_kernel(name: str) -> Search:
     """The compiled search for robots of the model with this name.
 
-    For a range of the queries it fills controls ``u`` ``(R, H, m)`` and states ``x`` ``(R, H+1, n)`` from where their
-    paths begin, and says in ``found`` ``(R,)`` whether a path arrives; if none does, the rest is left alone.
+    For query ``r`` it fills controls ``u`` ``(R, H, m)`` and states ``x`` ``(R, H+1, n)`` from where its path begins,
+    and says in ``found`` ``(R,)`` whether a path arrives; if none does, the rest is left alone.
     """
     model = MODELS[name]
     grow_paths, follow = _path_grower(model), _move_follower(model)
@@ -227,32 +188,105 @@ def search_kernel(name: str) -> Search:
 
     @cached_kernel(variant=name, key=models_key((name,)), **WITHOUT_ARRAYS)
     def search(
-        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, part: IntArray,
+        arrays: ProblemArrays, table: PathTable, moves: Moves, rules: BeamRules, queries: Queries, r: int,
         space: BeamSpace, u: FloatArray, x: FloatArray, found: BoolArray,
     ) -> None:  # fmt: skip
         arrays, table, moves = borrow(arrays), borrow(table), borrow(moves)
         queries, space = borrow(queries), borrow(space)
         zero: Whole = np.int64(0)  # a literal would compile what it is passed to once more
-        for r in range(part[0], part[1]):
+        for i in range(n):
+            space.beam.states[0, i] = queries.states[r, i]
+        space.beam.faults[0], space.numbers[0], size, space.ever.used[0] = 0.0, -1, zero + 1, 0
+        ending = (queries.limits[r], zero - 1, zero - 1)
+        for block in range(queries.blocks[r], table.first.shape[0]):
+            count, ending = grow_paths(arrays, table, moves, rules, queries, r, space, size, block, ending)
+            size = _keep_best(arrays, table, rules, queries, r, space, count, block, ending[0])
+            if size == 0:
+                break
+        _, number, move = ending
+        found[r] = move >= 0
+        if found[r]:
+            length = trace_back(space.ever, number, move, space.did)
+            robot, begin, start = queries.robots[r], queries.blocks[r], queries.blocks[r] * BLOCK
+            state, goal = to_fixed_tuple(queries.states[r], n), arrays.goal[robot]
             for i in range(n):
-                space.beam.states[0, i] = queries.states[r, i]
-            space.beam.faults[0], space.numbers[0], size, space.ever.used[0] = 0.0, -1, zero + 1, 0
-            ending = (queries.limits[r], zero - 1, zero - 1)
-            for block in range(queries.blocks[r], table.first.shape[0]):
-                count, ending = grow_paths(arrays, table, moves, rules, queries, r, space, size, block, ending)
-                size = _keep_best(space, count, ending[0], rules, arrays, table, queries, r, block)
-                if size == 0:
-                    break
-            _, number, move = ending
-            found[r] = move >= 0
-            if found[r]:
-                length = trace_back(space.ever, number, move, space.did)
-                robot, begin, start = queries.robots[r], queries.blocks[r], queries.blocks[r] * BLOCK
-                state, goal = to_fixed_tuple(queries.states[r], n), arrays.goal[robot]
-                for i in range(n):
-                    x[r, start, i] = state[i]
-                goal_radius = np.sqrt(arrays.squared_goal_radius)
-                reference = (moves, space.did[:length], begin, goal, goal_radius, x[r])
-                follow(arrays, robot, reference, to_fixed_tuple(goal, d), start, state, False, u[r], x[r])
+                x[r, start, i] = state[i]
+            goal_radius = np.sqrt(arrays.squared_goal_radius)
+            reference = (moves, space.did[:length], begin, goal, goal_radius, x[r])
+            follow(arrays, robot, reference, to_fixed_tuple(goal, d), start, state, False, u[r], x[r])
 
     return search
+
+
+def find_paths(
+    team: WorkingPlan,
+    robots: IntArray,
+    blocks: ArrayLike,
+    primitives: MotionPrimitives,
+    rules: BeamRules,
+    limits: ArrayLike = np.inf,
+    others: OtherAgents | None = None,
+) -> Rollouts:
+    """The best paths that robots ``(R,)`` find; one that finds none does what it does, and does not arrive.
+
+    So do those left over when the search should stop.
+
+    Args:
+        team: Plan of all.
+        robots: Their numbers.
+        blocks: ``(R,)`` the block of steps at whose beginning their new paths begin.
+        primitives: Their motion primitives.
+        rules: Rules by which paths are kept.
+        limits: ``(R,)`` what a path must cost less than [s]: its time, and what it costs to meet others.
+        others: Agents that they mind, or do not mind.
+
+    Returns:
+        A single path of each.
+    """
+    problem, horizon = team.problem, team.problem.horizon
+    blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))
+    if others is None:
+        extra = np.zeros((len(robots), 0, horizon + 1, problem.dimension), np.float32)
+        others = OtherAgents(robots[:, None], extra, np.zeros((len(robots), 0)))
+    u, x = (np.ascontiguousarray(rows[:, robots].swapaxes(0, 1)) for rows in (team.controls, team.states))
+    arrived = np.zeros(len(robots), bool)
+    for model, members in by_model(problem):
+        mine = np.flatnonzero(np.isin(robots, members))
+        if len(mine):
+            minded = OtherAgents(others.exclude[mine], others.extra[mine], others.radius[mine])
+            queries = Queries(robots[mine], blocks[mine], x[mine, blocks[mine] * BLOCK], limits[mine], minded)
+            moves = primitives.moves(problem.dimension, has_heading=model.heading_index is not None)
+            u[mine], x[mine], arrived[mine] = _search(team, model, moves, rules, queries, u[mine], x[mine])
+    u, x = (rows.swapaxes(0, 1)[:, :, None] for rows in (u, x))
+    return Rollouts(u, x, arrived[:, None], problem.dimension)
+
+
+def _search(
+    team: WorkingPlan, model: Model, moves: Moves, rules: BeamRules, queries: Queries, u: FloatArray, x: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Controls ``(R, H, m)``, states ``(R, H+1, n)`` and arrivals of one model's robots; as given if none arrives."""
+    found, search = np.zeros(len(u), bool), search_kernel(model.name)
+    arrays, table = team.problem.arrays, team.index.table
+    # Some searches take many times as long as others: who is done takes the next one.
+    waiting = iter(range(len(u)))
+
+    def look(_: IntArray) -> None:
+        d, num_blocks = team.problem.dimension, len(table.first)
+        space = make_beam_space(rules.width, len(moves.pace), num_blocks, x.shape[2], d, LANES)
+        for number in waiting:
+            if team.search.should_stop():
+                break
+            search(arrays, table, moves, rules, queries, number, space, u, x, found)
+
+    Threads(available_cores()).over(len(u), look)
+    return u, x, found
+
+
+def prepare_beams(team: WorkingPlan) -> None:
+    """Compile what the search of this team's paths needs, if it is not yet."""
+    firsts: dict[str, int] = {model.name: robots[0] for model, robots in by_model(team.problem)}
+    if not all(search_kernel(name).signatures for name in firsts):
+        robots: Sequence[int] = list(firsts.values())
+        team.faults(robots)
+        find_paths(team, np.array(robots), 0, MotionPrimitives((90.0,), (1.0,)), BeamRules(2, 1.0, 1.0))
+        team.index.move(robots, team.positions[:, robots])

@@ -30,23 +30,14 @@ class SearchConstraint(NamedTuple):
 
 @dataclass(eq=False)
 class TeamConfiguration:
-    """Nodes of the team, and what has been tried from there.
+    """Nodes of the team, and what has been tried from there."""
 
-    Attributes:
-        positions: ``(K,)`` nodes.
-        parent: Configuration that it came from; ``None`` for the start.
-        moves: ``(M, 2)`` robots and edges in the order of the moves that led here.
-        priorities: ``(K,)`` the highest goes first.
-        order: ``(K,)`` robots in that order.
-        untried: Constraints.
-    """
-
-    positions: IntArray
-    parent: TeamConfiguration | None
-    moves: IntArray
-    priorities: Floats
-    order: IntArray = field(init=False)
-    untried: deque[SearchConstraint] = field(default_factory=lambda: deque([SearchConstraint()]))
+    positions: IntArray  #: ``(K,)`` nodes
+    parent: TeamConfiguration | None  #: Configuration that it came from; ``None`` for the start
+    moves: IntArray  #: ``(M, 2)`` robots and edges in the order of the moves that led here
+    priorities: Floats  #: ``(K,)`` the highest goes first
+    order: IntArray = field(init=False)  #: ``(K,)`` robots in that order
+    untried: deque[SearchConstraint] = field(default_factory=lambda: deque([SearchConstraint()]))  #: Constraints
 
     def __post_init__(self) -> None:
         self.order = np.argsort(-self.priorities, kind="stable").astype(np.int64)
@@ -64,15 +55,10 @@ class TeamConfiguration:
 
 @dataclass(frozen=True, eq=False)
 class TeamMoves:
-    """Result of a search.
+    """Result of a search."""
 
-    Attributes:
-        moves: ``(M, 2)`` robots and edges, in an order in which all can be made one after another.
-        arrived: ``(K,)`` robots at their goals in the end: all, unless the search was ended before.
-    """
-
-    moves: IntArray
-    arrived: BoolArray
+    moves: IntArray  #: ``(M, 2)`` robots and edges, in an order in which all can be made one after another
+    arrived: BoolArray  #: ``(K,)`` robots at their goals in the end: all, unless the search was ended before
 
 
 class TeamOnRoadmap:

@@ -12,23 +12,14 @@ from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 
 
 class Cells(NamedTuple):
-    """Points by the cell that they lie in.
+    """Points by the cell that they lie in."""
 
-    Attributes:
-        points: ``(N, 3)`` [m].
-        low: ``(3,)`` lowest corner [m].
-        size: ``(3,)`` int64 cells along each axis.
-        width: Of a cell [m].
-        first: ``(C + 1,)`` int64 where the points of each cell begin in ``items``.
-        items: ``(N,)`` int64 numbers of the points, cell by cell.
-    """
-
-    points: Floats
-    low: Floats
-    size: IntArray
-    width: float
-    first: IntArray
-    items: IntArray
+    points: Floats  #: ``(N, 3)`` [m]
+    low: Floats  #: ``(3,)`` lowest corner [m]
+    size: IntArray  #: ``(3,)`` int64 cells along each axis
+    width: float  #: Of a cell [m]
+    first: IntArray  #: ``(C + 1,)`` int64 where the points of each cell begin in ``items``
+    items: IntArray  #: ``(N,)`` int64 numbers of the points, cell by cell
 
 
 def sort_into_cells(points: Floats, width: float) -> Cells:

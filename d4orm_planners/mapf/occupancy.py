@@ -25,22 +25,16 @@ EVER = 1 << 30
 
 
 class Others(NamedTuple):
-    """Motions of all robots around one.
+    """Motions of all robots around one."""
 
-    Attributes:
-        positions: ``(K, T + 1, 3)`` float64; afterwards they stay where they are [m].
-        need: ``(K,)`` how far the robot that is replanned keeps from each [m]; zero from whom it does not mind, and
-            from itself.
-        boxes: ``(B, K, 6)`` the lowest and the highest positions in every block of steps [m].
-        visits: ``(K, V, 3)`` int32 nodes that each comes so near to, the first step and the one after the last.
-        counts: ``(K,)`` int64 the number of visits of each.
-    """
-
-    positions: Floats
+    positions: Floats  #: ``(K, T + 1, 3)`` float64; afterwards they stay where they are [m]
+    #: ``(K,)`` how far the robot that is replanned keeps from each [m]; zero from whom it does not mind, and from
+    #: itself
     need: Floats
-    boxes: Floats
+    boxes: Floats  #: ``(B, K, 6)`` the lowest and the highest positions in every block of steps [m]
+    #: ``(K, V, 3)`` int32 nodes that each comes so near to, the first step and the one after the last
     visits: NDArray[np.int32]
-    counts: IntArray
+    counts: IntArray  #: ``(K,)`` int64 the number of visits of each
 
 
 class Occupancy:
@@ -186,21 +180,13 @@ def find_meetings(others: Others, positions: Floats, met: BoolArray) -> None:
 
 
 class Buckets(NamedTuple):
-    """Robots by where lines must have their middles in order to come near to them, in a grid over the plane.
+    """Robots by where lines must have their middles in order to come near to them, in a grid over the plane."""
 
-    Attributes:
-        low: Lowest corner [m].
-        width: Size of a cell [m].
-        size: Cells along both axes.
-        first: ``(B C + 1,)`` int64 where the robots of each cell in each block begin in ``items``.
-        items: int32 numbers of robots.
-    """
-
-    low: tuple[float, float]
-    width: float
-    size: tuple[int, int]
-    first: IntArray
-    items: NDArray[np.int32]
+    low: tuple[float, float]  #: Lowest corner [m]
+    width: float  #: Size of a cell [m]
+    size: tuple[int, int]  #: Cells along both axes
+    first: IntArray  #: ``(B C + 1,)`` int64 where the robots of each cell in each block begin in ``items``
+    items: NDArray[np.int32]  #: int32 numbers of robots
 
 
 @inlined

@@ -29,29 +29,17 @@ robot."""
 
 
 class PibtWorkspace(NamedTuple):
-    """Workspace of a step.
+    """Workspace of a step."""
 
-    Attributes:
-        state: ``(K,)`` int8.
-        may_dock: ``(K,)`` bool: may come to its goal.
-        who: ``(N,)`` int32 the robot at each node; -1 for none.
-        robots: ``(K,)`` int64 those that others yield to, the first one first.
-        edges: ``(K,)`` int64 by which each wants to go.
-        tried: ``(K,)`` int64 how many edges each has tried.
-        options: ``(K, D)`` int64 the edges that each tries in turn.
-        worth: ``(D,)`` float64 how good they are.
-        moves: ``(K, 2)`` int64 robot and edge of each move, in their order.
-    """
-
-    state: NDArray[np.int8]
-    may_dock: BoolArray
-    who: Ints
-    robots: IntArray
-    edges: IntArray
-    tried: IntArray
-    options: IntArray
-    worth: Floats
-    moves: IntArray
+    state: NDArray[np.int8]  #: ``(K,)`` int8
+    may_dock: BoolArray  #: ``(K,)`` bool: may come to its goal
+    who: Ints  #: ``(N,)`` int32 the robot at each node; -1 for none
+    robots: IntArray  #: ``(K,)`` int64 those that others yield to, the first one first
+    edges: IntArray  #: ``(K,)`` int64 by which each wants to go
+    tried: IntArray  #: ``(K,)`` int64 how many edges each has tried
+    options: IntArray  #: ``(K, D)`` int64 the edges that each tries in turn
+    worth: Floats  #: ``(D,)`` float64 how good they are
+    moves: IntArray  #: ``(K, 2)`` int64 robot and edge of each move, in their order
 
 
 @compiled
@@ -65,15 +53,9 @@ def _mixed(a: np.uint64, b: np.uint64) -> float:
 
 @compiled
 def _rank_options(
-    roadmap: Roadmap,
-    bodies: RobotArrays,
-    scratch: PibtWorkspace,
-    depth: int,
-    k: Whole,
-    at: Whole,
-    pushed: bool,
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, depth: int, k: Whole, at: Whole, pushed: bool,
     seed: int,
-) -> None:
+) -> None:  # fmt: skip
     """Sort the edges that a robot may take, the best first, with staying among them unless it is pushed."""
     options, worth, count = scratch.options[depth], scratch.worth, 0
     costs = bodies.costs[k]
@@ -131,14 +113,9 @@ def _blocking_robot(
 
 @compiled
 def _push(
-    roadmap: Roadmap,
-    bodies: RobotArrays,
-    scratch: PibtWorkspace,
-    positions: IntArray,
-    depth: int,
-    k: Whole,
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, depth: int, k: Whole,
     seed: int,
-) -> None:
+) -> None:  # fmt: skip
     """Have a robot look for an edge, for those before it to get past unless it is the first."""
     scratch.robots[depth], scratch.edges[depth], scratch.tried[depth] = k, NOTHING, 0
     scratch.state[k] = MOVING
@@ -160,15 +137,9 @@ def _next_edge(roadmap: Roadmap, scratch: PibtWorkspace, positions: IntArray, de
 
 @compiled
 def _move(
-    roadmap: Roadmap,
-    bodies: RobotArrays,
-    scratch: PibtWorkspace,
-    positions: IntArray,
-    root: Whole,
-    forced: Whole,
-    seed: int,
-    count: int,
-) -> int:
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, root: Whole, forced: Whole,
+    seed: int, count: int,
+) -> int:  # fmt: skip
     """Let a robot move, and before it those that are in its way; how many moves there are then.
 
     ``forced`` is the node that it must go to, -1 for where it likes, ``count`` the moves so far; ``positions`` is
@@ -202,15 +173,9 @@ def _move(
 
 @cached_kernel(variant="step", **OPTIONS)
 def step_team(
-    roadmap: Roadmap,
-    bodies: RobotArrays,
-    scratch: PibtWorkspace,
-    order: IntArray,
-    robots: IntArray,
-    targets: IntArray,
-    seed: int,
-    positions: IntArray,
-) -> int:
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, order: IntArray, robots: IntArray, targets: IntArray,
+    seed: int, positions: IntArray,
+) -> int:  # fmt: skip
     """Let the whole team move.
 
     Args:

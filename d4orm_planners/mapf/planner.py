@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import LARGEST, IntArray
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MAX_HORIZON
 from d4orm_env.core.seeds import Stream
@@ -19,10 +19,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
 from d4orm_planners.mapf.roadmap import fill_costs, lay_roadmap
-from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves, is_compiled
-
-if TYPE_CHECKING:
-    from d4orm_planners.mapf.roadmap import Roadmap
+from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout, drive_moves, is_compiled
 
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
@@ -50,23 +47,20 @@ LEISURELY = 10
 NOT_IN_TIME = "no paths found on the roadmaps in time"
 STEPS = 3000
 """Steps of path finding for all at once after which the next roadmap is tried."""
+RELAY_FINENESS = 1.6
+"""Fineness of the roadmap of a team with ever new goals."""
+DWELL = 1.0
+"""Time for which others keep off the goal of a robot that has arrived; by then it drives on to another [s]."""
 
 
 @dataclass
 class RoadmapPaths:
-    """Low-level planner of :func:`~d4orm_planners.mapf.lns.search_neighbourhoods`: paths in space and time.
+    """Low-level planner of :func:`~d4orm_planners.mapf.lns.search_neighbourhoods`: paths in space and time."""
 
-    Attributes:
-        replanning: Search for paths.
-        solution: Rollout of the team.
-        most: Robots that are replanned together, at most.
-        should_stop: Asked before every path.
-    """
-
-    replanning: Replanning
-    solution: TeamRollout
-    most: int
-    should_stop: Callable[[], bool]
+    replanning: Replanning  #: Search for paths
+    solution: TeamRollout  #: Rollout of the team
+    most: int  #: Robots that are replanned together, at most
+    should_stop: Callable[[], bool]  #: Asked before every path
     groups: int = 1
 
     @property
@@ -108,30 +102,32 @@ class MAPFConfig(PlannerConfig):
 
 @dataclass(frozen=True, eq=False)
 class RoadmapSolution:
-    """The state of the search.
+    """The state of the search."""
 
-    Attributes:
-        roadmap: Roadmap that paths are found on.
-        replanning: Search for better ones.
-        driven: Rollout of the team on them.
-    """
+    replanning: Replanning  #: Search for better paths
+    driven: TeamRollout  #: Rollout of the team on those that there are
 
-    roadmap: Roadmap
-    replanning: Replanning
-    driven: TeamRollout
+    def iteration(self, search: SolveRun) -> Iteration:
+        """The team's controls within the horizon."""
+        return Iteration(self.driven.until(search.problem.horizon))
+
+    def going_on_from_best(self, search: SolveRun) -> RoadmapSolution:
+        """The solution of a team that drives as in the best plan so far."""
+        return replace(self, driven=TeamRollout.of(search.best.trajectory))
+
+    def improved(self, search: SolveRun, config: MAPFConfig) -> RoadmapSolution:
+        """Replan some groups of robots; what is no better for all together is left."""
+        paths = RoadmapPaths(self.replanning, self.driven, config.neighbours, search.should_stop)
+        random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
+        return replace(self, driven=search_neighbourhoods(paths, random, config.replannings, search.should_stop))
 
 
 @dataclass(frozen=True)
 class NoPaths:
-    """The state of the search when no paths were found.
+    """The state of the search when no paths were found."""
 
-    Attributes:
-        why: For the record of the iterations.
-        unreachable: Robots that have no path to their goals, if that is why.
-    """
-
-    why: str
-    unreachable: tuple[int, ...] = ()
+    why: str  #: For the record of the iterations
+    unreachable: tuple[int, ...] = ()  #: Robots that have no path to their goals, if that is why
 
     @classmethod
     def unless_reachable(cls, problem: Problem) -> NoPaths | None:
@@ -161,31 +157,12 @@ class MAPF(Planner):
     ) -> tuple[RoadmapSolution | NoPaths, Iteration]:
         """See :meth:`Planner.iterate`: first paths for the whole team, then better ones for some robots at a time."""
         if isinstance(state, RoadmapSolution):
-            state = improve_roadmap_solution(search, state, self.config.neighbours, self.config.replannings)
+            state = state.improved(search, self.config)
         elif state is None:
             state = find_roadmap_solution(search)
         if isinstance(state, NoPaths):
             return state, state.explained(Iteration(search.current.controls))
-        return state, roadmap_iteration(search, state)
-
-
-def roadmap_iteration(search: SolveRun, solution: RoadmapSolution) -> Iteration:
-    """Return the team's controls within the horizon."""
-    return Iteration(solution.driven.until(search.problem.horizon))
-
-
-def going_on_from_best(search: SolveRun, solution: RoadmapSolution) -> RoadmapSolution:
-    """The solution of a team that drives as in the best plan so far."""
-    return replace(solution, driven=TeamRollout.of(search.best.trajectory))
-
-
-def improve_roadmap_solution(
-    search: SolveRun, solution: RoadmapSolution, neighbours: int, replannings: int
-) -> RoadmapSolution:
-    """Replan so many groups of at most so many robots; what is no better for all together is left."""
-    paths = RoadmapPaths(solution.replanning, solution.driven, neighbours, search.should_stop)
-    random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-    return replace(solution, driven=search_neighbourhoods(paths, random, replannings, search.should_stop))
+        return state, state.iteration(search)
 
 
 def find_roadmap_solution(search: SolveRun) -> RoadmapSolution | NoPaths:
@@ -208,7 +185,7 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
             paths = LEAST_PATIENCE + int(patience * problem.num_robots)
             driven = replanning.one_by_one(random, search.should_stop, paths)
             if driven is not None:
-                return RoadmapSolution(roadmap, replanning, driven)
+                return RoadmapSolution(replanning, driven)
         elif number == 0 and (reason := NoPaths.unless_reachable(problem)) is not None:
             return reason
         if search.should_stop():
@@ -227,17 +204,60 @@ def find_all_at_once(search: SolveRun) -> RoadmapSolution | NoPaths:
         seed = search.iteration_seed(Stream.GUIDANCE, number + 1)
         found = find_moves(problem, roadmap, seed, search.should_stop, STEPS)
         if found is not None and (best is None or found.arrived.sum() > best[1].arrived.sum()):
-            best = RoadmapSolution(roadmap, replanning, drive_moves(problem, roadmap, found.moves)), found
+            best = RoadmapSolution(replanning, drive_moves(problem, roadmap, found.moves)), found
         if search.should_stop() or (found is not None and found.arrived.all()):
             break
     return best[0] if best else NoPaths(NOT_IN_TIME)
 
 
+def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
+    """Plan paths for some robots of a team with ever new goals around all others on their present paths.
+
+    Others yield only where there is no other path.
+
+    Args:
+        problem: The team where it is now, and its goals.
+        paths: ``(T + 1, K, d)`` positions of the robots from now on [m]; those of ``changed`` are not read.
+        changed: ``(K,)`` robots whose paths are planned.
+        seed: Of the robots that may have to yield, and of how leisurely they drive.
+
+    Returns:
+        ``(H + 1, K, d)`` future positions of all robots [m]; ``None`` if no paths were found.
+    """
+    compile_path_finding(problem)
+    num_robots, d = problem.num_robots, problem.dimension
+    dwell = int(np.ceil(DWELL / problem.dt))
+    replanning = Replanning(problem, lay_roadmap(problem, RELAY_FINENESS), dwell)
+    if not np.isfinite(replanning.alone).all():
+        return None
+    result = paths[np.minimum(np.arange(problem.horizon + 1), len(paths) - 1)]
+    present = _driven(problem, result, dwell)
+    present.positions[:, changed] = FAR
+    before, random, robots = present.positions.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
+    order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
+    driven = replanning.settle(present, order, random, lambda: False, num_robots)
+    if driven is None:
+        return None
+    for robot in np.flatnonzero((driven.positions != before).any(axis=(0, 2))):
+        end = int(driven.arrivals[robot]) + 1
+        result[:end, robot], result[end:, robot] = driven.positions[:end, robot, :d], problem.goal[robot]
+    return result
+
+
+def _driven(problem: Problem, paths: FloatArray, dwell: int) -> TeamRollout:
+    """A team on its paths ``(H + 1, K, d)``, whose robots leave their goals again; its controls are not known."""
+    steps, num_robots, d = problem.horizon, problem.num_robots, problem.dimension
+    at_goal = np.linalg.norm(paths - problem.goal, axis=2) <= problem.goal_radius
+    arrivals = np.where(at_goal.any(axis=0), at_goal.argmax(axis=0), steps)
+    positions = np.zeros((steps + 1, num_robots, 3))
+    positions[:, :, :d] = paths
+    positions[np.arange(steps + 1)[:, None] > arrivals + dwell] = FAR
+    return TeamRollout(np.zeros((steps, num_robots, problem.control_size), np.float32), positions, arrivals)
+
+
 def compile_roadmap(problem: Problem) -> None:
     """Compile what :func:`needs_detour` needs, if it is not yet."""
-    if not problem.world.num_obstacles:
-        return
-    if not fill_costs.signatures:
+    if problem.world.num_obstacles and not fill_costs.signatures:
         needs_detour(_small_problem(problem, 0))
 
 

@@ -71,23 +71,14 @@ def join_routes(problem: Problem, routes: Sequence[Route]) -> Routes:
 
 
 class RouteBends(NamedTuple):
-    """Corners of paths, without the angles themselves, whose functions differ from one processor to the next.
+    """Corners of paths, without the angles themselves, whose functions differ from one processor to the next."""
 
-    Attributes:
-        corners: ``(C, 3)`` where they are [m].
-        before: ``(C, 3)`` unit vectors that lead to each.
-        after: ``(C, 3)`` unit vectors that lead on from each.
-        straight: ``(C,)`` half of the shorter of the paths to the corners next to each [m].
-        cosine: ``(C,)`` of half the angle by which the path turns.
-        sine: ``(C,)``.
-    """
-
-    corners: Floats
-    before: Floats
-    after: Floats
-    straight: Floats
-    cosine: Floats
-    sine: Floats
+    corners: Floats  #: ``(C, 3)`` where they are [m]
+    before: Floats  #: ``(C, 3)`` unit vectors that lead to each
+    after: Floats  #: ``(C, 3)`` unit vectors that lead on from each
+    straight: Floats  #: ``(C,)`` half of the shorter of the paths to the corners next to each [m]
+    cosine: Floats  #: ``(C,)`` of half the angle by which the path turns
+    sine: Floats  #: ``(C,)``
 
 
 def _bends_at(corners: Floats, inner: IntArray) -> RouteBends:
@@ -193,19 +184,9 @@ def _find_waits(cells: Cells, first: IntArray, times: Floats, radius: Floats, le
 
 @compiled
 def _find_touched(
-    cells: Cells,
-    a: int,
-    k: int,
-    first: IntArray,
-    owner: IntArray,
-    times: Floats,
-    radius: Floats,
-    margin: float,
-    farthest: float,
-    passed: IntArray,
-    wanted: IntArray,
-    touched: IntArray,
-) -> int:
+    cells: Cells, a: int, k: int, first: IntArray, owner: IntArray, times: Floats, radius: Floats, margin: float,
+    farthest: float, passed: IntArray, wanted: IntArray, touched: IntArray,
+) -> int:  # fmt: skip
     """Find the robots with earlier points too near to point ``a`` of robot ``k``.
 
     ``touched`` lists these robots, ``wanted`` says how far each of them has to have come; those that have ``passed``
@@ -237,15 +218,9 @@ def _find_touched(
 
 @cached_kernel(variant="waits", **OPTIONS)
 def find_waits(
-    cells: Cells,
-    first: IntArray,
-    owner: IntArray,
-    times: Floats,
-    radius: Floats,
-    margin: float,
-    wait_first: IntArray,
+    cells: Cells, first: IntArray, owner: IntArray, times: Floats, radius: Floats, margin: float, wait_first: IntArray,
     waits: IntArray,
-) -> int:
+) -> int:  # fmt: skip
     """Find the robots that each one has to let pass; see :class:`Routes`.
 
     ``owner`` ``(T,)`` is the robot of each point, and ``waits`` ``(room, 3)`` is at which point, for whom and until it

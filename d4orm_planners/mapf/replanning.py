@@ -10,12 +10,18 @@ from numba.extending import register_jitable
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
-from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.beam import sink
+from d4orm_planners.mapf.near_neighbours import squared_gap
+from d4orm_planners.mapf.reservations import (
+    Intervals,
+    Reservations,
+    Trip,
+    first_meeting,
+    interval_at,
+    meeting,
+    steps_to_turn,
+)
 from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
-from d4orm_planners.mapf.safe_intervals import Intervals, Reservations, interval_at
-from d4orm_planners.mapf.straightening import first_meeting, meeting
-from d4orm_planners.mapf.trips import Trip, steps_to_turn
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -33,63 +39,33 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
 
 
 class _Tree(NamedTuple):
-    """Entries of a search so far, with room for more.
+    """Entries of a search so far, with room for more."""
 
-    Attributes:
-        entries: ``(N, 5)`` int64 nodes, departures for them, arrivals, entries that they were come to from, intervals.
-        costs: ``(N,)`` steps from the start through each to the goal, at least.
-        heap: ``(N,)`` int64 numbers of those that nothing has been tried from, the soonest at the goal first.
-        sizes: ``(2,)`` int64 how many there are of both.
-    """
-
+    #: ``(N, 5)`` int64 nodes, departures for them, arrivals, entries that they were come to from, intervals
     entries: IntArray
-    costs: Floats
-    heap: IntArray
-    sizes: IntArray
+    costs: Floats  #: ``(N,)`` steps from the start through each to the goal, at least
+    heap: IntArray  #: ``(N,)`` int64 numbers of those that nothing has been tried from, the soonest at the goal first
+    sizes: IntArray  #: ``(2,)`` int64 how many there are of both
 
 
 class _Search(NamedTuple):
-    """The search for one robot's path.
+    """The search for one robot's path."""
 
-    Attributes:
-        reservations: All others.
-        came: Entry of the tree that comes first to each safe interval; -1 for none.
-        soonest: No step before it can be that at which the robot comes to its goal for good.
-    """
-
-    reservations: Reservations
-    came: Ints
-    soonest: Whole
+    reservations: Reservations  #: All others
+    came: Ints  #: Entry of the tree that comes first to each safe interval; -1 for none
+    soonest: Whole  #: No step before it can be that at which the robot comes to its goal for good
 
 
 @compiled
 def _departure(
-    search: _Search,
-    tree: IntArray,
-    entry: Whole,
-    head: Whole,
-    steps: Whole,
-    left: float,
-    trip: Trip,
-    dock: Whole,
-    depart: Whole,
-    turn: Whole,
-    arrival: Whole,
-) -> tuple[Whole, Whole, Whole]:
+    search: _Search, tree: IntArray, entry: Whole, head: Whole, steps: Whole, left: float, trip: Trip, dock: Whole,
+    depart: Whole, turn: Whole, arrival: Whole,
+) -> tuple[Whole, Whole, Whole]:  # fmt: skip
     """The next departure from an entry of the tree that comes to a safe interval before all others.
 
-    Args:
-        search: The search.
-        tree: Nodes, departures, arrivals, entries before and intervals.
-        entry: The entry.
-        head: Node to drive to.
-        steps: Steps that it takes.
-        left: Steps from there to the goal, at least.
-        trip: The motion; the dwell of goals only.
-        dock: Step until which it must not arrive.
-        depart: Earliest departure.
-        turn: Steps that it loses by turning before it drives.
-        arrival: Safe interval of the node that it comes to no sooner than.
+    The robot drives to node ``head`` in some ``steps``, from which on it takes at least the ``left`` ones to the goal.
+    It departs at ``depart`` or later, loses the steps of a ``turn`` before it drives, and comes to safe interval
+    ``arrival`` of the node or a later one, after step ``dock``.
 
     Returns:
         Departure, arrival and interval, or -1 for the interval if there is none.
@@ -174,7 +150,7 @@ def _is_way(roadmap: Roadmap, bodies: RobotArrays, k: Whole, node: Whole, e: Who
         return False
     aside = (bodies.goal_radius + bodies.slack / 2) ** 2
     docks = bodies.docks and head != goal
-    return not (docks and near_neighbours.squared_gap(nodes, goal, nodes, node, nodes, head) < aside)
+    return not (docks and squared_gap(nodes, goal, nodes, node, nodes, head) < aside)
 
 
 @compiled

@@ -14,7 +14,6 @@ from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_env.paths.lattice import lay_lattice
 from d4orm_env.paths.shortest_paths import in_space
 from d4orm_env.paths.spaces import Space, free_lines, make_space
-from d4orm_planners.mapf import near_neighbours
 from d4orm_planners.mapf.near_neighbours import find_near, sort_into_cells, squared_gap
 
 PAIR_SLACK = 0.4
@@ -30,31 +29,18 @@ PAD = 3
 
 
 class Roadmap(NamedTuple):
-    """Positions and the straight lines between them on which a robot keeps clear of obstacles.
+    """Positions and the straight lines between them on which a robot keeps clear of obstacles."""
 
-    Attributes:
-        nodes: ``(N, 3)`` float64 positions [m].
-        first: ``(N + 1,)`` int64 where the edges from each begin.
-        heads: ``(E,)`` int32 where each edge leads.
-        lengths: ``(E,)`` float64 [m].
-        room: ``(E,)`` float64 largest safety distance of a robot that passes [m].
-        near_first: ``(E + 1,)`` int64 where the nodes near each edge begin, those it joins included.
-        near: int32 nodes near edges.
-        gaps: float64 how near they are [m].
-        starts: ``(K,)`` int64 nodes.
-        goals: ``(K,)`` int64 nodes.
-    """
-
-    nodes: Floats
-    first: IntArray
-    heads: Ints
-    lengths: Floats
-    room: Floats
-    near_first: IntArray
-    near: Ints
-    gaps: Floats
-    starts: IntArray
-    goals: IntArray
+    nodes: Floats  #: ``(N, 3)`` float64 positions [m]
+    first: IntArray  #: ``(N + 1,)`` int64 where the edges from each begin
+    heads: Ints  #: ``(E,)`` int32 where each edge leads
+    lengths: Floats  #: ``(E,)`` float64 [m]
+    room: Floats  #: ``(E,)`` float64 largest safety distance of a robot that passes [m]
+    near_first: IntArray  #: ``(E + 1,)`` int64 where the nodes near each edge begin, those it joins included
+    near: Ints  #: int32 nodes near edges
+    gaps: Floats  #: float64 how near they are [m]
+    starts: IntArray  #: ``(K,)`` int64 nodes
+    goals: IntArray  #: ``(K,)`` int64 nodes
 
 
 def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
@@ -135,7 +121,7 @@ def measure_gaps(
     """Measure the distances of nodes from edges: ``gaps`` is output, all others as in :class:`Roadmap`."""
     for e in range(tails.shape[0]):
         for number in range(near_first[e], near_first[e + 1]):
-            gaps[number] = np.sqrt(near_neighbours.squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))
+            gaps[number] = np.sqrt(squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))
 
 
 ROUNDING = 2.0**-27
@@ -143,31 +129,18 @@ ROUNDING = 2.0**-27
 
 
 class RobotArrays(NamedTuple):
-    """Robots as discs, and their paths to their goals, as the kernels of path finding read them.
+    """Robots as discs, and their paths to their goals, as the kernels of path finding read them."""
 
-    Attributes:
-        radius: ``(K,)`` [m].
-        size: The largest of them [m].
-        safety_distance: ``(K,)`` radius and margin to obstacles [m].
-        margin: Between robots [m].
-        slack: Distance beyond it that they keep where they can [m].
-        goal_radius: Distance from its goal at which a robot may stop [m].
-        docks: Whether a robot that has arrived stays there for good.
-        starts: ``(K,)`` int64 nodes.
-        goals: ``(K,)`` int64 nodes.
-        costs: ``(K, N)`` float32 length of the path from every node to each robot's goal [m].
-    """
-
-    radius: Floats
-    size: float
-    safety_distance: Floats
-    margin: float
-    slack: float
-    goal_radius: float
-    docks: bool
-    starts: IntArray
-    goals: IntArray
-    costs: FloatArray
+    radius: Floats  #: ``(K,)`` [m]
+    size: float  #: The largest of them [m]
+    safety_distance: Floats  #: ``(K,)`` radius and margin to obstacles [m]
+    margin: float  #: Between robots [m]
+    slack: float  #: Distance beyond it that they keep where they can [m]
+    goal_radius: float  #: Distance from its goal at which a robot may stop [m]
+    docks: bool  #: Whether a robot that has arrived stays there for good
+    starts: IntArray  #: ``(K,)`` int64 nodes
+    goals: IntArray  #: ``(K,)`` int64 nodes
+    costs: FloatArray  #: ``(K, N)`` float32 length of the path from every node to each robot's goal [m]
 
 
 @compiled

@@ -20,10 +20,8 @@ from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.occupancy import Occupancy, Others, find_meetings
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import find_path
+from d4orm_planners.mapf.reservations import Reservations, Trip, make_reservations, straighten, turn_on_the_spot
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
-from d4orm_planners.mapf.safe_intervals import Reservations, make_reservations
-from d4orm_planners.mapf.straightening import straighten
-from d4orm_planners.mapf.trips import Trip, turn_on_the_spot
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
 from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
 
@@ -57,17 +55,11 @@ Drive: TypeAlias = tuple[FloatArray, Floats, int]
 
 @dataclass(frozen=True, eq=False)
 class TeamRollout:
-    """Rollout of a team.
+    """Rollout of a team."""
 
-    Attributes:
-        controls: ``(T, K, m)`` float32.
-        positions: ``(T + 1, K, 3)`` float64 [m].
-        arrivals: ``(K,)`` int64 step of arrival; ``T + 1`` or more for one that has not arrived.
-    """
-
-    controls: FloatArray
-    positions: Floats
-    arrivals: IntArray
+    controls: FloatArray  #: ``(T, K, m)`` float32
+    positions: Floats  #: ``(T + 1, K, 3)`` float64 [m]
+    arrivals: IntArray  #: ``(K,)`` int64 step of arrival; ``T + 1`` or more for one that has not arrived
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> TeamRollout:

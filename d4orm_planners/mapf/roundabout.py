@@ -29,21 +29,13 @@ CORRECTION = 1.0
 
 
 class Bends(NamedTuple):
-    """Paths of a line, an arc and a line.
+    """Paths of a line, an arc and a line."""
 
-    Attributes:
-        begin: ``(K, 2)`` where they begin [m].
-        centre: ``(K, 2)`` of the arcs [m].
-        radius: ``(K,)`` of the arcs [m].
-        first: ``(K,)`` length of the lines up to the arcs [m].
-        angles: ``(K, 2)`` at which the arcs begin and how far they go round, positive to the left [rad].
-    """
-
-    begin: Floats
-    centre: Floats
-    radius: Floats
-    first: Floats
-    angles: Floats
+    begin: Floats  #: ``(K, 2)`` where they begin [m]
+    centre: Floats  #: ``(K, 2)`` of the arcs [m]
+    radius: Floats  #: ``(K,)`` of the arcs [m]
+    first: Floats  #: ``(K,)`` length of the lines up to the arcs [m]
+    angles: Floats  #: ``(K, 2)`` at which the arcs begin and how far they go round, positive to the left [rad]
 
     def at(self, lengths: Floats) -> tuple[Floats, Floats]:
         """``(K, 2)`` positions and unit directions so far along the paths ``(K,)``."""

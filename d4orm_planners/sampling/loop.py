@@ -20,7 +20,7 @@ from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream
 from d4orm_env.core.team import Team
-from d4orm_planners.base.conflict_groups import Groups, components, conflicts
+from d4orm_planners.base.candidate import Groups, components, conflicts
 from d4orm_planners.base.planner import Iteration, Planner, State
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan, approach_goals

@@ -1,4 +1,4 @@
-"""Files of setpoints, by format.
+"""Setpoints of a smooth motion, sampled at a rate, and files for robots to execute, by format.
 
 Crazyflies hold motions on board as polynomials of degree 7. A piece is a duration and eight coefficients for each of x,
 y, z and yaw, 33 numbers of 4 bytes; 4,096 bytes are there for all (Crazyflie firmware,
@@ -16,19 +16,27 @@ from numbers import Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import BPoly, PPoly
 
-from d4orm_env.core.arrays import Floats
+from d4orm_env.core.arrays import Floats, positive_number
 from d4orm_env.core.errors import unknown
+from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.verify import VerificationReport
-from d4orm_env.verify.curves import verify_curves
 from d4orm_planners.tracking.ros_messages import write_bag
-from d4orm_planners.tracking.setpoints import Setpoints, sample_motion
-from d4orm_planners.tracking.smoothing import SmoothMotion
+from d4orm_planners.tracking.smoothing import SmoothMotion, verify_motion
 
+if TYPE_CHECKING:
+    import pandas as pd
+else:
+    pd = LazyModule("pandas")
+
+__all__ = ["FORMATS", "ExportReport", "Setpoints", "export_motion", "sample_motion"]
+
+MAX_RATE, MAX_SAMPLES = 1e5, 10**8
 MEMORY, PIECE_BYTES = 4096, 132
 MOST_PIECES = MEMORY // PIECE_BYTES
 CLOSE = 1 / 50
@@ -39,27 +47,91 @@ AXES = ("x", "y", "z", "yaw")
 
 
 @dataclass(frozen=True, eq=False)
-class Polynomials:
-    """Pieces of equal duration."""
+class Setpoints:
+    """Setpoints for the controllers of ``K`` robots, at ``T`` times a constant period apart.
 
-    durations: Floats  #: ``(P,)`` [s]
-    #: ``(P, K, 4, 8)`` of x, y, z [m] and yaw [rad], from the constant up, by the time in the piece
-    coefficients: Floats
-    deviation: float  #: Largest distance from the motion [m]
-    report: VerificationReport  #: What the verification of the polynomials found
+    Velocity, acceleration and jerk are the exact derivatives of one spline of class C4, which keeps the limits that it
+    was made for and was verified to touch nothing, between the samples too.
 
-    @property
-    def num_bytes(self) -> int:
-        """On board of one robot."""
-        return PIECE_BYTES * len(self.durations)
+    Attributes:
+        time: ``(T,)`` from 0 until all robots are at rest [s].
+        position: ``(T, K, d)`` [m].
+        velocity: ``(T, K, d)`` [m/s].
+        acceleration: ``(T, K, d)`` [m/s^2].
+        jerk: ``(T, K, d)`` [m/s^3].
+        heading: ``(T, K)`` [rad], not wrapped; zero for robots whose model has none.
+        stretch: Times the plan's duration that the motion takes, at least 1.
+        deviation: Largest distance from the plan at its steps [m].
+        report: What the verification found: least separation and clearance.
+    """
+
+    time: Floats
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    jerk: Floats
+    heading: Floats
+    stretch: float
+    deviation: float
+    report: VerificationReport
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """A row for each time and robot: ``time``, ``robot``, ``x`` to ``jz`` (``jy`` in the plane), ``heading``.
+
+        Raises:
+            ModuleNotFoundError: Without pandas.
+        """
+        times, robots = self.heading.shape
+        index = {"time": np.repeat(self.time, robots), "robot": np.tile(np.arange(robots), times)}
+        columns = {name: values.ravel() for name, values in self.columns().items()}
+        return pd.DataFrame(index | columns)
+
+    def columns(self) -> dict[str, Floats]:
+        """``(T, K)`` each: ``x``, ``y``, in space ``z``, their derivatives ``v``, ``a`` and ``j``, and ``heading``."""
+        kinds = {"": self.position, "v": self.velocity, "a": self.acceleration, "j": self.jerk}
+        axes = "xyz"[: self.position.shape[2]]
+        found = {f"{kind}{axis}": values[..., i] for kind, values in kinds.items() for i, axis in enumerate(axes)}
+        return found | {"heading": self.heading}
 
 
-def fit_polynomials(motion: SmoothMotion, height: float) -> Polynomials:
+def sample_motion(motion: SmoothMotion, rate: float) -> Setpoints:
+    """The motion at a rate [Hz], its end included.
+
+    Raises:
+        ValueError: If the rate is not positive, or so high that there would be over 10^8 numbers of a kind.
+    """
+    rate = positive_number(rate, "rate", most=MAX_RATE)
+    count = int(np.ceil(motion.duration * rate)) + 1
+    robots = motion.problem.num_robots
+    if count * robots > MAX_SAMPLES:
+        raise ValueError(
+            f"rate is {rate:g} Hz for {motion.duration:.0f} s and {robots} robots; use at most "
+            f"{MAX_SAMPLES / robots / motion.duration:.3g}"
+        )
+    time = np.arange(count) / rate
+    return Setpoints(
+        time=time,
+        position=motion.position(time),
+        velocity=motion.position(time, 1),
+        acceleration=motion.position(time, 2),
+        jerk=motion.position(time, 3),
+        heading=motion.heading(time),
+        stretch=motion.stretch,
+        deviation=motion.deviation,
+        report=motion.report,
+    )
+
+
+def fit_polynomials(motion: SmoothMotion, height: float) -> tuple[Floats, Floats]:
     """The fewest pieces that stay close to a motion, or as many as there is memory for.
 
     Args:
         motion: Of the team.
         height: z of a team that moves in the plane [m].
+
+    Returns:
+        ``(P,)`` durations, all equal [s], and ``(P, K, 4, 8)`` coefficients of x, y, z [m] and yaw [rad], from the
+        constant up, by the time in the piece.
 
     Raises:
         ValueError: If the motion is too long for as many: robots would touch, or not end at their goals.
@@ -69,13 +141,20 @@ def fit_polynomials(motion: SmoothMotion, height: float) -> Polynomials:
         curves, deviation = _pieces(motion, count)
         if deviation <= wanted:
             break
-    report = _verified(motion, curves)
+
+    def position(times: Floats, derivative: int = 0) -> Floats:
+        return np.asarray(curves(times, nu=derivative)[..., :-1])
+
+    def heading(times: Floats, derivative: int = 0) -> Floats:
+        return np.asarray(curves(times, nu=derivative)[..., -1])
+
+    report = verify_motion(motion.problem, position, heading, motion.duration, count * CHECKS + 1)
     if not report.ok:
         raise ValueError(
             f"{count} polynomials, which is all that {MEMORY} bytes on board hold, are up to {deviation:.3g} m off a "
             f"motion of {motion.duration:.0f} s: {report.violations[0]}; export shorter plans one after the other"
         )
-    return Polynomials(np.diff(curves.x), _coefficients(motion, curves, height), deviation, report)
+    return np.diff(curves.x), _coefficients(motion, curves, height)
 
 
 def _pieces(motion: SmoothMotion, count: int) -> tuple[PPoly, float]:
@@ -91,15 +170,6 @@ def _pieces(motion: SmoothMotion, count: int) -> tuple[PPoly, float]:
     return curves, float(np.linalg.norm(offset, axis=2).max())
 
 
-def _verified(motion: SmoothMotion, curves: PPoly) -> VerificationReport:
-    times = np.linspace(0, motion.duration, (len(curves.x) - 1) * CHECKS + 1)
-    second = curves(times, nu=2)
-    turned = motion.problem.team.radius * (np.abs(second[..., -1]) + curves(times, nu=1)[..., -1] ** 2)
-    bend = (np.linalg.norm(second[..., :-1], axis=2) + turned).max(axis=0)
-    position, heading = (lambda times: curves(times)[..., :-1]), (lambda times: curves(times)[..., -1])
-    return verify_curves(motion.problem, position, motion.duration, bend, heading)
-
-
 def _coefficients(motion: SmoothMotion, curves: PPoly, height: float) -> Floats:
     ascending = np.moveaxis(curves.c[::-1], 0, -1)  # (P, K, d+1, 8)
     d = motion.problem.dimension
@@ -108,9 +178,6 @@ def _coefficients(motion: SmoothMotion, curves: PPoly, height: float) -> Floats:
     if d == 2:
         coefficients[:, :, 2, 0] = height
     return coefficients
-
-
-__all__ = ["FORMATS", "ExportReport", "export_motion"]
 
 
 @dataclass(frozen=True)
@@ -167,12 +234,12 @@ def _crazyswarm2(motion: SmoothMotion, setpoints: Setpoints, folder: Path, heigh
             f"robot_{robot} comes down to z = {lowest[robot]:.2f} m, and the floor is at 0; plan with bounds above the "
             "floor, or from a greater height"
         )
-    polynomials = fit_polynomials(motion, height)
+    durations, coefficients = fit_polynomials(motion, height)
     header = ["Duration", *(f"{axis}^{power}" for axis in AXES for power in range(8))]
     for robot in range(motion.problem.num_robots):
-        rows = polynomials.coefficients[:, robot].reshape(len(polynomials.durations), -1)
-        _write_table(folder / f"robot_{robot}.csv", header, np.column_stack([polynomials.durations, rows]))
-    return len(polynomials.durations)
+        rows = coefficients[:, robot].reshape(len(durations), -1)
+        _write_table(folder / f"robot_{robot}.csv", header, np.column_stack([durations, rows]))
+    return len(durations)
 
 
 def _bag(storage: str, motion: SmoothMotion, setpoints: Setpoints, folder: Path, height: float) -> int | None:

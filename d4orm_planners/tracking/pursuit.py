@@ -86,15 +86,9 @@ def point_reached(points: Floats, arcs: Floats, at: int, last: int, position: Fl
 
 @inlined
 def point_ahead(
-    route: Routes | Timed,
-    paces: Floats,
-    at: int,
-    last: int,
-    stop: float,
-    lookahead: tuple[float, float | np.float32],
-    position: Floats | Row,
-    size: float,
-) -> int:
+    route: Routes | Timed, paces: Floats, at: int, last: int, stop: float, lookahead: tuple[float, float | np.float32],
+    position: Floats | Row, size: float,
+) -> int:  # fmt: skip
     """The point that a robot at point ``at`` heads for.
 
     The slower it must be there, the less far ahead it looks. A sharp corner is driven to before it is turned, and left

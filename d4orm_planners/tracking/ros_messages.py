@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.lazy import LazyModule
-from d4orm_planners.tracking.setpoints import Setpoints
+
+if TYPE_CHECKING:
+    from d4orm_planners.tracking.export import Setpoints
 
 rosbag2: Any = LazyModule("rosbags.rosbag2", "a ROS bag", "ros")
 typesys: Any = LazyModule("rosbags.typesys", "a ROS message", "ros")

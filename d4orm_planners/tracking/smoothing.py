@@ -8,6 +8,7 @@ but deviate more from the plan: of several, the quickest is taken that is free o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -125,8 +126,7 @@ class SmoothMotion:
     @cached_property
     def peaks(self) -> MotionLimits:
         """Peaks of what is limited, of each robot."""
-        steps = round(self.curves.t[-1] / self.problem.dt)
-        times = np.linspace(0, self.duration, steps * PER_STEP + 1)
+        times = np.linspace(0, self.duration, self._num_samples)
         velocity, acceleration, jerk = (self.position(times, order) for order in (1, 2, 3))
         heading, rate = self.heading(times), self.heading(times, 1)
         ahead, faster = (
@@ -146,10 +146,11 @@ class SmoothMotion:
     @cached_property
     def report(self) -> VerificationReport:
         """Verdict of :func:`d4orm_env.verify.curves.verify_curves`."""
-        times = np.linspace(0, self.duration, round(self.curves.t[-1] / self.problem.dt) * PER_STEP + 1)
-        turned = self.problem.team.radius * (np.abs(self.heading(times, 2)) + self.heading(times, 1) ** 2)
-        bend = (np.linalg.norm(self.position(times, 2), axis=2) + turned).max(axis=0)
-        return verify_curves(self.problem, self.position, self.duration, bend, self.heading)
+        return verify_motion(self.problem, self.position, self.heading, self.duration, self._num_samples)
+
+    @property
+    def _num_samples(self) -> int:
+        return round(self.curves.t[-1] / self.problem.dt) * PER_STEP + 1
 
     def within(self, limits: MotionLimits) -> SmoothMotion:
         """The same motion, as slow as these limits need."""
@@ -162,6 +163,20 @@ class SmoothMotion:
             share = (1 + RESERVE) * getattr(self.peaks, name) / getattr(limits, name)
             needed[name] = float(max(share.max(), 0.0)) ** (1 / power), int(np.argmax(share))
         return needed
+
+
+Values = Callable[..., Floats]
+"""``(times, derivative=0)``: values of the whole team at times ``(T,)`` [s], or derivatives of them."""
+
+
+def verify_motion(
+    problem: Problem, position: Values, heading: Values, duration: float, num_samples: int
+) -> VerificationReport:
+    """Verdict of :func:`d4orm_env.verify.curves.verify_curves`, by the sharpest bends at so many samples."""
+    times = np.linspace(0, duration, num_samples)
+    turned = problem.team.radius * (np.abs(heading(times, 2)) + heading(times, 1) ** 2)
+    bend = (np.linalg.norm(position(times, 2), axis=2) + turned).max(axis=0)
+    return verify_curves(problem, position, duration, bend, heading)
 
 
 def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits) -> SmoothMotion:

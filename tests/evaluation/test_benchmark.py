@@ -15,7 +15,7 @@ from numba.core import config
 
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN, get_model
 from d4orm_env.scenarios import make_problem
-from d4orm_planners.base.machine import commit, describe_machine
+from d4orm_planners.base.provenance import commit, describe_machine
 from d4orm_planners.cli import app as cli
 from d4orm_planners.evaluation import bench_report, measuring, probes
 from d4orm_planners.evaluation.benchmark import parts, run_parts, thread_counts

@@ -31,11 +31,10 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     subgoal_indices,
     visible_subgoals,
 )
-from d4orm_planners.d4orm_d.planner import D4ormD
-from d4orm_planners.d4orm_d.settings import D4ormDConfig
+from d4orm_planners.d4orm_d.planner import D4ormD, D4ormDConfig
 from d4orm_planners.engine.sampling_types import get_sampling_engine
-from d4orm_planners.tracking.reference_drives import follow_reference
 from d4orm_planners.tracking.steering import present_velocities
+from d4orm_planners.tracking.tracker import follow_reference
 
 
 @pytest.mark.parametrize(

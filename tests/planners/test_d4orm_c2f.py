@@ -23,8 +23,8 @@ from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
-from d4orm_planners.base.background import Background
 from d4orm_planners.base.episode import open_env
+from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
 from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach

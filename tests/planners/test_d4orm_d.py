@@ -15,8 +15,9 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
-from d4orm_planners.base.conflict_groups import conflicts, failure_groups, regrouped
+from d4orm_planners.base.candidate import conflicts
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.d4orm_d.decoupling import failure_groups, regrouped
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.sampling_types import SamplingResult, SamplingTask

@@ -17,8 +17,8 @@ from env_support import line_problem
 from test_own import program
 
 from d4orm_planners import Policy, evaluate, make_policy
-from d4orm_planners.base.fingerprint import attributes
 from d4orm_planners.base.planner_registry import policy_settings
+from d4orm_planners.base.provenance import attributes
 
 
 @dataclass(frozen=True)

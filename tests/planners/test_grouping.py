@@ -10,17 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from d4orm_planners.base.conflict_groups import (
-    Graph,
-    Grouping,
-    components,
-    conflicts,
-    failure_groups,
-    graph_of,
-    independent_robots,
-    reconnected,
-    regrouped,
-)
+from d4orm_planners.base.candidate import Graph, components, conflicts, graph_of
+from d4orm_planners.d4orm_d.decoupling import Grouping, failure_groups, reconnected, regrouped
+from d4orm_planners.d4orm_d.repairs import independent_robots
 
 MAX_ROBOTS = 7
 

@@ -24,10 +24,9 @@ from d4orm_planners.mapf.occupancy import Occupancy
 from d4orm_planners.mapf.planner import RoadmapPaths, needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import find_path
+from d4orm_planners.mapf.reservations import Trip, make_reservations, steps_to_turn
 from d4orm_planners.mapf.roadmap import Roadmap, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning, TeamRollout, drive_moves
-from d4orm_planners.mapf.safe_intervals import make_reservations
-from d4orm_planners.mapf.trips import Trip, steps_to_turn
 from d4orm_planners.tracking.path_drives import Corners
 from d4orm_planners.tracking.pursuit import gear_towards
 from d4orm_planners.tracking.timed_path import drive_by_clock

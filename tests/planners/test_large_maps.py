@@ -20,8 +20,8 @@ from d4orm_planners.mapf import roadmap as roadmaps
 from d4orm_planners.mapf.lacam import TeamOnRoadmap as Searched
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
 from d4orm_planners.mapf.occupancy import Occupancy
+from d4orm_planners.mapf.reservations import free_intervals, interval_at
 from d4orm_planners.mapf.roadmap import lay_roadmap
-from d4orm_planners.mapf.safe_intervals import free_intervals, interval_at
 
 
 def caves(rows: int, columns: int, seed: int) -> np.ndarray:

@@ -17,10 +17,10 @@ from d4orm_planners import make_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
-from d4orm_planners.mapf import beams
+from d4orm_planners.mapf import beam_search
 from d4orm_planners.mapf.beam import BeamRules, OtherAgents
-from d4orm_planners.mapf.beams import find_paths
-from d4orm_planners.mapf.motion_lns import improve_paths
+from d4orm_planners.mapf.beam_search import find_paths
+from d4orm_planners.mapf.lns import improve_paths
 from d4orm_planners.mapf.motion_primitives import MotionPrimitives
 from d4orm_planners.tracking.steering import straight_drives
 
@@ -61,7 +61,7 @@ def test_paths_among_obstacles_become_shorter() -> None:
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, found = make_problem("heterogeneous", num_robots=6), []
     for threads in (1, 3):
-        for module in (path_index, beams):
+        for module in (path_index, beam_search):
             monkeypatch.setattr(module, "Threads", lambda _, threads=threads: Threads(threads))
         team = solved_team(problem)
         found.append(improve_paths(team, seed=0, rounds=4))

@@ -10,8 +10,7 @@ import pytest
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners import make_policy, run_episode
-from d4orm_planners.mapf.planner import compile_path_finding
-from d4orm_planners.mapf.relay import DWELL, relay_paths
+from d4orm_planners.mapf.planner import DWELL, compile_path_finding, relay_paths
 from d4orm_planners.mapf.roadmap import lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning
 

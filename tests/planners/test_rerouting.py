@@ -20,7 +20,7 @@ from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.engine import path_index
 from d4orm_planners.hybrid.rerouting import reroute
-from d4orm_planners.mapf import beams
+from d4orm_planners.mapf import beam_search
 from d4orm_planners.tracking.steering import straight_drives
 
 
@@ -102,7 +102,7 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem("random", num_robots=40, size=7.0, seed=0)
     teams = []
     for threads in (1, 3):
-        for module in (path_index, beams):
+        for module in (path_index, beam_search):
             monkeypatch.setattr(module, "Threads", lambda _, threads=threads: Threads(threads))
         teams.append(rerouted(problem))
     np.testing.assert_array_equal(teams[0].controls, teams[1].controls)

@@ -26,7 +26,7 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
 from d4orm_env.envs.joint_env import ENV_ID, JointNavigationEnv
-from d4orm_planners.base.machine import commit, versions
+from d4orm_planners.base.provenance import commit, versions
 from d4orm_planners.evaluation.pool import ProcessWorker, run_here, run_jobs
 from d4orm_planners.rl.dataset.demonstrations import Demonstrations, RecordedEpisode
 from d4orm_planners.rl.dataset.minari_files import DatasetFiles
