@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -247,6 +248,15 @@ def study_rows(
     with replaced_when_done(path) as temporary:
         parquet.write_table(Table.from_pylist([{**row, **source} for row in rows]), temporary, compression="zstd")
     print(f"wrote {path}")
+    return rows
+
+
+def each_row(row_of: Callable[..., dict[str, Any]], *choices: Iterable[Any]) -> list[dict[str, Any]]:
+    """The row of every combination of choices, printed as soon as it is there."""
+    rows = []
+    for chosen in product(*choices):
+        rows.append(row_of(*chosen))
+        print(rows[-1], flush=True)
     return rows
 
 
