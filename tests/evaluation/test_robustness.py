@@ -21,6 +21,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import trial_support
 
 from d4orm_planners import make_policy
 from d4orm_planners.base.policy import GoToGoal
@@ -30,7 +31,7 @@ from d4orm_planners.evaluation import trials as trials_module
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.robustness import write_robustness
 from d4orm_planners.evaluation.sqlite_file import APPLICATION_ID
-from d4orm_planners.evaluation.store import STORE, Trial, TrialStore
+from d4orm_planners.evaluation.store import STORE, TrialStore
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.summary import SuccessRate, success_rate, success_rates, wilson_interval
 from d4orm_planners.evaluation.tables import HEADER, markdown
@@ -46,18 +47,7 @@ def rates_of(
     return success_rates(run_study(Study(policies=policies, **study), out, workers=workers, progress=progress))
 
 
-def trial(seed: int = 0, **changes: Any) -> Trial:
-    values = {
-        "policy": "go-to-goal",
-        "config": "{}",
-        "problem": "abc",
-        "control_noise_std": 0.1,
-        "scenario": "circle",
-        "num_robots": 2,
-    }
-    values |= {"label": "go-to-goal", "dt": 0.1}
-    outcome = {"success": True, "arrived": 2, "travel_time": 5.0, "makespan": 6.0, "steps": 60, "wall_time": 0.5}
-    return Trial(**{**values, "model": "holonomic2d", "versions": "{}", **outcome, "seed": seed, **changes})
+trial = partial(trial_support.trial, policy="go-to-goal", label="go-to-goal", control_noise_std=0.1, makespan=6.0)
 
 
 @pytest.fixture
