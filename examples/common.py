@@ -175,8 +175,8 @@ def _with_corrected_tests(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]
     return [{name: found.get((number, name), value) for name, value in row.items()} for number, row in enumerate(rows)]
 
 
-def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:
-    """Number of trials that are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
+def solved_columns(trials: Sequence[Any], counts: Callable[[Any], bool] = is_solved) -> dict[str, str]:
+    """Number of trials or rows that are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
     solved = sum(map(counts, trials))
     lower, upper = wilson_interval(solved, len(trials))
     return {"solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}"}

@@ -135,12 +135,11 @@ def train(options: TrainOptions) -> None:
 def _learning(options: TrainOptions) -> Callable[..., TrainingResult]:
     """The training that was asked for: by reinforcement, or of an expert."""
     training, imitation = _library("training"), _library("imitation")
-    reinforcement = training.train, training.TrainingSettings
-    imitating = imitation.imitate, imitation.ImitationSettings
     if options.algorithm == IMITATION:
-        (learn, kind), (_, other), reason = imitating, reinforcement, "is for ppo and sac; leave it out"
+        learn, kind, other = imitation.imitate, imitation.ImitationSettings, training.TrainingSettings
+        reason = "is for ppo and sac; leave it out"
     elif options.algorithm in training.ALGORITHMS:
-        (learn, kind), (_, other) = reinforcement, imitating
+        learn, kind, other = training.train, training.TrainingSettings, imitation.ImitationSettings
         reason = f"is for imitation; use it with 'd4orm train {IMITATION}'"
     else:
         raise unknown("algorithm", options.algorithm, (*training.ALGORITHMS, IMITATION))
