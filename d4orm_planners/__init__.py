@@ -18,27 +18,10 @@ if TYPE_CHECKING:
     from d4orm_planners.evaluation.evaluate import evaluate
 
 __all__ = [
-    "Controller",
-    "Episode",
-    "Iteration",
-    "IterationRecord",
-    "MixedPolicy",
-    "OpenLoop",
-    "Plan",
-    "Planner",
-    "PlannerConfig",
-    "Policy",
-    "SolveRun",
-    "evaluate",
-    "list_planners",
-    "list_policies",
-    "load_plan",
-    "make_planner",
-    "make_policy",
-    "register_planner",
-    "register_policy",
-    "run_episode",
-]
+    "Controller", "Episode", "Iteration", "IterationRecord", "MixedPolicy", "OpenLoop", "Plan", "Planner",
+    "PlannerConfig", "Policy", "SolveRun", "evaluate", "list_planners", "list_policies", "load_plan",
+    "make_planner", "make_policy", "register_planner", "register_policy", "run_episode",
+]  # fmt: skip
 
 _HOMES = {
     "base.controller": ("Controller",),

@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -174,8 +175,8 @@ def _with_corrected_tests(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]
     return [{name: found.get((number, name), value) for name, value in row.items()} for number, row in enumerate(rows)]
 
 
-def solved_columns(trials: Sequence[Trial], counts: Callable[[Trial], bool] = is_solved) -> dict[str, str]:
-    """Number of trials that are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
+def solved_columns(trials: Sequence[Any], counts: Callable[[Any], bool] = is_solved) -> dict[str, str]:
+    """Number of trials or rows that are solved, or count otherwise, with the 95% interval of their share (Wilson)."""
     solved = sum(map(counts, trials))
     lower, upper = wilson_interval(solved, len(trials))
     return {"solved": f"{solved} of {len(trials)}", "interval": f"{lower:.0%} to {upper:.0%}"}
@@ -247,6 +248,15 @@ def study_rows(
     with replaced_when_done(path) as temporary:
         parquet.write_table(Table.from_pylist([{**row, **source} for row in rows]), temporary, compression="zstd")
     print(f"wrote {path}")
+    return rows
+
+
+def each_row(row_of: Callable[..., dict[str, Any]], *choices: Iterable[Any]) -> list[dict[str, Any]]:
+    """The row of every combination of choices, printed as soon as it is there."""
+    rows = []
+    for chosen in product(*choices):
+        rows.append(row_of(*chosen))
+        print(rows[-1], flush=True)
     return rows
 
 

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from d4orm_env import verify
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_planners.base.plan import IterationRecord
+from d4orm_planners.base.plan import IterationRecord, Plan
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.planner_registry import PLANNERS, make_planner
 
@@ -63,6 +64,16 @@ def _ringed(number: int, distance: float) -> Problem:
     angle = np.linspace(0, 2 * np.pi, number, endpoint=False)
     ring = np.column_stack([3 + distance * np.cos(angle), distance * np.sin(angle), np.full(number, 0.25)])
     return Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[3, 0]], World(circles=ring), horizon=60)
+
+
+def assert_solves(planner: str, problem: Problem, seed: int = 0, **config: Any) -> Plan:
+    """Whatever is claimed to be solved is checked here anew."""
+    plan = make_planner(planner, engine="cpu", **config).solve(problem, seed=seed)
+    assert plan.solved, (plan.status, [record.note for record in plan.history], plan.failures)
+    report = verify(problem, plan.controls)
+    assert report.ok, report.violations
+    assert not plan.trajectory.margin_violated[1:].any()
+    return plan
 
 
 class Recorder:

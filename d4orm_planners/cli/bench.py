@@ -8,12 +8,11 @@ from typing import Annotated
 
 import typer
 
-from d4orm_planners.cli.arguments import MOST_SEEDS, names, numbers, output_folder
-from d4orm_planners.cli.common_options import Quiet
-from d4orm_planners.cli.outputs import parts_progress
+from d4orm_planners.cli.options import MOST_SEEDS, Quiet, names, numbers
+from d4orm_planners.cli.outputs import output_folder, parts_progress, tell_written
 from d4orm_planners.evaluation.bench_report import circumstances, write_report
 from d4orm_planners.evaluation.benchmark import parts, run_parts
-from d4orm_planners.evaluation.benchmark_settings import QUICK, SECTIONS, BenchmarkSettings
+from d4orm_planners.evaluation.measuring import QUICK, SECTIONS, BenchmarkSettings
 
 
 def bench(
@@ -46,6 +45,4 @@ def bench(
     with output_folder(out), parts_progress(enabled=not quiet) as progress:
         results = run_parts(list(parts(settings)), progress)
         written = write_report(out, settings, begun, results)
-    for path in written:
-        if not quiet:
-            typer.echo(f"wrote {path}")
+    tell_written(*written, quiet=quiet)

@@ -11,27 +11,23 @@ import typer
 
 from d4orm_planners.base.display import one_line
 from d4orm_planners.base.planner_registry import setting_names
-from d4orm_planners.cli.arguments import (
-    check_target,
-    decimals,
-    names,
-    numbers,
-    output_folder,
-    parse_levels,
-    parse_settings,
-    policies_by_label,
-    seed_list,
-)
-from d4orm_planners.cli.common_options import (
+from d4orm_planners.cli.options import (
     ObservationOptions,
     Physics,
     Quiet,
     ScenarioSettings,
     TimeLimit,
     Workers,
+    decimals,
+    names,
+    numbers,
+    parse_levels,
+    parse_settings,
+    policies_by_label,
+    seed_list,
     takes,
 )
-from d4orm_planners.cli.outputs import resumable, tell_results
+from d4orm_planners.cli.outputs import check_target, output_folder, resumable, tell_results, tell_written
 from d4orm_planners.evaluation.evaluate import run_shard, run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard as page
 from d4orm_planners.evaluation.robustness import tolerance_tables, write_disturbances, write_robustness
@@ -265,5 +261,4 @@ def leaderboard(
     text = page(trials, limits)
     with target(out) as path:
         path.write_text(text, encoding="utf-8")
-    if not quiet:
-        typer.echo(f"wrote {out}")
+    tell_written(out, quiet=quiet)

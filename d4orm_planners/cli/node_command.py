@@ -22,7 +22,7 @@ from d4orm_env.scenarios.schema import VERSION, parse
 from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.cli import on_signals
-from d4orm_planners.cli.arguments import check_target
+from d4orm_planners.cli.outputs import check_target
 from d4orm_planners.d_d4orm.planner import DD4orm
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 from d4orm_planners.serve.fleet_server import NODE, FleetServer

@@ -1,10 +1,11 @@
-"""Output of commands: tables, and lines of progress."""
+"""Output of commands: where files go, tables, and lines of progress."""
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Te
 from rich.table import Table
 from rich.text import Text
 
+from d4orm_env.core.files import target_of
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_planners.base.display import one_line
 from d4orm_planners.base.plan import IterationRecord
@@ -25,6 +27,42 @@ if TYPE_CHECKING:
 
 LOG_INTERVAL = 60.0
 """Seconds between lines of progress where there is no terminal."""
+
+
+@contextmanager
+def output_folder(folder: Path) -> Iterator[None]:
+    """Make a folder, unless it is there; what was made is removed again where nothing was written to it."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"folder {str(folder)!r} cannot be made ({error.strerror}); choose another") from None
+    check_writable(folder)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # it is not empty
+            for path in made:
+                path.rmdir()
+
+
+def check_writable(folder: Path) -> None:
+    """Find out whether files can be made in a folder."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        reason = error.strerror or "refused"
+        raise ValueError(f"folder {str(folder)!r} cannot be written to ({reason}); choose another") from None
+
+
+def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
+    """Find out before planning whether a file can be written."""
+    if path is None:
+        return
+    if path.suffix not in suffixes:
+        raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
+    check_writable(target_of(path).parent)
 
 
 def episode_rows(episode: Episode) -> list[tuple[str, str]]:
@@ -153,5 +191,11 @@ def _live_line(columns: Iterable[ProgressColumn], enabled: bool) -> Iterator[Pro
 def tell_results(text: str, written: Iterable[Path]) -> None:
     """Print tables, and which files were written."""
     typer.echo(text)
-    for path in written:
-        typer.echo(f"wrote {path}")
+    tell_written(*written)
+
+
+def tell_written(*paths: Path | None, quiet: bool = False) -> None:
+    """Print which files were written, as far as there are any."""
+    for path in paths:
+        if path is not None and not quiet:
+            typer.echo(f"wrote {path}")

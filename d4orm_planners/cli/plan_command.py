@@ -12,9 +12,25 @@ import typer
 
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
-from d4orm_planners.cli.arguments import check_target, output_folder, parse_settings, refuse_options
-from d4orm_planners.cli.common_options import Engine, PictureOptions, ProblemOptions, Settings, TimeLimit, takes
-from d4orm_planners.cli.outputs import print_plan, print_table, require_solved, solve_progress
+from d4orm_planners.cli.options import (
+    Engine,
+    PictureOptions,
+    ProblemOptions,
+    Settings,
+    TimeLimit,
+    parse_settings,
+    refuse_options,
+    takes,
+)
+from d4orm_planners.cli.outputs import (
+    check_target,
+    output_folder,
+    print_plan,
+    print_table,
+    require_solved,
+    solve_progress,
+    tell_written,
+)
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.hybrid.compile_ahead import compile_for_planning
 
@@ -64,9 +80,7 @@ def plan(options: PlanOptions) -> None:
     if options.out is not None:
         (found.to_html if options.out.suffix == ".html" else found.save)(options.out)
     options.draw(problem, found.trajectory)
-    for path in (options.out, options.picture, options.animation):
-        if path is not None and not options.quiet:
-            typer.echo(f"wrote {path}")
+    tell_written(options.out, options.picture, options.animation, quiet=options.quiet)
     require_solved(found)
 
 

@@ -1,12 +1,17 @@
-"""``d4orm run`` and ``d4orm demo``: an episode of a plan or a policy; a team planned, executed, verified and drawn."""
+"""``d4orm run``, ``play`` and ``demo``: episodes of plans and policies, live in a browser, and drawn."""
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
+import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import rich
 import typer
 
 from d4orm_env import make_problem, navigation_v0, verify
@@ -18,8 +23,8 @@ from d4orm_planners.base.episode import open_env, run_episode
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner, make_policy
 from d4orm_planners.base.policy import OpenLoop
-from d4orm_planners.cli.arguments import check_target, output_folder, policies_by_label, refuse_options, single_levels
-from d4orm_planners.cli.common_options import (
+from d4orm_planners.cli import on_signals
+from d4orm_planners.cli.options import (
     Disturb,
     Engine,
     NoiseLevel,
@@ -28,9 +33,22 @@ from d4orm_planners.cli.common_options import (
     PictureOptions,
     ProblemOptions,
     Seed,
+    names,
+    policies_by_label,
+    refuse_options,
+    single_levels,
     takes,
 )
-from d4orm_planners.cli.outputs import episode_rows, print_plan, print_table, require_solved, require_success
+from d4orm_planners.cli.outputs import (
+    check_target,
+    episode_rows,
+    output_folder,
+    print_plan,
+    print_table,
+    require_solved,
+    require_success,
+    tell_written,
+)
 from d4orm_planners.cli.plan_command import solving
 from d4orm_planners.sampling.denoising import DenoisingFilm
 
@@ -40,6 +58,10 @@ if TYPE_CHECKING:
     from d4orm_planners.base.episode import Episode
     from d4orm_planners.base.plan import Plan
     from d4orm_planners.base.policy import Policy
+    from d4orm_planners.play.playground import Playground
+
+LAST_WAIT = 2.0
+"""Seconds from Ctrl-C of ``d4orm play`` to the end of the process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,8 +141,7 @@ def run(options: RunOptions) -> None:
         episode.to_html(options.out)
     if not options.quiet:
         print_table("Execution", episode_rows(episode))
-        if options.out is not None:
-            typer.echo(f"wrote {options.out}")
+        tell_written(options.out)
     if isinstance(policy, OpenLoop) and policy.plan is not None:
         require_solved(policy.plan)
     require_success(episode, problem)
@@ -141,8 +162,61 @@ def compare(options: RunOptions, texts: list[str]) -> None:
             print_table(name, episode_rows(episodes[name]))
     title = f"{problem.name}, {count(problem.num_robots, 'robot')}"
     Replay(title, tuple(episode.motion(name) for name, episode in episodes.items())).save(options.out)
-    if not options.quiet:
-        typer.echo(f"wrote {options.out}")
+    tell_written(options.out, quiet=options.quiet)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions(ObservationOptions, ProblemOptions):
+    """Options on the first scene, and on the page's address."""
+
+    policy: Annotated[
+        str, typer.Option("--policy", "-p", help="What drives (see `d4orm planners`); several, separated by commas.")
+    ] = "d4orm-c2f"
+    host: Annotated[str, typer.Option(help="Where to be found; elsewhere than here the address has a token.")] = (
+        "127.0.0.1"
+    )
+    port: Annotated[int, typer.Option(help="Port; any free one by default.")] = 0
+    open_browser: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser if there is one.")] = True
+
+
+@takes(PlayOptions)
+def play(options: PlayOptions) -> None:
+    """Look at a team live in a browser, and meddle with it; needs the extra viz."""
+    # Some libraries, while they are loaded, swallow what a signal raises.
+    with on_signals(lambda *_: os._exit(130)):
+        playground = _playground(options)
+    try:
+        typer.echo(f"open {playground.address}\nCtrl-C ends it")
+        if options.open_browser and has_display():
+            webbrowser.open(playground.address)
+        playground.run()
+    except KeyboardInterrupt:
+        # Python waits for threads of planners, which may be in the middle of a plan.
+        watchdog = threading.Timer(LAST_WAIT, os._exit, (130,))
+        watchdog.daemon = True
+        watchdog.start()
+        raise
+    finally:
+        playground.close()
+
+
+def _playground(options: PlayOptions) -> Playground:
+    try:
+        from d4orm_planners.play.playground import Playground
+    except ImportError as error:
+        raise ImportError("d4orm play needs viser; install it with: pip install 'd4orm-env[viz]'") from error
+
+    rich.get_console().quiet = True  # or viser prints a line for every client of another version
+    typer.echo("getting ready; the first time this compiles for a while ...")
+    policies = names(options.policy) or ()
+    return Playground(
+        options.problem(), *policies, seed=options.seed, host=options.host, port=options.port, **options.observation
+    )
+
+
+def has_display() -> bool:
+    """Check whether a browser would have something to draw on."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def demo(

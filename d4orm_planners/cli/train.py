@@ -1,4 +1,4 @@
-"""``d4orm train``: reinforcement learning, and imitation of an expert."""
+"""``d4orm train``: reinforcement learning, and imitation of an expert; ``d4orm dataset``: demonstrations."""
 
 from __future__ import annotations
 
@@ -16,9 +16,28 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from d4orm_env.core.errors import unknown
-from d4orm_planners.cli.arguments import output_folder, parse_settings, refuse_options
-from d4orm_planners.cli.common_options import Model, Quiet, takes
-from d4orm_planners.cli.outputs import resumable, tell_results
+from d4orm_env.disturbances.disturbance_registry import disturbances_at
+from d4orm_env.scenarios.problems import is_scenario_file
+from d4orm_planners.cli.options import (
+    Disturb,
+    Model,
+    NoiseLevel,
+    NumRobots,
+    ObservationOptions,
+    Quiet,
+    ScenarioName,
+    ScenarioSettings,
+    Settings,
+    Workers,
+    parse_settings,
+    refuse_options,
+    seed_list,
+    single_levels,
+    takes,
+)
+from d4orm_planners.cli.outputs import output_folder, resumable, tell_results
+from d4orm_planners.rl.dataset import Demonstrations
+from d4orm_planners.rl.dataset.write import checked_id, dataset_folder, write_dataset
 
 if TYPE_CHECKING:
     from d4orm_planners.rl.training import TrainingResult
@@ -116,12 +135,11 @@ def train(options: TrainOptions) -> None:
 def _learning(options: TrainOptions) -> Callable[..., TrainingResult]:
     """The training that was asked for: by reinforcement, or of an expert."""
     training, imitation = _library("training"), _library("imitation")
-    reinforcement = training.train, training.TrainingSettings
-    imitating = imitation.imitate, imitation.ImitationSettings
     if options.algorithm == IMITATION:
-        (learn, kind), (_, other), reason = imitating, reinforcement, "is for ppo and sac; leave it out"
+        learn, kind, other = imitation.imitate, imitation.ImitationSettings, training.TrainingSettings
+        reason = "is for ppo and sac; leave it out"
     elif options.algorithm in training.ALGORITHMS:
-        (learn, kind), (_, other) = reinforcement, imitating
+        learn, kind, other = training.train, training.TrainingSettings, imitation.ImitationSettings
         reason = f"is for imitation; use it with 'd4orm train {IMITATION}'"
     else:
         raise unknown("algorithm", options.algorithm, (*training.ALGORITHMS, IMITATION))
@@ -145,3 +163,90 @@ def _library(name: str) -> ModuleType:
         return import_module(f"d4orm_planners.rl.{name}")
     except ModuleNotFoundError as error:
         raise ImportError(f"training needs {error.name}; install it with: pip install 'd4orm-env[rl]'") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetOptions(ObservationOptions):
+    """Options on demonstrations and their files."""
+
+    context: typer.Context
+    policy: Annotated[str, typer.Option("--policy", "-p", help="Planner, policy or package.module:Name.")] = "d4orm-c2f"
+    settings: Settings = None
+    scenario: ScenarioName = "random"
+    num_robots: NumRobots = None
+    model: Model = None
+    scenario_settings: ScenarioSettings = None
+    seeds: Annotated[
+        str,
+        typer.Option("--seeds", "--episodes", "-n", help="How many, or which: 50 for 0 to 49, 10-19, or 3,5,8."),
+    ] = "100"
+    reward: Annotated[str, typer.Option(help="paper or training.")] = "paper"
+    control_noise_std: NoiseLevel = 0.0
+    disturb: Disturb = None
+    agents: Annotated[
+        str, typer.Option(help="An episode for the whole team, or one for each robot: team or robot.")
+    ] = "team"
+    only_success: Annotated[
+        bool, typer.Option("--only-success", help="Leave out episodes with a contact or a robot that does not arrive.")
+    ] = False
+    dataset_id: Annotated[
+        str | None, typer.Option("--id", help="Name in Minari, as d4orm/mine-v0; made of what it holds by default.")
+    ] = None
+    shard_size: Annotated[int, typer.Option(help="Seeds whose episodes go into one file.")] = 1000
+    workers: Workers = None
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder; by default where Minari finds the name.")] = (
+        None
+    )
+    quiet: Quiet = False
+
+    def demonstrations(self) -> Demonstrations:
+        """Return the demonstrations to record."""
+        own = parse_settings(self.scenario_settings, "--scenario-set")
+        if is_scenario_file(self.scenario):
+            reason = f"does not go with a scenario file; change it in {self.scenario}"
+            refuse_options(self.context, ("num_robots", "model", "scenario_settings"), reason)
+        environment: dict[str, object] = {"scenario": self.scenario, **own}
+        for name in ("num_robots", "model"):
+            if name in own:
+                raise ValueError(f"--scenario-set {name} is said by --{name.replace('_', '-')}; use that")
+            if getattr(self, name) is not None:
+                environment[name] = getattr(self, name)
+        for name, default in (("reward", "paper"), ("control_noise_std", 0.0)):
+            if getattr(self, name) != default:
+                environment[name] = getattr(self, name)
+        if self.disturb:
+            environment["disturbances"] = disturbances_at(single_levels(self.disturb))
+        environment |= self.observation
+        return Demonstrations(
+            policy=self.policy,
+            settings=parse_settings(self.settings),
+            environment=environment,
+            seeds=seed_list(self.seeds),
+            agents=self.agents,
+            only_success=self.only_success,
+        )
+
+
+@takes(DatasetOptions)
+def dataset(options: DatasetOptions) -> None:
+    """Record demonstrations of a planner or policy as a Minari dataset; goes on where it was stopped."""
+    demonstrations = options.demonstrations()
+    name = checked_id(demonstrations.dataset_id if options.dataset_id is None else options.dataset_id)
+    folder = options.out or dataset_folder(name)
+    kept = f"the finished episodes are kept in {folder}"
+    with output_folder(folder), resumable(kept, enabled=not options.quiet) as progress:
+        written = write_dataset(
+            demonstrations,
+            folder,
+            dataset_id=name,
+            shard_size=options.shard_size,
+            workers=options.workers,
+            progress=progress,
+        )
+    if not options.quiet:
+        typer.echo(f"wrote {written.total_episodes} episodes, {written.total_steps} steps, to {folder}")
+        how = f"minari.MinariDataset({str(folder / 'data')!r})" if options.out else f"minari.load_dataset({name!r})"
+        typer.echo(f"use it: {how}")
+    if not written.total_episodes:
+        typer.echo("every episode was left out; try another policy, or without --only-success", err=True)
+        raise typer.Exit(1)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import pkgutil
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 import typer
@@ -24,7 +22,7 @@ from d4orm_planners import d4orm_c2f, mapf, tracking
 from d4orm_planners import engine as sampling_engine
 from d4orm_planners.base.names import PLANNERS
 from d4orm_planners.base.planner_registry import make_planner
-from d4orm_planners.cli.common_options import Quiet
+from d4orm_planners.cli.options import Quiet
 from d4orm_planners.d4orm_c2f.barrier import safe_velocities
 from d4orm_planners.engine.score import score_kernel
 from d4orm_planners.hybrid.compile_ahead import (
@@ -41,38 +39,15 @@ from d4orm_planners.mapf.beam_search import search_kernel
 from d4orm_planners.sampling.loop import SamplingPlanner
 from d4orm_planners.tracking.tracker import follow_reference, reference_kernel, straight_kernel
 
-
-@dataclass(frozen=True)
-class WarmupReport:
-    """Report of a warm-up.
-
-    Attributes:
-        seconds: Time that it took.
-        compiled: Kernels that had to be compiled.
-        loaded: Kernels that were in the cache already.
-        folders: Folders of the cache; empty if no folder can be written to, so that nothing is kept.
-        lost: Kernels that could not be written there.
-    """
-
-    seconds: float
-    compiled: tuple[str, ...]
-    loaded: tuple[str, ...]
-    folders: tuple[Path, ...]
-    lost: tuple[str, ...]
-
-
 TEAMS = (*((model, model) for model in COMMON), ("holonomic2d", "differential_drive"))
 """The smallest teams of common models that have kernels of their own."""
 
 
-def warm_up() -> WarmupReport:
+def warm_up() -> None:
     """Run everything once on the smallest problems.
 
     One compilation of a kernel serves every problem with the same models, so two robots stand for all teams.
     """
-    begin = time.perf_counter()
-    # Before anything runs: what the other process compiles is in the cache when it is needed here.
-    missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
     # The last kernel, for three models, takes as long as two others.
     other = in_another_process(f"drive_once({TEAMS[0]}); sample_once({TEAMS[1:-1]}); find_paths(); spread_waves()")
     sample_once((TEAMS[0], TEAMS[-1]))
@@ -90,17 +65,6 @@ def warm_up() -> WarmupReport:
     spread_waves()
     _evade()
     _plan()
-    seconds = time.perf_counter() - begin
-    kernels = [kernel for kernel in _kernels() if kernel.signatures]
-    compiled = [kernel for kernel in kernels if kernel.stats.cache_misses or kernel in missing]
-    loaded = [kernel for kernel in kernels if kernel not in compiled]
-    lost = [kernel for kernel in compiled if has_to_be_compiled(kernel)]
-    folders = tuple(sorted({Path(path) for kernel in kernels if (path := kernel.stats.cache_path)}))
-    return WarmupReport(seconds, _names(compiled), _names(loaded), folders, _names(lost))
-
-
-def _names(kernels: Iterable[Dispatcher[Callable[..., object]]]) -> tuple[str, ...]:
-    return tuple(kernel.py_func.__name__ for kernel in kernels)
 
 
 def _plan() -> None:
@@ -161,12 +125,17 @@ def _kernels() -> list[Dispatcher[Callable[..., object]]]:
 def warmup(quiet: Quiet = False) -> None:
     """Compile ahead what planning and the environments need, so that the next start is quick."""
     check_can_be_kept()
-    report = warm_up()
+    begin = time.perf_counter()
+    # Before anything runs: what another process compiles meanwhile is in the cache when it is needed here.
+    missing = [kernel for kernel in _kernels() if has_to_be_compiled(kernel)]
+    warm_up()
+    seconds = time.perf_counter() - begin
+    kernels = [kernel for kernel in _kernels() if kernel.signatures]
+    compiled = [kernel for kernel in kernels if kernel.stats.cache_misses or kernel in missing]
     if not quiet:
-        typer.echo(
-            f"{len(report.compiled)} kernels compiled, {len(report.loaded)} found in the cache, {report.seconds:.1f} s"
-        )
-        for folder in report.folders:
+        found = len(kernels) - len(compiled)
+        typer.echo(f"{len(compiled)} kernels compiled, {found} found in the cache, {seconds:.1f} s")
+        for folder in sorted({str(kernel.stats.cache_path) for kernel in kernels}):
             typer.echo(f"cache {folder}")
-    if report.lost:
-        raise OSError(f"{len(report.lost)} kernels could not be kept; free some space, or set NUMBA_CACHE_DIR")
+    if lost := sum(map(has_to_be_compiled, compiled)):
+        raise OSError(f"{lost} kernels could not be kept; free some space, or set NUMBA_CACHE_DIR")

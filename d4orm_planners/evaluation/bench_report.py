@@ -15,8 +15,7 @@ from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.engine.choice import resolve_engine
 from d4orm_planners.base.provenance import commit, describe_machine, versions
-from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
-from d4orm_planners.evaluation.measuring import Measurement, Spread
+from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread
 from d4orm_planners.evaluation.tables import table
 
 jax: Any = LazyModule("jax")

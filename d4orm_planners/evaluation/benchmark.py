@@ -9,8 +9,10 @@ from typing import Any, TypeAlias, get_args
 
 import numpy as np
 
+from d4orm_env import verify
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.engine.choice import resolve_engine
 from d4orm_env.engine.threads import available_cores
@@ -19,7 +21,6 @@ from d4orm_planners import reference as plain
 from d4orm_planners.base.controller import Mode
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
-from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
 from d4orm_planners.evaluation.env_steps import (
     DISTURBANCES,
     RAY_BOXES,
@@ -31,16 +32,16 @@ from d4orm_planners.evaluation.env_steps import (
     measure_rooms,
     measure_worlds,
 )
-from d4orm_planners.evaluation.measuring import Measurement, Spread, in_turn, measure
+from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, in_turn, measure
 from d4orm_planners.evaluation.probes import (
     BOXES,
     Where,
+    boxed_problem,
     measure_big_loops,
     measure_big_team,
     measure_improvement,
     measure_index,
     measure_memory,
-    measure_obstacles,
     measure_robots,
     measure_startup,
 )
@@ -93,8 +94,7 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for cells in settings.map_cells:
         yield "index", f"index of {cells} x {cells} cells", partial(measure_index, cells)
     for mode in get_args(Mode):
-        loops = partial(measure_robots, mode, settings.repetitions, settings.time_limit)
-        yield "robots", f"control loops, {mode}", loops
+        yield "robots", f"control loops, {mode}", partial(measure_robots, settings, mode)
     for scenario, size in (("circle", 8), ("warehouse", 16)):
         start = partial(measure_startup, scenario, size, min(settings.repetitions, 5))
         yield "startup", f"first plan of a process, {scenario}", start
@@ -181,9 +181,8 @@ def _measure_denoising(
 ) -> Measurement:
     problem = circle(num_robots, model, settings.horizon)
     run = _plain_run(problem, settings) if engine == "plain" else _engine_run(problem, settings, engine, preset)
-    planner = _d4orm(num_steps=settings.num_steps)
-    noise_scale = planner.noise_scale()
-    timed = partial(measure, repetitions=settings.repetitions, time_limit=settings.time_limit)
+    noise_scale = _d4orm(num_steps=settings.num_steps).noise_scale()
+    timed = partial(measure, settings)
     # Steps in a row, because what a run begins with is no part of a step.
     first = np.repeat(noise_scale[:1], FIRST_STEPS)
     step = timed(lambda: run(first, True)).times(1 / FIRST_STEPS)
@@ -236,7 +235,7 @@ def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int)
     noise_scale = _d4orm(num_steps=settings.num_steps).noise_scale()
     several, single = (_engine_run(problem, settings, "cpu", None, count) for count in (threads, 1))
     works = [partial(run, noise_scale, True) for run in (several, single)]
-    with_several, with_one = in_turn(works, settings.repetitions, settings.time_limit)
+    with_several, with_one = in_turn(settings, *works)
     return {
         "num_robots": num_robots,
         "threads": threads,
@@ -247,14 +246,24 @@ def _measure_threads(settings: BenchmarkSettings, num_robots: int, threads: int)
 
 
 def _measure_obstacles(settings: BenchmarkSettings, num_boxes: int, where: Where) -> Measurement:
-    """An iteration of the paper's planner among boxes, beside one in the open."""
-    planner = _d4orm(preset="paper", num_steps=settings.num_steps)
-    noise_scale = planner.noise_scale()
+    """An iteration of the paper's planner among boxes, beside one in the open, and verify()."""
+    problem = boxed_problem(num_boxes, where)
+    noise_scale = _d4orm(preset="paper", num_steps=settings.num_steps).noise_scale()
+    controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    controls[:40] = 0.5 * (problem.goal - problem.start[:, :2]) / np.linalg.norm(problem.goal, axis=1)[:, None]
 
-    def iterate(problem: Problem) -> None:
-        _engine_run(problem, settings, "cpu", "paper")(noise_scale, True)
+    def iterate(chosen: Problem) -> None:
+        _engine_run(chosen, settings, "cpu", "paper")(noise_scale, True)
 
-    return measure_obstacles(iterate, num_boxes, where, settings.repetitions, settings.time_limit)
+    among, alone = in_turn(settings, *(partial(iterate, one) for one in (problem, problem.replace(world=World()))))
+    return {
+        "obstacles": num_boxes,
+        "where": where,
+        "num_robots": problem.num_robots,
+        "iteration": Spread.of(among),
+        "ratio": Spread.of(np.divide(among, alone).tolist()),
+        "verify": measure(settings, lambda: verify(problem, controls)),
+    }
 
 
 def _measure_plans(settings: BenchmarkSettings, engine: str, preset: str | None, num_robots: int) -> Measurement:

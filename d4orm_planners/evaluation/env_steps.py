@@ -14,8 +14,7 @@ from d4orm_env.disturbances import Delay, Dropout, StateNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.evaluation.benchmark_settings import BenchmarkSettings
-from d4orm_planners.evaluation.measuring import Measurement, Spread, measure
+from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, measure
 from d4orm_planners.evaluation.probes import boxed_problem
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
                 env.reset()
             env.step(table[index % len(table)])
 
-    spread = measure(steps, settings.repetitions, settings.time_limit)
+    spread = measure(settings, steps)
     env.close()
     return spread.times(1 / count)
 
@@ -110,7 +109,7 @@ def _measure_batch(settings: BenchmarkSettings, size: int, **options: Any) -> Sp
         for index in range(calls):
             env.step(table[index % len(table)])
 
-    spread = measure(steps, settings.repetitions, settings.time_limit)
+    spread = measure(settings, steps)
     env.close()
     return spread.times(1 / (calls * size))
 
@@ -135,9 +134,7 @@ def measure_functional(settings: BenchmarkSettings) -> Measurement:
         return jax.lax.scan(move, (state, jnp.float32(0)), jax.random.split(key, calls))[0]
 
     state, _ = begin(jax.random.split(jax.random.key(0), size))
-    spread = measure(
-        lambda: jax.block_until_ready(steps(state, jax.random.key(1))), settings.repetitions, settings.time_limit
-    )
+    spread = measure(settings, lambda: jax.block_until_ready(steps(state, jax.random.key(1))))
     return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
 
 

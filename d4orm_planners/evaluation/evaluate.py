@@ -131,11 +131,7 @@ def run_study(
     Returns:
         Trials, one per seed, for every scenario, model, team size, policy and condition, in that order.
     """
-    if trial_timeout is not None:
-        trial_timeout = duration(trial_timeout, "trial_timeout")
-    if workers is not None:
-        whole_number(workers, "workers", 1)
-    groups = study.groups()
+    groups = _checked_groups(study, trial_timeout, workers)
     if ray is not None:
         import_ray(RAY_USE)  # before there is a store
     Path(out).mkdir(parents=True, exist_ok=True)
@@ -179,12 +175,21 @@ def run_shard(
     """
     count = whole_number(shard[1], "number of shards", 1)
     index = whole_number(shard[0], "shard", 1, count)
-    jobs = [job for group in study.groups() for job in group][index - 1 :: count]
+    jobs = [job for group in _checked_groups(study, trial_timeout, workers) for job in group][index - 1 :: count]
     Path(out).mkdir(parents=True, exist_ok=True)
     path = Path(out) / SHARD_STORES.replace("*", f"{index}-of-{count}")
     store = TrialStore(path, alone=True)
     _complete(store, jobs, workers, None, trial_timeout, progress)
     return path
+
+
+def _checked_groups(study: Study, trial_timeout: float | None, workers: int | None) -> list[list[Job]]:
+    """The jobs of a study that is to run with these."""
+    if trial_timeout is not None:
+        duration(trial_timeout, "trial_timeout")
+    if workers is not None:
+        whole_number(workers, "workers", 1)
+    return study.groups()
 
 
 def _missing(jobs: Sequence[Job], finished: Set[TrialKey]) -> tuple[list[Job], int, int]:

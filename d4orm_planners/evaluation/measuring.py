@@ -1,13 +1,143 @@
-"""Wall-clock measurements, repeated and in turn."""
+"""How a benchmark measures: its settings, in full and for a first look, and a stopwatch whose readings are samples."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
+from pydantic import Field
+
+from d4orm_env.dynamics.models import COMMON, get_model
+from d4orm_planners.base.settings import CheckedSettings, Count, Positive, Samples, Steps, Whole
+
+ENGINES = ("cpu", "jax", "plain")
+SECTIONS = (
+    "denoising", "threads", "environments", "obstacles", "index", "robots", "startup", "memory", "plans", "big teams",
+    "improvement", "big loops",
+)  # fmt: skip
+MODELS = (
+    *COMMON, "unicycle", "unicycle1", "unicycle2", "car", "car_first_order", "holonomic2d_jerk", "holonomic3d_drag",
+)  # fmt: skip
+
+Robots = Annotated[Count, Field(le=10_000)]
+"""Number of robots, as many as scenarios make."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkSettings(CheckedSettings):
+    """Settings of a benchmark.
+
+    Attributes:
+        sections: Parts to measure, of :data:`SECTIONS`.
+        num_robots: Team sizes.
+        models: Robot models.
+        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.reference`, which has the common models.
+        num_samples: ``M``.
+        horizon: ``H``.
+        num_steps: Denoising steps in an iteration.
+        repetitions: Calls per measurement at most.
+        time_limit: Seconds per measurement, after which no further call begins.
+        iteration_limit: Whole iterations expected to take longer than this are left out [s].
+        most_robots_slow: Largest team for engines other than the CPU engine and, on an accelerator, JAX.
+        env_steps: Environment steps per repetition.
+        num_worlds: Worlds in the batched environment.
+        plan_robots: Team sizes for the first feasible plan.
+        seeds: Seeds ``0, 1, ...`` per team size.
+        plan_time_limit: Seconds per plan.
+        thread_robots: Team sizes whose iterations are timed with several threads and with one.
+        memory_robots: Team size of the memory measurement.
+        obstacles: Numbers of boxes among the paths of 8 robots.
+        far_obstacles: The same of boxes far away; also what environments are stepped among.
+        map_cells: Cells along a side of the maps whose index of obstacles is timed.
+        big_random: Team sizes for the first plan of the recommended planner on open ground.
+        big_warehouse: The same in warehouses.
+        big_drives: The same of differential drives.
+        big_boxes: The same of rectangles with goal headings in warehouses.
+        big_free_boxes: The same of rectangles without.
+        big_seeds: Seeds of these, and of the plans that are improved.
+        big_time_limit: Seconds per plan of these.
+        improved_robots: Team sizes whose first plans are improved.
+        improving_limit: Time that this may take [s].
+        loop_robots: Team sizes for control loops of D4orm-C2F.
+        loops: Their number.
+    """
+
+    sections: tuple[str, ...] = SECTIONS
+    num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
+    models: tuple[str, ...] = MODELS
+    engines: tuple[str, ...] = ENGINES
+    num_samples: Samples = 1024
+    horizon: Steps = 100
+    num_steps: Steps = 100
+    repetitions: Count = 20
+    time_limit: Positive = 2.0
+    iteration_limit: Positive = 20.0
+    most_robots_slow: Annotated[Whole, Field(ge=0)] = 16
+    env_steps: Count = 2000
+    num_worlds: Steps = 1024
+    plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)
+    seeds: Count = 20
+    plan_time_limit: Positive = 20.0
+    thread_robots: tuple[Robots, ...] = (8, 16, 64)
+    memory_robots: Robots = 64
+    obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
+    far_obstacles: tuple[Count, ...] = (200,)
+    map_cells: tuple[Count, ...] = (32, 256)
+    big_random: tuple[Robots, ...] = (1000, 2000)
+    big_warehouse: tuple[Robots, ...] = (100, 200)
+    big_drives: tuple[Robots, ...] = (100,)
+    big_boxes: tuple[Robots, ...] = (16, 50)
+    big_free_boxes: tuple[Robots, ...] = (100,)
+    big_seeds: Count = 3
+    big_time_limit: Positive = 120.0
+    improved_robots: tuple[Robots, ...] = (8, 24)
+    improving_limit: Positive = 0.05
+    loop_robots: tuple[Robots, ...] = (64, 512)
+    loops: Count = 30
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for model in self.models:
+            get_model(model)
+        for what, given, known in (("engine", self.engines, ENGINES), ("section", self.sections, SECTIONS)):
+            for name in given:
+                if name not in known:
+                    raise ValueError(f"{what} {name!r} is no {what} of the benchmark; choose from {', '.join(known)}")
+
+
+QUICK: Mapping[str, object] = {
+    "num_robots": (4, 8),
+    "models": ("holonomic2d", "differential_drive"),
+    "num_steps": 20,
+    "repetitions": 3,
+    "time_limit": 0.5,
+    "iteration_limit": 2.0,
+    "most_robots_slow": 8,
+    "env_steps": 500,
+    "num_worlds": 128,
+    "plan_robots": (4, 8),
+    "seeds": 2,
+    "plan_time_limit": 5.0,
+    "thread_robots": (8,),
+    "memory_robots": 16,
+    "obstacles": (4, 200),
+    "map_cells": (32,),
+    "big_random": (100,),
+    "big_warehouse": (16,),
+    "big_drives": (8,),
+    "big_boxes": (4,),
+    "big_free_boxes": (8,),
+    "big_seeds": 2,
+    "big_time_limit": 10.0,
+    "improved_robots": (8,),
+    "loop_robots": (16,),
+    "loops": 10,
+}
+"""Settings of a benchmark of about a minute, for a first look."""
+
 
 Measurement: TypeAlias = dict[str, Any]
 """Measurement of one case, by column: numbers, texts and :class:`Spread`."""
@@ -35,23 +165,17 @@ class Spread:
         return replace(self, **{name: value * factor for name, value in vars(self).items() if name != "count"})
 
 
-def measure(work: Callable[[], object], repetitions: int, time_limit: float) -> Spread:
-    """Seconds that ``work`` takes, after one call that does not count.
-
-    Args:
-        work: Function to time.
-        repetitions: Calls at most, at least one.
-        time_limit: No further call begins once the counted ones have taken this long [s].
-    """
-    return Spread.of(in_turn((work,), repetitions, time_limit)[0])
+def measure(settings: BenchmarkSettings, work: Callable[[], object]) -> Spread:
+    """Seconds that ``work`` takes, after one call that does not count, by the settings' repetitions and time limit."""
+    return Spread.of(in_turn(settings, work)[0])
 
 
-def in_turn(works: Sequence[Callable[[], object]], repetitions: int, time_limit: float) -> list[list[float]]:
+def in_turn(settings: BenchmarkSettings, *works: Callable[[], object]) -> list[list[float]]:
     """Seconds that each of several functions takes, called in turn; see :func:`measure`."""
     for work in works:
         work()
     seconds: list[list[float]] = [[] for _ in works]
-    while not seconds[0] or (len(seconds[0]) < repetitions and sum(map(sum, seconds)) < time_limit):
+    while not seconds[0] or (len(seconds[0]) < settings.repetitions and sum(map(sum, seconds)) < settings.time_limit):
         for work, taken in zip(works, seconds, strict=True):
             begin = time.perf_counter()
             work()

@@ -1,4 +1,4 @@
-"""Start-up and memory of fresh processes, control loops, and the cost of obstacles beside the open world."""
+"""Start-up and memory of fresh processes, control loops, the index of obstacles, and plans of big teams."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
-from d4orm_env import navigation_v0, verify
+from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.footprints import Box
@@ -23,7 +22,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
 from d4orm_planners.base.planner_registry import make_planner, make_policy
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
-from d4orm_planners.evaluation.measuring import Measurement, Spread, in_turn, measure
+from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, measure
 
 _FIRST_PLAN = """
 import json, sys, time
@@ -112,7 +111,7 @@ def measure_memory(num_robots: int, num_samples: int, horizon: int, diameter: fl
     return {"num_robots": num_robots, "num_samples": num_samples, "horizon": horizon, **result}
 
 
-def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Measurement:
+def measure_robots(settings: BenchmarkSettings, mode: Mode) -> Measurement:
     """Seconds of control loops of D4orm-C2F for ten robots, and of :meth:`Plan.sample` at 100 Hz for as many.
 
     The loops run at their own pace, because refining and planning anew go on beside them. Once a second all robots are
@@ -120,10 +119,10 @@ def measure_robots(mode: Mode, repetitions: int, time_limit: float) -> Measureme
     """
     problem = make_problem("circle", num_robots=CONTROLLED, goal_speed=0.1, horizon=150)
     plan = make_planner().solve(problem, seed=0)
-    sampling = measure(plan.sample, repetitions, time_limit)
+    sampling = measure(settings, plan.sample)
     seconds: list[float] = []
     replanned = held = 0
-    for seed in range(min(repetitions, 3)):
+    for seed in range(min(settings.repetitions, 3)):
         timeout = 0.9 * problem.dt
         with Controller("d4orm-c2f", mode=mode, reserve=0.0, timeout=timeout, replan_distance=2.0) as controller:
             steps = _driven(problem, controller, seed)
@@ -169,25 +168,6 @@ def boxed_problem(num_boxes: int, where: Where) -> Problem:
     else:
         positions = random.uniform(8, 20, (num_boxes, 2)) * random.choice([-1, 1], (num_boxes, 2))
     return problem.replace(world=World(boxes=np.hstack([positions - SIZE / 2, positions + SIZE / 2])))
-
-
-def measure_obstacles(
-    iterate: Callable[[Problem], object], num_boxes: int, where: Where, repetitions: int, time_limit: float
-) -> Measurement:
-    """Seconds of an iteration among boxes and in the open, in turn, and of verify()."""
-    problem = boxed_problem(num_boxes, where)
-    open_world = problem.replace(world=World())
-    controls = np.zeros((problem.horizon, NUM_ROBOTS, problem.control_size), np.float32)
-    controls[:40] = 0.5 * (problem.goal - problem.start[:, :2]) / np.linalg.norm(problem.goal, axis=1)[:, None]
-    among, alone = in_turn([partial(iterate, one) for one in (problem, open_world)], repetitions, time_limit)
-    return {
-        "obstacles": num_boxes,
-        "where": where,
-        "num_robots": NUM_ROBOTS,
-        "iteration": Spread.of(among),
-        "ratio": Spread.of(np.divide(among, alone).tolist()),
-        "verify": measure(lambda: verify(problem, controls), repetitions, time_limit),
-    }
 
 
 def measure_index(cells: int) -> Measurement:

@@ -196,13 +196,12 @@ _LINE = ("label", "scenario", "num_robots", "model", "control_noise_std", "distu
 """Attributes that the rates of a line have in common."""
 
 
-def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[Tolerance]:
+def tolerances(rates: Iterable[SuccessRate]) -> list[Tolerance]:
     """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
 
     Args:
         rates: In any order, if a disturbance has a level without effect, else its levels from harmless to bad. Those
             without a disturbance only tell the undisturbed success.
-        share: Share of the undisturbed success rate that is asked for.
     """
     lines: dict[tuple[object, ...], list[SuccessRate]] = {}
     undisturbed: dict[tuple[object, ...], float] = {}
@@ -212,7 +211,7 @@ def tolerances(rates: Iterable[SuccessRate], share: float = THRESHOLD) -> list[T
             undisturbed[where] = rate.rate
         if rate.disturbance:
             lines.setdefault((*where, rate.disturbance), []).append(rate)
-    return [_tolerance(_from_harmless(line), undisturbed.get(where[:-1]), share) for where, line in lines.items()]
+    return [_tolerance(_from_harmless(line), undisturbed.get(where[:-1])) for where, line in lines.items()]
 
 
 def _from_harmless(line: Sequence[SuccessRate]) -> Sequence[SuccessRate]:
@@ -225,8 +224,8 @@ def _from_harmless(line: Sequence[SuccessRate]) -> Sequence[SuccessRate]:
     return sorted(line, key=lambda rate: abs((rate.level or 0.0) - zero), reverse=zero != harmless)
 
 
-def _tolerance(line: Sequence[SuccessRate], undisturbed: float | None, share: float) -> Tolerance:
-    threshold = None if undisturbed is None else share * undisturbed
+def _tolerance(line: Sequence[SuccessRate], undisturbed: float | None) -> Tolerance:
+    threshold = None if undisturbed is None else THRESHOLD * undisturbed
     passes = fails = None
     if threshold:
         levels = [rate.level for rate in line]

@@ -24,9 +24,10 @@ from d4orm_planners.cli.app import main as d4orm
 
 FOLDER = Path(__file__).parent
 DATA = FOLDER / "data"
-SHARED = ("settings_studies",)
-"""Modules that are no studies."""
-NAMES = tuple(sorted({*COMPARISONS, "paper", *(path.stem for path in FOLDER.glob("[a-z]*.py"))} - {*SHARED}))
+BESIDE = {"ablation": "disturbance_study", "cl_mapf": "dynobench"}
+"""Studies that are functions in the module of another."""
+OWN = {path.stem for path in FOLDER.glob("[a-z]*.py")} - {"settings_studies"}
+NAMES = tuple(sorted({*COMPARISONS, "paper", *OWN, *BESIDE}))
 TIMED = ("big-teams", "coarseness", "ipopt")
 """Figures of the paper that were measured on a machine that did nothing else."""
 FIGURES = ("amswarm", "nodes", "noise-schedule", "robustness", "selections", "team-size", *TIMED)
@@ -40,7 +41,11 @@ PRESETS = {
 def run(name: str, *arguments: object) -> None:
     """Run a study with arguments as those of the command line; exit if it fails."""
     with patch.object(sys, "argv", [f"python -m examples.studies {name}", *map(str, arguments)]):
-        status = compare(name) if name in COMPARISONS else import_module(f"examples.studies.{name}").main()
+        if name in COMPARISONS:
+            status = compare(name)
+        else:
+            module = import_module(f"examples.studies.{BESIDE.get(name, name)}")
+            status = getattr(module, name if name in BESIDE else "main")()
     plt.close("all")
     if status:
         raise SystemExit(status)

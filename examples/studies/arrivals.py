@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import each_row, grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -27,8 +27,9 @@ TEAMS = (
 MAX_ITERATIONS = 40
 
 
-def solve(scenario: str, num_robots: int, seed: int, **settings: Any) -> dict[str, Any]:
+def solve(team: tuple[str, int], seed: int, **settings: Any) -> dict[str, Any]:
     """The row of a solve: iterations until all arrived and until it was solved, and the state in the end."""
+    scenario, num_robots = team
     plan = make_planner("d4orm", preset="paper", **settings).solve(
         make_problem(scenario, num_robots=num_robots, seed=seed), seed=seed, max_iterations=settings["max_iterations"]
     )
@@ -39,15 +40,6 @@ def solve(scenario: str, num_robots: int, seed: int, **settings: Any) -> dict[st
         "iterations": plan.iterations, "arrived_after": arrived[0] if arrived else None,
         "not_arrived": last.num_not_arrived, "in_violation": last.num_margin_violated,
     }  # fmt: skip
-
-
-def measure(teams: Any, seeds: int, **settings: Any) -> Rows:
-    """A row of every team and seed."""
-    rows = []
-    for scenario, size in teams:
-        rows += [solve(scenario, size, seed, **settings) for seed in range(seeds)]
-        print(rows[-1], flush=True)
-    return rows
 
 
 def median(values: list[int], count: int) -> str:
@@ -79,8 +71,8 @@ def summary(rows: Rows) -> Rows:
 def main() -> None:
     """Run every team and seed, and write the table."""
     arguments = study_parser(__doc__, seeds=10).parse_args()
-    measured = partial(measure, TEAMS, arguments.seeds, max_iterations=MAX_ITERATIONS)
+    teams, seeds, solved = TEAMS, arguments.seeds, partial(solve, max_iterations=MAX_ITERATIONS)
     if arguments.quick:
-        measured = partial(measure, TEAMS[:1], 1, max_iterations=2, num_samples=64, num_steps=10)
-    rows = study_rows(arguments, "arrivals", measured)
+        teams, seeds, solved = TEAMS[:1], 1, partial(solve, max_iterations=2, num_samples=64, num_steps=10)
+    rows = study_rows(arguments, "arrivals", lambda: each_row(solved, teams, range(seeds)))
     save_table(summary(rows), arguments.out / "arrivals.csv")

@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import sys
 from argparse import ArgumentTypeError
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from functools import partial
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from examples.common import grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import each_row, grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.engine.choice import get_engine
@@ -48,16 +49,9 @@ def folder(text: str) -> Path:
     return Path(text)
 
 
-@contextmanager
-def importable(checkout: Path) -> Iterator[None]:
-    """Find the checkout's package first."""
-    with patch.object(sys, "path", [str(checkout), *sys.path]):
-        yield
-
-
 def published(checkout: Path, num_samples: int, root: bool) -> Solver:
     """Their program, by the standard deviations of its own, or by the roots of these."""
-    with importable(checkout):
+    with patch.object(sys, "path", [str(checkout), *sys.path]):
         code = import_module("d4orm.planners.multi_planner")
     plan, denoise = code.plan_joint_naive, code.make_reverse_once_naive
     outcome: list[Any] = []
@@ -105,8 +99,9 @@ def ours(preset: str, num_samples: int) -> Solver:
     return solve
 
 
-def row_of(label: str, solver: Solver, problem: Problem, seed: int, max_iterations: int) -> Row:
-    """One solve and what :func:`d4orm_env.verify` says of it."""
+def row_of(max_iterations: int, size: int, seed: int, labelled: tuple[str, Solver]) -> Row:
+    """One solve of a team and what :func:`d4orm_env.verify` says of it."""
+    (label, solver), problem = labelled, make_problem("paper_circle", num_robots=size)
     began = process_time()
     controls, solved, iterations = solver(problem, seed, max_iterations)
     spent, executed = process_time() - began, evaluate_controls(get_engine("cpu"), problem, controls.astype(np.float32))
@@ -116,18 +111,6 @@ def row_of(label: str, solver: Solver, problem: Problem, seed: int, max_iteratio
         "verified": executed.solved, "processor_seconds": spent, "reward": executed.reward,
         "travel_time": float(arrived.argmax(axis=0).mean() * problem.dt) if arrived[-1].all() else None,
     }  # fmt: skip
-
-
-def measure(solvers: dict[str, Solver], teams: tuple[int, ...], seeds: int, max_iterations: int) -> list[Row]:
-    """A row of every planner, team and seed."""
-    rows = []
-    for size in teams:
-        problem = make_problem("paper_circle", num_robots=size)
-        for seed in range(seeds):
-            for label, solver in solvers.items():
-                rows.append(row_of(label, solver, problem, seed, max_iterations))
-                print(rows[-1], flush=True)
-    return rows
 
 
 def summary(rows: list[Row]) -> list[Row]:
@@ -162,6 +145,6 @@ def main() -> None:
             "their code, the paper's deviations": published(arguments.checkout, samples, root=True),
             **{label: ours(preset, samples) for label, preset in PRESETS.items()},
         }
-        return measure(solvers, teams, seeds, iterations)
+        return each_row(partial(row_of, iterations), teams, range(seeds), solvers.items())
 
     save_table(summary(study_rows(arguments, "authors_code", solve_all)), arguments.out / "authors_code.csv")

@@ -13,14 +13,15 @@ folder one by one, and a call that was broken off, or one with more seeds or sce
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from examples.common import plt, save_figure, save_table, solved_columns, study_trials, trials_parser
+from examples.common import mean_text, plt, save_figure, save_table, solved_columns, study_trials, trials_parser
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
 
 from d4orm_env.disturbances import (
@@ -36,6 +37,7 @@ from d4orm_env.disturbances import (
     Stall,
     StateNoise,
 )
+from d4orm_planners.evaluation.comparison import in_common, paired
 from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 from d4orm_planners.evaluation.trials import Condition
@@ -168,3 +170,83 @@ def main() -> None:
     save_table(overview(cells), arguments.out / "disturbance_overview.csv")
     save_table(rows_of(cells), arguments.out / "disturbance_study.csv")
     draw(cells, arguments.out / "disturbance_study.png")
+
+
+ABLATION = """\
+Ablation of D4orm-C2F's measures against disturbances: each left out by itself, and all of them left out.
+
+    python -m examples.studies ablation --seeds 30 --out ablation
+
+Eight robots on the circle, at random positions and in rooms, each measure under the disturbance that it is there for.
+The table has how many trials succeeded and in how many there was a contact, with all measures and without, how
+likely it is that both are equally good (McNemar, paired by seed), and how much longer robots travel without where both
+succeed (mean, and Wilcoxon's test).
+`--go-on-from FILE` takes trials from a Parquet file, such as those with all measures in
+`examples/studies/data/disturbance_study.parquet`."""
+"""Description of the ablation."""
+ALL, WITHOUT_ALL = "d4orm-c2f", "all of them"
+LEFT_OUT: Mapping[str, tuple[str, Any]] = {
+    "delay of 2 steps": ("delay", 0),
+    "states 2 cm, 5 cm/s": ("filter_states", False),
+    "limits 20% weaker": ("learn_limits", False),
+    "dropout 30%": ("expect_losses", False),
+    "one robot stalls": ("stalls", False),
+    "pushes 0.2/s, 0.3 m/s": ("last_resort", False),
+    NOTHING: ("direct_final_approach", False),
+}
+"""Measure that is tried under each disturbance, which is a setting, and its value without it."""
+
+
+def ablations(scenarios: Sequence[str], disturbances: Sequence[str], seeds: int) -> list[Study]:
+    """A study for every disturbance: with all measures, without the one against it, and without any."""
+    studies = []
+    for name in disturbances:
+        measure, without = LEFT_OUT[name]
+        settings = {ALL: {}, measure: {measure: without}, WITHOUT_ALL: dict(LEFT_OUT.values())}
+        studies.append(
+            Study(
+                policies={label: {"policy": ALL, "refine": "sync", **own} for label, own in settings.items()},
+                scenarios=scenarios,
+                num_robots=ROBOTS,
+                seeds=range(FIRST_SEED, FIRST_SEED + seeds),
+                scenario_settings=AS_IN_THE_PAPER,
+                disturbances={name: [[] if name == NOTHING else [DISTURBANCES[name]]]},
+            )
+        )
+    return studies
+
+
+def ablation_rows(trials: Sequence[Trial]) -> list[dict[str, Any]]:
+    """A row for every disturbance, scenario and what is left out."""
+    named, rows = names_by_text(), []
+    cells: dict[tuple[str, str], dict[str, list[Trial]]] = {}
+    for trial in trials:
+        cell = cells.setdefault((named.get(trial.disturbances, NOTHING), name_of(trial)), {})
+        cell.setdefault(trial.label, []).append(trial)
+    order = [tuple(LEFT_OUT), SCENARIOS]
+    for disturbance, scenario in sorted(cells, key=lambda cell: [known.index(one) for known, one in zip(order, cell)]):
+        cell = cells[disturbance, scenario]
+        for label in (LEFT_OUT[disturbance][0], WITHOUT_ALL):
+            pairs = in_common(cell[label], cell[ALL])
+            both = [(one, other) for one, other in pairs if one.success and other.success]
+            test = paired(cell[label], cell[ALL], lambda trial: float(not trial.success))
+            longer = [one.travel_time - other.travel_time for one, other in both]
+            cost = paired(*zip(*both, strict=True), cost=attrgetter("travel_time")) if both else None
+            rows.append(
+                {"disturbance": disturbance, "scenario": scenario, "left out": label, "trials": len(pairs),
+                 "with": successes([other for _, other in pairs]), "without": successes([one for one, _ in pairs]),
+                 "p (succeeded)": test.success_p,
+                 "travel time without [s]": mean_text(longer, "+.2f"),
+                 "p (travel time)": cost and cost.cost_p}
+            )  # fmt: skip
+    return rows
+
+
+def ablation() -> None:
+    """Run the ablation and write its table."""
+    arguments = trials_parser(ABLATION, seeds=30).parse_args()
+    size = (SCENARIOS, tuple(LEFT_OUT), arguments.seeds)
+    if arguments.quick:
+        size = (SCENARIOS[:1], tuple(LEFT_OUT)[:1], 1)
+    trials = study_trials(arguments, "ablation", ablations(*size))
+    save_table(ablation_rows(trials), arguments.out / "ablation.csv")

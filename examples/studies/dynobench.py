@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,18 @@ import numpy as np
 from examples.common import grouped, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, load_dynobench
+from d4orm_env.scenarios import load_cl_mapf
 from d4orm_planners import Plan, make_planner
 
+CARS = """\
+Cars of CL-CBS's and CSDO's benchmarks, planned by what `make_planner()` gives.
+
+    git clone https://github.com/APRIL-ZJU/CL-CBS
+    git clone https://github.com/YangSVM/CSDOTrajectoryPlanning
+    python -m examples.studies cl_mapf --cl-cbs CL-CBS --csdo CSDOTrajectoryPlanning
+
+A row for each map's kind and number of cars, of the first files of each folder; else as in the study `dynobench`."""
+"""Description of the study of cars."""
 LIMIT = 60.0
 """Time to plan [s]."""
 
@@ -54,7 +65,7 @@ def row_of(benchmark: str, path: Path, seed: int, load: Callable[[Path], Problem
 
 
 def main() -> None:
-    """Plan all instances and write the tables."""
+    """Plan all instances of dynobench and write the table."""
     parser = study_parser(__doc__, seeds=5)
     parser.add_argument("--checkouts", type=Path, nargs="+", default=(), help="checkouts with instances in example/")
     arguments = parser.parse_args()
@@ -88,3 +99,35 @@ def described(benchmark: str, kind: str, rows: list[dict[str, Any]]) -> dict[str
         "longest [s]": f"{max(row['seconds'] for row in rows):.1f}",
         "makespan [s]": median("makespan"), "sum of costs [s]": median("sum_of_costs"),
     }  # fmt: skip
+
+
+def map_of(path: Path) -> str:
+    """The map's size in metres, and whether it has rooms."""
+    return path.stem.removeprefix("map_").split("_")[0] + " m" + (", rooms" if "room" in path.parts else "")
+
+
+def cl_mapf() -> None:
+    """Plan the first instances of all folders of cars and write the table."""
+    parser = study_parser(CARS)
+    parser.add_argument("--cl-cbs", type=Path, help="a checkout with instances in benchmark/")
+    parser.add_argument("--csdo", type=Path, help="a checkout with instances in benchmark/")
+    parser.add_argument("--files", type=int, default=2, help="instances of each folder")
+    arguments = parser.parse_args()
+    found = [
+        (benchmark, path)
+        for benchmark, checkout in (("CL-CBS", arguments.cl_cbs), ("CSDO", arguments.csdo))
+        for number in range(arguments.files if checkout else 0)
+        for path in sorted((checkout / "benchmark").rglob(f"*_ex{number}.yaml"))
+    ]
+    if not found and arguments.trials is None:
+        parser.error("give --cl-cbs, --csdo or both with instances in benchmark/, or --trials")
+
+    rows = study_rows(arguments, "cl_mapf", lambda: [_row(*one) for one in found])
+    accepted = [row | {"kind": f"{row['map']}, {row['robots']:3} cars"} for row in rows if not row["refused"]]
+    table = [described(*kind, own) for kind, own in sorted(grouped(accepted, "benchmark", "kind").items())]
+    save_table([{k: v for k, v in row.items() if k != "models"} for row in table], arguments.out / "cl_mapf.csv")
+
+
+def _row(benchmark: str, path: Path) -> dict[str, Any]:
+    load = partial(load_cl_mapf, clockwise=benchmark == "CL-CBS")
+    return row_of(benchmark, path, 0, load) | {"map": map_of(path)}

@@ -16,11 +16,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from examples.common import mean_text, require, save_table, study_parser, study_rows
+from examples.common import mean_text, require, save_table, solved_columns, study_parser, study_rows
 from examples.studies import AS_IN_THE_PAPER
 
 require("rl", "stable_baselines3")
-from d4orm_planners.evaluation.summary import wilson_interval
 from d4orm_planners.rl.checkpoints import run_worlds
 from d4orm_planners.rl.learned import SHIPPED
 from d4orm_planners.rl.network import SUFFIX, load_network
@@ -105,9 +104,8 @@ def cell(rows: Rows) -> tuple[str, str, str]:
     """Successes, their interval and the mean travel time of the successes."""
     if not rows:
         return "", "", ""
-    times = [row["travel_time"] for row in rows if row["success"]]
-    lower, upper = wilson_interval(len(times), len(rows))
-    return f"{len(times)} of {len(rows)}", f"{lower:.0%} to {upper:.0%}", mean_text(times)
+    found = solved_columns(rows, lambda row: row["success"])
+    return found["solved"], found["interval"], mean_text([row["travel_time"] for row in rows if row["success"]])
 
 
 def table_of(rows: Rows, table: str) -> list[dict[str, str]]:

@@ -7,12 +7,11 @@ Random starts and goals on a square with 1.5625 square metres per robot: 10 m x 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import COLOURS, count, grouped, plt, save_figure, save_table, study_parser, study_rows
+from examples.common import COLOURS, count, each_row, grouped, plt, save_figure, save_table, study_parser, study_rows
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -33,21 +32,12 @@ def draw(rows: list[dict[str, Any]], out: Any) -> None:
     save_figure(figure, out / "scaling.png")
 
 
-def measure(sizes: Sequence[int], seeds: int, time_limit: float) -> list[dict[str, Any]]:
-    """A row per team size and problem."""
-    planner = make_planner("hybrid", max_iterations=1000)
-    rows = []
-    for robots in sizes:
-        for seed in range(seeds):
-            size = (robots * AREA) ** 0.5
-            problem = make_problem("random", num_robots=robots, seed=seed, size=size)
-            plan = planner.solve(problem, seed=seed, time_limit=time_limit)
-            rows.append(
-                {"robots": robots, "seed": seed, "solved": plan.solved, "iterations": plan.iterations,
-                 "seconds": plan.wall_time}
-            )  # fmt: skip
-            print(rows[-1], flush=True)
-    return rows
+def solve(time_limit: float, robots: int, seed: int) -> dict[str, Any]:
+    """The row of a team size and problem."""
+    problem = make_problem("random", num_robots=robots, seed=seed, size=(robots * AREA) ** 0.5)
+    plan = make_planner("hybrid", max_iterations=1000).solve(problem, seed=seed, time_limit=time_limit)
+    outcome = {"solved": plan.solved, "iterations": plan.iterations, "seconds": plan.wall_time}
+    return {"robots": robots, "seed": seed, **outcome}
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -77,7 +67,7 @@ def main() -> None:
     parser.add_argument("--time-limit", type=float, default=120.0, help="seconds per plan")
     arguments = parser.parse_args()
     sizes, seeds = ((4, 8), 1) if arguments.quick else (arguments.num_robots, arguments.seeds)
-    plans = partial(measure, sizes, seeds, arguments.time_limit)
+    plans = partial(each_row, partial(solve, arguments.time_limit), sizes, range(seeds))
     rows = summary(study_rows(arguments, "scaling", plans))
     save_table(rows, arguments.out / "scaling.csv")
     draw(rows, arguments.out)

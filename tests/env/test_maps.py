@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from env_support import MAP
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
-from scenario_support import MAP
 
 from d4orm_env import load_map, make_problem
 from d4orm_env.scenarios import load_problem, save_problem

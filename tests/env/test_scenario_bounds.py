@@ -9,9 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from env_support import WALLED, needed, scenario_models
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scenario_support import WALLED, needed, scenario_models
 
 from d4orm_env import load_problem, navigation_v0, save_problem
 from d4orm_env.envs.joint_env import JointNavigationEnv

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from env_support import WALLED, needed
 from hypothesis import example, given
 from hypothesis import strategies as st
-from scenario_support import WALLED, needed
 
 from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.problem import Problem

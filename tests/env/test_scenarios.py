@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenario_support import WALLED, needed, scenario_models
+from env_support import WALLED, needed, scenario_models
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team

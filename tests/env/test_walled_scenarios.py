@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from env_support import slow
-from scenario_support import WALLED, needed
+from env_support import WALLED, needed, slow
 
 from d4orm_env import Problem, verify
 from d4orm_env.scenarios import make_problem

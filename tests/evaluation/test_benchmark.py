@@ -16,11 +16,9 @@ from numba.core import config
 from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN, get_model
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.provenance import commit, describe_machine
-from d4orm_planners.cli import app as cli
 from d4orm_planners.evaluation import bench_report, measuring, probes
 from d4orm_planners.evaluation.benchmark import parts, run_parts, thread_counts
-from d4orm_planners.evaluation.benchmark_settings import MODELS, QUICK, SECTIONS, BenchmarkSettings
-from d4orm_planners.evaluation.measuring import Spread, measure
+from d4orm_planners.evaluation.measuring import MODELS, QUICK, SECTIONS, BenchmarkSettings, Spread, measure
 from d4orm_planners.evaluation.probes import measure_startup
 
 sys.path.append(str(Path(__file__).parents[1] / "release"))
@@ -69,12 +67,6 @@ def results() -> dict[str, list[Any]]:
     return results
 
 
-def call(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        cli.main(list(arguments))
-    return int(exit_.value.code or 0)
-
-
 def test_spread_is_the_five_numbers() -> None:
     spread = Spread.of([5.0, 1.0, 2.0, 4.0, 3.0])
     assert spread == Spread(3.0, 2.0, 4.0, 1.0, 5.0, 5)
@@ -92,7 +84,7 @@ def test_measure_leaves_the_first_call_out_and_stops(
     def work() -> None:
         clock[0] += next(calls)
 
-    spread = measure(work, repetitions=3, time_limit=4.0)
+    spread = measure(BenchmarkSettings(repetitions=3, time_limit=4.0), work)
     assert spread.count == count
     assert spread.largest == max(ticks[:count])
 
@@ -198,7 +190,7 @@ def test_report_files(results: dict[str, list[Any]], tmp_path: Path) -> None:
     assert len(tables) > 5 * 3
 
 
-def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_takes_its_lists(d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[BenchmarkSettings] = []
 
     def pretend(settings: BenchmarkSettings) -> list[Any]:
@@ -207,7 +199,7 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr("d4orm_planners.cli.bench.parts", pretend)
     options = ("--num-robots", "4,8", "--models", "velocity2d", "--engines", "cpu,jax", "--seeds", "3", "--quick")
-    assert call("bench", "--out", str(tmp_path / "new"), *options) == 0
+    assert d4orm("bench", "--out", "new", *options).status == 0
     (settings,) = seen
     assert (settings.num_robots, settings.models, settings.engines) == ((4, 8), ("velocity2d",), ("cpu", "jax"))
     assert (settings.seeds, settings.num_steps) == (3, QUICK["num_steps"])
@@ -226,11 +218,9 @@ def test_the_command_takes_its_lists(tmp_path: Path, monkeypatch: pytest.MonkeyP
         (("--seeds", "0"), "seeds is 0"),
     ],
 )
-def test_bad_input_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], message: str
-) -> None:
-    assert call("bench", "--out", str(tmp_path / "new"), *options) == 2
-    error = capsys.readouterr().err
+def test_bad_input_is_one_line(d4orm, tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+    status, _, error = d4orm("bench", "--out", "new", *options)
+    assert status == 2
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "new").exists()

@@ -9,6 +9,7 @@ import pytest
 from examples.common import holm, penalised_steps, steps_to_solution
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trial_support import trial
 
 from d4orm_planners.evaluation.comparison import newcombe_interval, paired, survival
 from d4orm_planners.evaluation.store import Trial
@@ -17,14 +18,7 @@ from d4orm_planners.evaluation.summary import wilson_interval
 
 def trials(costs: list[float | None], **changes: Any) -> list[Trial]:
     """A trial per cost, with seeds from 0 on; without a cost it fails."""
-    common: dict[str, Any] = {
-        "policy": "d4orm", "config": "{}", "problem": "circle", "control_noise_std": 0.0, "label": "d4orm",
-        "scenario": "circle", "num_robots": 8, "model": "holonomic2d", "dt": 0.1,
-    }  # fmt: skip
-    return [
-        Trial(**{**common, **changes}, seed=seed, success=cost is not None, wall_time=cost)
-        for seed, cost in enumerate(costs)
-    ]
+    return [trial(seed, success=cost is not None, wall_time=cost, **changes) for seed, cost in enumerate(costs)]
 
 
 def spent(trial: Trial) -> float:

@@ -363,6 +363,9 @@ def test_shards_of_a_job_array_come_to_the_same(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == [
         "trials-1-of-2.sqlite", "trials-2-of-2.sqlite"
     ]  # fmt: skip
+    with pytest.raises(ValueError, match="workers is 0"):
+        run_shard(study, tmp_path / "none", (1, 2), workers=0)
+    assert not (tmp_path / "none").exists()
     ran: list[int] = []
     together = run_study(study, tmp_path / "parts", workers=1, progress=lambda what, done, total: ran.append(done))
     assert ran == [12], "nothing was left to run"

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trial_support
 from planner_support import program
 
 from d4orm_env import make_problem, save_problem
@@ -36,17 +37,7 @@ QUICK = {"engine": "cpu", "num_samples": 64, "num_steps": 5, "max_iterations": 3
 TINY: dict[str, Any] = {"num_robots": 2, "seeds": range(2), "workers": 1}
 
 
-def trial(seed: int = 0, **changes: Any) -> Trial:
-    values = {
-        "policy": "d4orm",
-        "config": "{}",
-        "problem": "abc",
-        "control_noise_std": 0.0,
-        "scenario": "circle",
-        "num_robots": 2,
-    }
-    outcome = {"success": True, "verified": True, "arrived": 2, "travel_time": 5.0, "steps": 60, "wall_time": 0.5}
-    return Trial(**{**values, "label": "d4orm", "model": "holonomic2d", "dt": 0.1, **outcome, "seed": seed, **changes})
+trial = partial(trial_support.trial, verified=True)
 
 
 # Rows.

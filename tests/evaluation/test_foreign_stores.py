@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from trial_support import trial
 
 from d4orm_planners.evaluation import tables as report
-from d4orm_planners.evaluation.store import Trial, checked_trial
+from d4orm_planners.evaluation.store import checked_trial
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 NESTED = "[" * 100_000
-TRIAL = Trial(policy="go-to-goal", config="{}", problem="p", control_noise_std=0.0, seed=1, label="go-to-goal",
-              scenario="circle", num_robots=2, model="holonomic2d", dt=0.1)  # fmt: skip
+TRIAL = trial()
 
 
 def one_line(error: BaseException) -> str:

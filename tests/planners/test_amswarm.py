@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planner_support import walled_in_problem
+from planner_support import assert_solves, walled_in_problem
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
-from d4orm_env.verify import verify
-from d4orm_planners import Plan, make_planner
+from d4orm_planners import make_planner
 from d4orm_planners.baselines.amswarm.alternation import Neighbourhood, alternate
 from d4orm_planners.baselines.amswarm.bernstein import Guess, first_coefficients, sample_basis
 from d4orm_planners.baselines.amswarm.planner import AMSwarmConfig, make_method
@@ -135,19 +134,9 @@ def swap_problem(model: str = "holonomic2d", **changes: Any) -> Problem:
     return Problem(team, start, -start[:, : team.dimension], **({"horizon": 80} | changes))
 
 
-def assert_solves(problem: Problem, seed: int = 0, **config: Any) -> Plan:
-    """Whatever is claimed to be solved is checked here anew."""
-    plan = make_planner("amswarm", engine="cpu", **config).solve(problem, seed=seed)
-    assert plan.solved, (plan.status, [record.note for record in plan.history], plan.failures)
-    report = verify(problem, plan.controls)
-    assert report.ok, report.violations
-    assert not plan.trajectory.margin_violated[1:].any()
-    return plan
-
-
 @pytest.mark.parametrize("model", ["holonomic2d", "holonomic3d", "velocity2d"])
 def test_two_robots_change_places(model: str) -> None:
-    assert_solves(swap_problem(model))
+    assert_solves("amswarm", swap_problem(model))
 
 
 WORLDS = {
@@ -163,7 +152,9 @@ WORLDS = {
 @pytest.mark.parametrize("kind", WORLDS)
 def test_obstacles_are_gone_round(kind: str) -> None:
     world = WORLDS[kind]
-    assert_solves(swap_problem("holonomic2d" if world.dimension == 2 else "holonomic3d", world=world, horizon=120))
+    assert_solves(
+        "amswarm", swap_problem("holonomic2d" if world.dimension == 2 else "holonomic3d", world=world, horizon=120)
+    )
 
 
 def test_a_guess_within_a_box_leaves_it_by_the_nearest_side() -> None:
@@ -171,13 +162,13 @@ def test_a_guess_within_a_box_leaves_it_by_the_nearest_side() -> None:
     problem = Problem(
         Team(("holonomic2d",)), [[-1.5, 0.2, 0, 0]], [[1.5, 0.2]], World(boxes=[[-0.2, -0.8, 0.2, 0.4]]), horizon=100
     )
-    plan = assert_solves(problem)
+    plan = assert_solves("amswarm", problem)
     assert plan.trajectory.positions[:, 0, 1].max() > 0.55
 
 
 @pytest.mark.parametrize("name", ["amswarm_1", "amswarm_3", "amswarm_4"])
 def test_the_environments_that_the_publication_solves(name: str) -> None:
-    plan = assert_solves(make_problem(name))
+    plan = assert_solves("amswarm", make_problem(name))
     # The smoothness that the paper reports: less than a quarter of D4orm's 43 to 47.
     assert plan.metrics["mean_squared_jerk"] < 11
 

@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planner_support import hop_problem, walled_in_problem
+from planner_support import assert_solves, hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
-from d4orm_env.verify import verify
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.collocation import CollocatedMotion, TeamProgram
 from d4orm_planners.engine.sampling_types import get_sampling_engine
@@ -47,47 +46,37 @@ def swap_problem(models: tuple[str, str] = ("holonomic2d", "holonomic2d"), **cha
     return Problem(team, start, -start[:, : team.dimension], **({"horizon": 45} | changes))
 
 
-def assert_solves(problem: Problem, seed: int = 0, **config: Any) -> Plan:
-    """Whatever is claimed to be solved is checked here anew."""
-    plan = make_planner("ipopt", engine="cpu", **config).solve(problem, seed=seed)
-    assert plan.solved, (plan.status, [record.note for record in plan.history], plan.failures)
-    report = verify(problem, plan.controls)
-    assert report.ok, report.violations
-    assert not plan.trajectory.margin_violated[1:].any()
-    return plan
-
-
 @pytest.mark.parametrize("preset", [None, "paper"])
 @pytest.mark.parametrize("model", MODELS)
 def test_two_robots_change_places(model: str, preset: str | None) -> None:
-    assert_solves(swap_problem((model, model)), preset=preset)
+    assert_solves("ipopt", swap_problem((model, model)), preset=preset)
 
 
 def test_models_mix() -> None:
-    assert_solves(swap_problem(("differential_drive", "holonomic2d")))
-    assert_solves(swap_problem(("velocity2d", "differential_drive")))
+    assert_solves("ipopt", swap_problem(("differential_drive", "holonomic2d")))
+    assert_solves("ipopt", swap_problem(("velocity2d", "differential_drive")))
 
 
 @pytest.mark.parametrize("kind", PLANAR_WORLDS)
 def test_obstacles_of_the_plane(kind: str) -> None:
-    assert_solves(swap_problem(world=World(2, **PLANAR_WORLDS[kind]), horizon=60))
+    assert_solves("ipopt", swap_problem(world=World(2, **PLANAR_WORLDS[kind]), horizon=60))
 
 
 @pytest.mark.parametrize("kind", SPATIAL_WORLDS)
 def test_obstacles_of_space(kind: str) -> None:
     world = World(3, **SPATIAL_WORLDS[kind])
-    assert_solves(swap_problem(("holonomic3d", "holonomic3d"), world=world, horizon=60))
+    assert_solves("ipopt", swap_problem(("holonomic3d", "holonomic3d"), world=world, horizon=60))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", [None, "paper"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_four_robots_cross_a_circle(seed: int, preset: str | None) -> None:
-    assert_solves(make_problem("circle", num_robots=4), seed=seed, preset=preset)
+    assert_solves("ipopt", make_problem("circle", num_robots=4), seed=seed, preset=preset)
 
 
 def test_a_goal_speed_is_kept() -> None:
-    plan = assert_solves(swap_problem(goal_speed=0.1))
+    plan = assert_solves("ipopt", swap_problem(goal_speed=0.1))
     before = plan.trajectory.arrived.argmax(axis=0) - 1
     # One step before it docks a robot at 1 m/s^2 is at most a tenth faster than when it does.
     assert (np.linalg.norm(plan.trajectory.states[before, [0, 1], 2:], axis=1) < 0.21).all()
@@ -97,7 +86,7 @@ def test_a_robot_that_starts_at_its_goal_stays_there() -> None:
     problem = swap_problem()
     start = np.concatenate([problem.start, [[0, 0.2, 0, 0]]])
     crowded = Problem(Team(("holonomic2d",) * 3), start, [[1, 0], [-1, 0], [0, 0.2]], horizon=60)
-    plan = assert_solves(crowded)
+    plan = assert_solves("ipopt", crowded)
     assert plan.trajectory.arrived[1].tolist() == [False, False, True]
 
 
@@ -106,7 +95,7 @@ def test_robots_stand_where_they_dock() -> None:
     start = [[-0.6, 0, 0, 0], [-1.5, 0.05, 0, 0]]
     problem = Problem(Team(("holonomic2d",) * 2), start, [[0, 0], [1.5, 0.05]], horizon=60)
     for seed in range(3):
-        assert_solves(problem, seed=seed, max_iterations=2)
+        assert_solves("ipopt", problem, seed=seed, max_iterations=2)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -138,14 +127,14 @@ def test_contacts_are_those_that_come_near() -> None:
 
 
 def test_without_a_margin_robots_do_not_touch_between_the_steps_either() -> None:
-    assert_solves(swap_problem(margin=0.0))
+    assert_solves("ipopt", swap_problem(margin=0.0))
 
 
 def test_the_same_seed_gives_the_same_plan() -> None:
     problem = swap_problem(goal_speed=np.inf)
-    first, again = (assert_solves(problem, seed=3) for _ in range(2))
+    first, again = (assert_solves("ipopt", problem, seed=3) for _ in range(2))
     np.testing.assert_array_equal(first.controls, again.controls)
-    other = assert_solves(problem, seed=4)
+    other = assert_solves("ipopt", problem, seed=4)
     assert not np.allclose(first.controls, other.controls, atol=1e-3)
 
 
@@ -177,7 +166,7 @@ def test_ctrl_c_stops_ipopt(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_initial_controls_replace_the_warm_start() -> None:
     problem = swap_problem()
-    given = assert_solves(problem)
+    given = assert_solves("ipopt", problem)
     middle = given.trajectory.positions[20, :, 1]
     mirrored = 0.99 * given.controls * [1, -1]
     planner = make_planner("ipopt", engine="cpu", perturbation=1e-3)
@@ -188,7 +177,7 @@ def test_initial_controls_replace_the_warm_start() -> None:
 
 
 def test_a_plan_with_notes_is_saved_and_loaded(tmp_path: Any) -> None:
-    plan = assert_solves(swap_problem())
+    plan = assert_solves("ipopt", swap_problem())
     plan.save(tmp_path / "plan.npz")
     assert Plan.load(tmp_path / "plan.npz").history == plan.history
     assert plan.history[-1].note == "Solve_Succeeded"

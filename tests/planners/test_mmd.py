@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planner_support import hop_problem, walled_in_problem
+from planner_support import assert_solves, hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
-from d4orm_env.verify import verify
-from d4orm_planners import Plan, make_planner
+from d4orm_planners import make_planner
 from d4orm_planners.baselines.mmd.constraint_tree import Constraint, Planning, count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.guiding import PathSurroundings, guide
 from d4orm_planners.baselines.mmd.path_frame import (
@@ -354,33 +353,23 @@ def test_planning_again_begins_with_what_was_planned() -> None:
 # What it plans.
 
 
-def assert_solves(problem: Problem, seed: int = 0, **config: Any) -> Plan:
-    """Whatever is claimed to be solved is checked here anew."""
-    plan = make_planner("mmd", engine="cpu", **config).solve(problem, seed=seed)
-    assert plan.solved, (plan.status, [record.note for record in plan.history], plan.failures)
-    report = verify(problem, plan.controls)
-    assert report.ok, report.violations
-    assert not plan.trajectory.margin_violated[1:].any()
-    return plan
-
-
 @pytest.mark.parametrize("model", ["holonomic2d", "velocity2d", "differential_drive"])
 def test_a_circle_is_crossed(model: str) -> None:
-    assert_solves(make_problem("circle", num_robots=4, model=model))
+    assert_solves("mmd", make_problem("circle", num_robots=4, model=model))
 
 
 def test_in_space_there_is_room_on_all_sides() -> None:
-    plan = assert_solves(make_problem("sphere", num_robots=6))
+    plan = assert_solves("mmd", make_problem("sphere", num_robots=6))
     assert np.abs(plan.trajectory.positions[:, :, 2]).max() > 0.1
 
 
 @pytest.mark.parametrize("scenario", ["rooms", "warehouse", "forest"])
 def test_paths_lead_round_obstacles(scenario: str) -> None:
-    assert_solves(make_problem(scenario, num_robots=3, seed=0))
+    assert_solves("mmd", make_problem(scenario, num_robots=3, seed=0))
 
 
 def test_who_may_not_dock_comes_to_its_goal_too() -> None:
-    assert_solves(make_problem("circle", num_robots=2, arrival="stay", horizon=150))
+    assert_solves("mmd", make_problem("circle", num_robots=2, arrival="stay", horizon=150))
 
 
 def test_a_goal_out_of_reach_is_named() -> None:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, RecordedRules, cpu_rewards, engine_noise, toward_goals
-from env_support import mixed_problem, slow
+from env_support import mixed_problem, needed, slow
 from reference import ROUNDOFF, evaluate, position_error
-from scenario_support import needed
 
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team

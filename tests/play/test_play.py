@@ -12,10 +12,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from network_support import wait_until as until
 
 from d4orm_env import World, make_problem
 from d4orm_env.core.problem import Problem
@@ -28,14 +29,6 @@ from d4orm_planners.play.scene_frame import closest_approach
 from d4orm_planners.play.session import Session
 
 TIMEOUT = 60.0
-
-
-def until(condition: Callable[[], object]) -> None:
-    """Wait for something that another thread does."""
-    end = time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from examples.common import save_table
+from examples.studies import lifelong, solve_rates
 from examples.studies.settings_studies import irregular_circle
 from matplotlib.figure import Figure
 from PIL import Image
@@ -77,6 +78,18 @@ def completed(name: str, out: Path, *arguments: str) -> None:
     result = run(name, out, *arguments)
     assert result.returncode == 0, result.stderr
     assert not [path for path in out.iterdir() if path.name.startswith(".")], "a temporary file was left behind"
+
+
+def made(name: str, tmp_path: Path, *arguments: str) -> list[dict[str, str]]:
+    """The rows of an example's table of the same name, in the folder ``out``."""
+    completed(name, tmp_path / "out", *arguments)
+    return table(tmp_path / "out" / f"{name}.csv")
+
+
+def check_made_again(name: str, tmp_path: Path, rows: list[dict[str, str]], of: str | None = None) -> None:
+    """The same table, of the study's name if not said, comes of the trials that :func:`made` wrote."""
+    completed(name, tmp_path / "again", "--trials", str(tmp_path / "out" / f"{name}.parquet"))
+    assert table(tmp_path / "again" / f"{of or name}.csv") == rows
 
 
 @pytest.mark.parametrize(
@@ -143,15 +156,13 @@ def test_cars_of_a_benchmark_are_planned(tmp_path: Path) -> None:
     content = (EXAMPLES / "scenarios" / "cl_mapf_cars.yaml").read_text()
     (folder / "map_30by30_obst2_agents4_ex0.yaml").write_text(content)
     (folder / "map_30by30_obst2_agents4_ex1.yaml").write_text(content.replace("[15, 5, 1.57]", "[10, 15, 0]"))
-    completed("cl_mapf", tmp_path / "out", "--csdo", str(tmp_path / "cars"))
-    (row,) = table(tmp_path / "out" / "cl_mapf.csv")
+    (row,) = made("cl_mapf", tmp_path, "--csdo", str(tmp_path / "cars"))
     assert (row["benchmark"], row["instances"], row["solved"]) == ("CSDO", "30by30 m,   4 cars", "1 of 1")
 
 
 def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    completed("one_dimension", out)
-    rows = {row["method"]: row for row in table(out / "one_dimension.csv")}
+    rows = {row["method"]: row for row in made("one_dimension", tmp_path)}
     short = {name: float(row["short of the best reward"]) for name, row in rows.items()}
     assert 0 <= short["MBD"] < short["MPPI, large noise"] < short["MPPI, small noise"]
     assert float(rows["MBD"]["movement in the last step"]) < float(
@@ -162,9 +173,7 @@ def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_robot_credit_does_not_dilute_with_the_team(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("gradient_dilution", out)
-    rows = table(out / "gradient_dilution.csv")
+    out, rows = tmp_path / "out", made("gradient_dilution", tmp_path)
     assert [(row["robots"], row["weighted by"], row["samples"]) for row in rows] == [
         ("1", "robot", "256"), ("16", "team", "256"), ("16", "groups of 4", "256"), ("16", "robot", "256"),
         ("16", "team", "4096"),
@@ -182,9 +191,7 @@ def test_robot_credit_does_not_dilute_with_the_team(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_step_loop_shows_that_the_plan_avoids_what_driving_straight_does_not(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("step_loop", out)
-    rows = {(float(row["noise [m/s^2]"]), row["policy"]): row for row in table(out / "step_loop.csv")}
+    rows = {(float(row["noise [m/s^2]"]), row["policy"]): row for row in made("step_loop", tmp_path)}
     assert rows[0.0, "d4orm"]["success"] == "1 of 1"
     assert rows[0.0, "go-to-goal"]["success"] == "0 of 1"
     assert rows[0.5, "d4orm"]["success"] == "0 of 1", "a plan executed blindly does not survive much noise"
@@ -210,9 +217,7 @@ def test_mixed_team_example_solves_a_scenario_and_draws_it(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_learners_are_tuned_and_a_second_call_trains_nothing(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
-    out = tmp_path / "out"
-    completed("tune_learners", out, "--learner", "ppo")
-    rows = table(out / "tune_learners.csv")
+    out, rows = tmp_path / "out", made("tune_learners", tmp_path, "--learner", "ppo")
     # Three settings at first, the learner's own among them; the best one goes on.
     assert [bool(row["twice as long"]) for row in rows] == [True, False, False]
     assert sum(row["settings"] == "as they are" for row in rows) == 1
@@ -220,8 +225,7 @@ def test_learners_are_tuned_and_a_second_call_trains_nothing(tmp_path: Path) -> 
     assert len(trained) == 4
     completed("tune_learners", out, "--learner", "ppo")
     assert sorted((path, path.stat().st_mtime_ns) for path in out.glob("*/policy.safetensors")) == trained
-    completed("tune_learners", tmp_path / "again", "--trials", str(out / "tune_learners.parquet"))
-    assert table(tmp_path / "again" / "tune_learners.csv") == rows
+    check_made_again("tune_learners", tmp_path, rows)
 
 
 @pytest.mark.slow
@@ -245,15 +249,12 @@ def test_rivals_are_tuned_and_a_second_call_runs_nothing(tmp_path: Path) -> None
     trials = (out / "trials.sqlite").read_bytes()
     completed("tune_rivals", out, "--method", "cem")
     assert (out / "trials.sqlite").read_bytes() == trials
-    completed("tune_rivals", tmp_path / "again", "--trials", str(out / "tune_rivals.parquet"))
-    assert table(tmp_path / "again" / "tuning.csv") == rows
+    check_made_again("tune_rivals", tmp_path, rows, of="tuning")
 
 
 @pytest.mark.slow
 def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("credit_by_update", out)
-    rows = table(out / "credit_by_update.csv")
+    out, rows = tmp_path / "out", made("credit_by_update", tmp_path)
     assert len({(row["update"], row["credit"]) for row in rows}) == len(rows) == 25
     assert all((row["p (steps)"] == "-") == (row["update"] == "d4orm") for row in rows)
     assert (out / "credit_by_update.png").read_bytes().startswith(PNG)
@@ -267,35 +268,29 @@ def test_credit_and_update_are_crossed(tmp_path: Path) -> None:
 
 
 def test_samples_are_counted_for_every_setting(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("fewer_samples", out)
-    rows = {row["steps x samples"]: row for row in table(out / "fewer_samples.csv")}
+    rows = {row["steps x samples"]: row for row in made("fewer_samples", tmp_path)}
     assert len(rows) == 10
     # One iteration each: 100 steps of 1024; 70 of 256; and 30 of 256 with 70 of 128, or of 64.
     counted = {label: row["1000 samples"] for label, row in rows.items() if row["solved"] == "1 of 1"}
     expected = {"100 x 1024": "102", "70 x 256": "18", "100 x 256, the last 70% with 128 (default)": "17",
                 "100 x 256, the last 70% with 64": "12"}  # fmt: skip
     assert {label: counted[label] for label in expected} == expected
-    completed("fewer_samples", tmp_path / "again", "--trials", str(out / "fewer_samples.parquet"))
-    assert table(tmp_path / "again" / "fewer_samples.csv") == list(rows.values())
+    check_made_again("fewer_samples", tmp_path, list(rows.values()))
 
 
 def test_arrivals_are_counted_by_iterations(tmp_path: Path) -> None:
-    completed("arrivals", tmp_path / "out")
-    (row,) = table(tmp_path / "out" / "arrivals.csv")
+    (row,) = made("arrivals", tmp_path)
     assert (row["robots"], row["iterations until all arrive"], row["solved"]) == ("2", "1", "1 of 1")
 
 
 def test_turned_samples_are_compared_with_others(tmp_path: Path) -> None:
-    completed("independent_noise", tmp_path / "out")
-    (row,) = table(tmp_path / "out" / "independent_noise.csv")
+    (row,) = made("independent_noise", tmp_path)
     assert (row["robots"], row["samples"], row["p"]) == ("2", "64", "1")
     assert row["reward, turned"] != row["reward, apart"]
 
 
 def test_irregular_circles_differ_from_seed_to_seed(tmp_path: Path) -> None:
-    completed("irregular_circles", tmp_path / "out")
-    rows = table(tmp_path / "out" / "irregular_circles.csv")
+    rows = made("irregular_circles", tmp_path)
     assert [(row["team"], row["planner"]) for row in rows] == [("2 robots", name) for name in ("d4orm", "mppi", "cem")]
     assert (rows[0]["solved"], rows[0]["steps"], rows[0]["p (steps)"]) == ("1 of 1", "20", "-")
     assert int(rows[2]["steps"]) == 2 * int(rows[2]["restricted"]), "one without a solution counts twice its budget"
@@ -312,15 +307,13 @@ def test_p_values_are_corrected_for_their_number_in_the_table(tmp_path: Path) ->
 
 
 def test_jerk_is_smaller_where_it_is_limited(tmp_path: Path) -> None:
-    completed("jerk_limits", tmp_path / "out")
-    free, limited = (float(row["jerk [m²/s⁶]"]) for row in table(tmp_path / "out" / "jerk_limits.csv"))
+    free, limited = (float(row["jerk [m²/s⁶]"]) for row in made("jerk_limits", tmp_path))
     # The jerk's limit is 4 m/s^3.
     assert limited <= 16 < free
 
 
 def test_smoothness_and_seconds_are_set_beside_mmd(tmp_path: Path) -> None:
-    completed("against_mmd", tmp_path / "out")
-    rows = {row["planner"]: row for row in table(tmp_path / "out" / "against_mmd.csv")}
+    rows = {row["planner"]: row for row in made("against_mmd", tmp_path)}
     assert [row["solved"] for row in rows.values()] == ["1 of 1"] * 3
     # MMD's motions are sums of sines.
     jerk = {label: float(row["jerk [m²/s⁶]"]) for label, row in rows.items()}
@@ -397,8 +390,7 @@ def test_the_authors_code_runs_from_a_checkout(tmp_path: Path, shift: float) -> 
         "their code": ("1 of 1", "0 of 1"), "their code, the paper's deviations": ("1 of 1", "1 of 1"),
         "d4orm, authors": ("1 of 1", "1 of 1"), "d4orm, paper": ("1 of 1", "1 of 1"),
     }  # fmt: skip
-    completed("authors_code", tmp_path / "again", "--trials", str(out / "authors_code.parquet"))
-    assert table(tmp_path / "again" / "authors_code.csv") == list(rows.values())
+    check_made_again("authors_code", tmp_path, list(rows.values()))
 
 
 def test_the_authors_code_needs_a_checkout(tmp_path: Path) -> None:
@@ -407,33 +399,25 @@ def test_the_authors_code_needs_a_checkout(tmp_path: Path) -> None:
 
 
 def test_contacts_are_charged_by_every_credit(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("contact_penalty", out)
-    rows = table(out / "contact_penalty.csv")
+    rows = made("contact_penalty", tmp_path)
     assert len({(row["team"], row["credit, penalty"]) for row in rows}) == len(rows) == 4 * 8
     # In its first iteration everybody is a group of its own.
     by_credit = {(row["team"], row["credit, penalty"].partition(" (")[0]): row["travel time [s]"] for row in rows}
     assert all(by_credit[team, "robot, 2"] == by_credit[team, "group, 2"] for team, _ in by_credit)
     assert any(by_credit[team, "group, 1"] != by_credit[team, "group, 2"] for team, _ in by_credit)
-    completed("contact_penalty", tmp_path / "again", "--trials", str(out / "contact_penalty.parquet"))
-    assert table(tmp_path / "again" / "contact_penalty.csv") == rows
+    check_made_again("contact_penalty", tmp_path, rows)
 
 
 def test_robots_fit_between_the_cylinders_that_are_further_apart(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("amswarm_gaps", out)
-    rows = table(out / "amswarm_gaps.csv")
+    rows = made("amswarm_gaps", tmp_path)
     fits = {row["cylinders"]: float(row["gap [m]"]) > float(row["a robot needs [m]"]) for row in rows}
     assert fits == {"as it is": False, "1.1 times as far apart": True, "1.2 times as far apart": True,
                     "robots of 0.24 m": True, "without those on the left": False}  # fmt: skip
-    completed("amswarm_gaps", tmp_path / "again", "--trials", str(out / "amswarm_gaps.parquet"))
-    assert table(tmp_path / "again" / "amswarm_gaps.csv") == rows
+    check_made_again("amswarm_gaps", tmp_path, rows)
 
 
 def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("paper_differences", out)
-    rows = table(out / "paper_differences.csv")
+    out, rows = tmp_path / "out", made("paper_differences", tmp_path)
     assert len({(row["team"], row["settings"]) for row in rows}) == len(rows) == 2 * 12
     trials = read_parquet(out / "paper_differences.parquet")
     configs = {trial.label: json.loads(trial.config) for trial in trials}
@@ -446,14 +430,11 @@ def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) 
             [["clip_between_iterations"], ["credit", "penalty"], ["random_start"], ["weight_cutoff"],
              ["num_samples"] if kind == "preset" else ["late_samples", "num_samples"]]
         )  # fmt: skip
-    completed("paper_differences", tmp_path / "again", "--trials", str(out / "paper_differences.parquet"))
-    assert table(tmp_path / "again" / "paper_differences.csv") == rows
+    check_made_again("paper_differences", tmp_path, rows)
 
 
 def test_the_paper_its_code_and_ours_meet_head_to_head(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("head_to_head", out)
-    rows = table(out / "head_to_head.csv")
+    out, rows = tmp_path / "out", made("head_to_head", tmp_path)
     assert len({(row["team"], row["planner"]) for row in rows}) == len(rows) == 3 * 4 + 2 + 6
     trials = {trial.label: json.loads(trial.config) for trial in read_parquet(out / "head_to_head.parquet")}
     base = trials["d4orm-d, authors"]
@@ -465,14 +446,11 @@ def test_the_paper_its_code_and_ours_meet_head_to_head(tmp_path: Path) -> None:
     assert sorted(changed.values()) == [
         ["clip_after"], ["penalty_per_pair"], ["penalty_rise"], ["reset_after_probe"], ["start"]
     ]  # fmt: skip
-    completed("head_to_head", tmp_path / "again", "--trials", str(out / "head_to_head.parquet"))
-    assert table(tmp_path / "again" / "head_to_head.csv") == rows
+    check_made_again("head_to_head", tmp_path, rows)
 
 
 def test_rivals_meet_the_same_seeds_tuned_and_as_the_paper_has_them(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("tuned_rivals", out)
-    rows = table(out / "tuned_rivals.csv")
+    out, rows = tmp_path / "out", made("tuned_rivals", tmp_path)
     methods = [row["method"] for row in rows]
     assert set(methods) >= {"d4orm, defaults", "mbd, tuned", *(f"{name}, paper" for name in TUNED if name != "mbd")}
     assert len(methods) == len(set(methods))
@@ -483,22 +461,18 @@ def test_rivals_meet_the_same_seeds_tuned_and_as_the_paper_has_them(tmp_path: Pa
         assert {key: configs[label][key] for key in tuned if key != "num_steps"} == {
             key: value for key, value in tuned.items() if key != "num_steps"
         }
-    completed("tuned_rivals", tmp_path / "again", "--trials", str(out / "tuned_rivals.parquet"))
-    assert table(tmp_path / "again" / "tuned_rivals.csv") == rows
+    check_made_again("tuned_rivals", tmp_path, rows)
 
 
 @pytest.mark.slow
 def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("disturbance_study", out)
-    rows = table(out / "disturbance_study.csv")
+    out, rows = tmp_path / "out", made("disturbance_study", tmp_path)
     assert len({row["disturbance"] for row in rows}) == len(rows) == 13
     assert {(row["scenario"], row["policy"], row["trials"], row["errors"]) for row in rows} == {
         ("circle", "orca", "1", "0")
     }
     assert (out / "disturbance_study.png").read_bytes().startswith(PNG)
-    completed("disturbance_study", tmp_path / "again", "--trials", str(out / "disturbance_study.parquet"))
-    assert table(tmp_path / "again" / "disturbance_study.csv") == rows
+    check_made_again("disturbance_study", tmp_path, rows)
 
 
 @pytest.mark.slow
@@ -537,31 +511,24 @@ def test_solve_rates_make_a_table_per_set(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_measures_against_disturbances_are_left_out_one_by_one(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("ablation", out, "--workers", "1")
-    rows = table(out / "ablation.csv")
+    rows = made("ablation", tmp_path, "--workers", "1")
     assert [(row["scenario"], row["disturbance"], row["left out"], row["trials"]) for row in rows] == [
         ("circle", "delay of 2 steps", "delay", "1"),
         ("circle", "delay of 2 steps", "all of them", "1"),
     ]
     assert {row["with"] for row in rows} == {"1, 0"}
-    completed("ablation", tmp_path / "again", "--trials", str(out / "ablation.parquet"))
-    assert table(tmp_path / "again" / "ablation.csv") == rows
+    check_made_again("ablation", tmp_path, rows)
 
 
 def test_gradient_ascent_through_the_dynamics_raises_the_reward(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("jax_functional", out)
-    rewards = [float(row["reward"]) for row in table(out / "jax_functional.csv")]
+    rewards = [float(row["reward"]) for row in made("jax_functional", tmp_path)]
     assert rewards[-1] > rewards[0] + 0.05
 
 
 @pytest.mark.slow
 def test_a_network_learns_from_a_planner(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
-    out = tmp_path / "out"
-    completed("imitate_expert", out)
-    rows = table(out / "imitate_expert.csv")
+    rows = made("imitate_expert", tmp_path)
     assert [row["learned by"] for row in rows] == [
         *("cloning", "DAgger", "PPO from there", "PPO from there", "PPO from nothing", "PPO from nothing")
     ]
@@ -569,16 +536,13 @@ def test_a_network_learns_from_a_planner(tmp_path: Path) -> None:
     assert max(success[:2]) >= 40
     assert max(success[2:4]) >= 40
     assert success[2] > success[4], "it begins where the other took it"
-    completed("imitate_expert", tmp_path / "again", "--trials", str(out / "imitate_expert.parquet"))
-    assert table(tmp_path / "again" / "imitate_expert.csv") == rows
+    check_made_again("imitate_expert", tmp_path, rows)
 
 
 @pytest.mark.slow
 def test_ppo_in_one_jit_learns_to_arrive(tmp_path: Path) -> None:
     pytest.importorskip("optax")
-    out = tmp_path / "out"
-    completed("jax_ppo", out)
-    success = [float(row["success"].removesuffix("%")) for row in table(out / "jax_ppo.csv")]
+    success = [float(row["success"].removesuffix("%")) for row in made("jax_ppo", tmp_path)]
     assert success[0] < 20
     assert success[-1] > 50
 
@@ -595,17 +559,13 @@ def test_ppo_in_one_jit_learns_to_arrive(tmp_path: Path) -> None:
 )
 def test_recipes_learn_something(name: str, module: str, tmp_path: Path) -> None:
     pytest.importorskip(module, exc_type=ImportError)
-    out = tmp_path / "out"
-    completed(name, out)
-    success = [float(row["success"].removesuffix("%")) for row in table(out / f"{name}.csv")]
+    success = [float(row["success"].removesuffix("%")) for row in made(name, tmp_path)]
     assert success[0] < 10
     assert success[-1] > 20
 
 
 def test_a_policy_gives_a_planner_its_warm_start(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("warm_start", out)
-    rows = table(out / "warm_start.csv")
+    rows = made("warm_start", tmp_path)
     assert [row["from"] for row in rows] == ["nothing", "ppo"] * 2
     assert {row["solved"] for row in rows} == {"2 of 2"}
     without, warm = (float(row["iterations, median"]) for row in rows[:2])
@@ -615,9 +575,7 @@ def test_a_policy_gives_a_planner_its_warm_start(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_d4orm_finds_several_kinds_of_solution_and_no_robot_weaves(tmp_path: Path) -> None:
     pytest.importorskip("casadi")
-    out = tmp_path / "out"
-    completed("multimodality", out)
-    rows = table(out / "multimodality.csv")
+    out, rows = tmp_path / "out", made("multimodality", tmp_path)
     assert len({row["signs"] for row in rows}) == len(rows) == 8
     plans = {row["top to bottom"]: int(row["d4orm: plans"]) for row in rows}
     assert sum(plans.values()) == 8, "every seed solves so easy a problem"
@@ -643,9 +601,7 @@ def test_planners_find_several_kinds_of_solution_for_a_team(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_big_team_example_ends_without_failures_and_draws_the_plan(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("sixty_four_robots", out)
-    rows = table(out / "sixty_four_robots.csv")
+    out, rows = tmp_path / "out", made("sixty_four_robots", tmp_path)
     assert [int(row["iteration"]) for row in rows] == list(range(1, len(rows) + 1))
     assert int(rows[0]["failed"]) > int(rows[-1]["failed"]) == 0
     plan = Plan.load(out / "sixty_four_robots.npz")
@@ -660,9 +616,7 @@ def test_big_team_example_ends_without_failures_and_draws_the_plan(tmp_path: Pat
 def test_results_are_read_alike_from_all_three_files(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     pytest.importorskip("pyarrow")
-    out = tmp_path / "out"
-    completed("read_results", out)
-    rows = table(out / "read_results.csv")
+    out, rows = tmp_path / "out", made("read_results", tmp_path)
     assert [(row["policy"], row["scenario"], row["trials"]) for row in rows] == [
         (policy, scenario, "2")
         for policy in ("d4orm", "d4orm, few samples", "orca")
@@ -679,9 +633,7 @@ def test_results_are_read_alike_from_all_three_files(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_lifelong_example_stays_below_its_bound(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("lifelong", out)
-    (row,) = table(out / "lifelong.csv")
+    (row,), out = made("lifelong", tmp_path), tmp_path / "out"
     assert row["simulated [s]"] == "6.0"
     goals, rate = int(row["goals reached"]), float(row["goals per robot-minute"])
     assert goals >= 2
@@ -695,9 +647,7 @@ def test_lifelong_example_stays_below_its_bound(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_scaling_example_solves_every_team(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    completed("scaling", out)
-    rows = table(out / "scaling.csv")
+    out, rows = tmp_path / "out", made("scaling", tmp_path)
     assert [(row["robots"], row["side [m]"], row["solved"]) for row in rows] == [
         ("4", "2.5", "1 of 1"),
         ("8", "3.5", "1 of 1"),
@@ -717,12 +667,8 @@ def test_scaling_example_solves_every_team(tmp_path: Path) -> None:
     ],
     ids=["from rest", "at top speed", "backwards", "near", "there already"],
 )
-def test_lifelong_bound_is_the_time_of_a_straight_drive(
-    monkeypatch: pytest.MonkeyPatch, position: float, velocity: float, seconds: float
-) -> None:
+def test_lifelong_bound_is_the_time_of_a_straight_drive(position: float, velocity: float, seconds: float) -> None:
     """A single robot on a line, limits of 1 m/s and 1 m/s^2, and the goal's disc begins at 4 m."""
-    monkeypatch.syspath_prepend(ROOT)
-    lifelong = importlib.import_module("examples.studies.lifelong")
     problem = make_problem("circle", num_robots=1)
     goal = np.array([[4 + problem.goal_radius, 0]], np.float32)
     states = np.array([[position, 0, velocity, 0]], np.float32)
@@ -732,11 +678,7 @@ def test_lifelong_bound_is_the_time_of_a_straight_drive(
 
 @pytest.mark.parametrize("last_speed", [np.inf, 0.1])
 @pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
-def test_a_straight_drive_is_as_soon_as_the_least(
-    monkeypatch: pytest.MonkeyPatch, model: str, last_speed: float
-) -> None:
-    monkeypatch.syspath_prepend(ROOT)
-    solve_rates = importlib.import_module("examples.studies.solve_rates")
+def test_a_straight_drive_is_as_soon_as_the_least(model: str, last_speed: float) -> None:
     problem = make_problem("circle", num_robots=1, model=model, goal_speed=last_speed)
     braking = range(48, 57) if last_speed < 1 else ()  # from 1 m/s to 0.1 m/s
     controls = np.zeros((problem.horizon, 1, 2), np.float32)
@@ -747,9 +689,7 @@ def test_a_straight_drive_is_as_soon_as_the_least(
     assert arrived.argmax() * problem.dt == pytest.approx(solve_rates.least_travel_time(problem))
 
 
-def test_lifelong_drives_are_summed_up_over_their_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(ROOT)
-    lifelong = importlib.import_module("examples.studies.lifelong")
+def test_lifelong_drives_are_summed_up_over_their_seeds() -> None:
     drive = {"scenario": "random", "robots": 2, "seconds": 60.0, "touched": 1, "contacts": 3, "replanned": 4}
     first = {**drive, "goals": 20, "least_time": 3.0, "loop_seconds": [0.01, 0.03]}
     second = {**drive, "goals": 24, "least_time": 3.75, "loop_seconds": [0.02]}
@@ -764,8 +704,8 @@ def test_lifelong_drives_are_summed_up_over_their_seeds(monkeypatch: pytest.Monk
 
 
 @pytest.fixture
-def multimodality(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(ROOT)
+def multimodality() -> ModuleType:
+    pytest.importorskip("casadi")
     return importlib.import_module("examples.studies.multimodality")
 
 
@@ -871,14 +811,12 @@ def test_a_trained_policy_is_compared_with_planners_under_noise(tmp_path: Path) 
 @pytest.mark.slow
 def test_learners_are_trained_with_several_seeds_and_their_curves_read_again(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
-    out, again = tmp_path / "out", tmp_path / "again"
-    completed("training_seeds", out, "--seeds", "2")
-    rows = table(out / "training_seeds.csv")
+    out = tmp_path / "out"
+    rows = made("training_seeds", tmp_path, "--seeds", "2")
     assert [row["learner"].split(",")[0] for row in rows] == ["PPO", "PPO", "PPO", "SAC", "SAC"]
     assert {row["seeds"] for row in rows} == {"2"}
     assert (out / "training_seeds.png").read_bytes().startswith(PNG)
-    completed("training_seeds", again, "--trials", str(out / "training_seeds.parquet"))
-    assert table(again / "training_seeds.csv") == rows
+    check_made_again("training_seeds", tmp_path, rows)
 
 
 @pytest.mark.slow
@@ -891,8 +829,7 @@ def test_policies_are_rolled_out_among_walls(tmp_path: Path) -> None:
     assert len(rows) == 7
     assert sum(row["succeeded"] == "1 of 1" for row in rows) >= 3
     assert not (out / "policy_rates.csv").exists(), "nothing was measured on open ground"
-    completed("policy_rates", tmp_path / "again", "--trials", str(out / "policy_rates.parquet"))
-    assert table(tmp_path / "again" / "policy_rates_walls.csv") == rows
+    check_made_again("policy_rates", tmp_path, rows, of="policy_rates_walls")
 
 
 def test_count_of_seeds_below_one_is_refused(tmp_path: Path) -> None:

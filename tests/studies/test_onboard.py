@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import os
 import signal
 import subprocess
@@ -11,11 +10,12 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from examples.studies.onboard.course import Course, digest, goals_to_plan_for, present_problem
+from examples.studies.onboard.mission import Command, Mission, Tick, decode, encode
 from hypothesis import given
 from hypothesis import strategies as st
 from network_support import TIMEOUT
@@ -32,20 +32,9 @@ from d4orm_planners.tracking.steering import straight_drives
 pytestmark = pytest.mark.studies
 
 
-@pytest.fixture(scope="module")
-def onboard() -> Any:
-    """The modules of the demonstration."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT)
-        yield SimpleNamespace(
-            course=importlib.import_module("examples.studies.onboard.course"),
-            mission=importlib.import_module("examples.studies.onboard.mission"),
-        )
-
-
-def test_robots_get_out_of_where_denoising_of_the_whole_team_stayed_for_ever(onboard: Any) -> None:
+def test_robots_get_out_of_where_denoising_of_the_whole_team_stayed_for_ever() -> None:
     """Six robots of a run, at rest round after round after 155 s."""
-    mission = onboard.mission.Mission(robots=6, seed=0, samples=576, timeout=10.0, namespace="", world="", team="")
+    mission = Mission(robots=6, seed=0, samples=576, timeout=10.0, namespace="", world="", team="")
     problem = mission.problem().with_state(
         np.float32(
             [[1.365, 1.017], [1.068, -1.525], [-1.031, -0.958], [-1.094, -0.415], [1.023, -0.811], [-1.148, 0.704]]
@@ -69,23 +58,23 @@ def corridor() -> Problem:
     )
 
 
-def under_way(onboard: Any, problem: Problem) -> Any:
+def under_way(problem: Problem) -> Course:
     """Everybody drives straight to the goal."""
     engine = get_sampling_engine("cpu", 1)
     candidate = evaluate_controls(engine, problem, straight_drives(problem).controls[:, :, 0])
-    course = onboard.course.Course.of(10, problem, engine, candidate)
+    course = Course.of(10, problem, engine, candidate)
     assert course is not None, "driving straight solves it"
     return course
 
 
-def joint_at(problem: Problem, course: Any, tick: int) -> JointState:
+def joint_at(problem: Problem, course: Course, tick: int) -> JointState:
     controls = np.zeros((3, 2), np.float32)
     return JointState(course.states_at(tick), np.asarray(problem.goal), controls, np.zeros(3, bool), tick)
 
 
-def test_course_ends_at_rest(onboard: Any) -> None:
+def test_course_ends_at_rest() -> None:
     problem = corridor()
-    course = under_way(onboard, problem)
+    course = under_way(problem)
     assert course.controls_at(10)[0] == pytest.approx([1, 0])
     assert course.states_at(12)[0] == pytest.approx([0.2, 0], abs=1e-5)
     assert not course.controls_at(10_000).any()
@@ -93,9 +82,9 @@ def test_course_ends_at_rest(onboard: Any) -> None:
     assert course.rest(12, 3)[:, 0] == pytest.approx(np.tile([1.0, 0], (3, 1)))
 
 
-def test_who_would_run_into_a_body_stops_and_the_others_go_on(onboard: Any) -> None:
+def test_who_would_run_into_a_body_stops_and_the_others_go_on() -> None:
     problem, engine = corridor(), get_sampling_engine("cpu", 1)
-    course = under_way(onboard, problem)
+    course = under_way(problem)
     stopped = course.with_stops(problem, engine, joint_at(problem, course, 12), [0])
     assert stopped.begin == 12
     assert not stopped.controls[:, :2].any(), "robot 1 would run into robot 0"
@@ -103,73 +92,69 @@ def test_who_would_run_into_a_body_stops_and_the_others_go_on(onboard: Any) -> N
     assert stopped.digest != course.digest
 
 
-def test_who_follows_does_not_touch_a_robot_that_stops_for_a_tick(onboard: Any) -> None:
+def test_who_follows_does_not_touch_a_robot_that_stops_for_a_tick() -> None:
     """The margin that plans keep is more than the distance of a tick."""
-    problem = mission(onboard).problem()
+    problem = mission().problem()
     assert problem.margin > float(np.max(np.asarray(problem.team.max_speed))) * problem.dt
 
 
-def test_robots_whose_goal_a_body_covers_stay(onboard: Any) -> None:
+def test_robots_whose_goal_a_body_covers_stay() -> None:
     problem = corridor()
     states = np.array([[0, 0], [1.5, 0.2], [0, 1.5]], np.float32)
     joint = JointState(states, np.asarray(problem.goal), np.zeros((3, 2), np.float32), np.zeros(3, bool), 5)
-    goals = onboard.course.goals_to_plan_for
-    assert goals(problem, joint, []) == pytest.approx(np.asarray(problem.goal))
-    assert goals(problem, joint, [1]) == pytest.approx(np.array([[0, 0], [1.5, 0.2], [1, 1.5]]))
+    assert goals_to_plan_for(problem, joint, []) == pytest.approx(np.asarray(problem.goal))
+    assert goals_to_plan_for(problem, joint, [1]) == pytest.approx(np.array([[0, 0], [1.5, 0.2], [1, 1.5]]))
 
 
-def test_plans_begin_with_less_margin_only_where_robots_are_nearer(onboard: Any) -> None:
+def test_plans_begin_with_less_margin_only_where_robots_are_nearer() -> None:
     problem = corridor()
-    present = onboard.course.present_problem
-    assert present(problem, problem.start, problem.goal, []).margin == 0.15
+    assert present_problem(problem, problem.start, problem.goal, []).margin == 0.15
     near = np.array([[0, 0], [-0.4, 0], [0, 1.5]], np.float32)
-    assert present(problem, near, problem.goal, []).margin == pytest.approx(0.1, abs=2e-3)
-    lost = present(problem, near, problem.goal, [1]).team
+    assert present_problem(problem, near, problem.goal, []).margin == pytest.approx(0.1, abs=2e-3)
+    lost = present_problem(problem, near, problem.goal, [1]).team
     assert np.asarray(lost.max_speed) == pytest.approx([1, 1e-6, 1])
 
 
 @pytest.mark.parametrize("lost", [[], [1]])
-def test_a_plan_has_the_same_name_after_it_was_passed_on(onboard: Any, lost: list[int]) -> None:
+def test_a_plan_has_the_same_name_after_it_was_passed_on(lost: list[int]) -> None:
     engine, whole = get_sampling_engine("cpu", 1), corridor()
-    problem = onboard.course.present_problem(whole, whole.start, whole.goal, lost)
+    problem = present_problem(whole, whole.start, whole.goal, lost)
     random = np.random.default_rng(0)
     candidate = evaluate_controls(engine, problem, random.normal(0, 2, (40, 3, 2)).astype(np.float32))
     again = evaluate_controls(engine, problem, candidate.controls)
     other = evaluate_controls(engine, problem, 0.5 * candidate.controls)
-    digest = onboard.course.digest
     assert digest(engine, problem, again) == digest(engine, problem, candidate) != digest(engine, problem, other)
 
 
-def mission(onboard: Any, **changes: Any) -> Any:
+def mission(**changes: Any) -> Mission:
     settings = {
         "robots": 3, "seed": 0, "samples": 96, "iterations": 1, "timeout": 1.0, "silence": 1.0, "namespace": "test",
         "world": "tcp/127.0.0.1:1", "team": "tcp/127.0.0.1:2",
     }  # fmt: skip
-    return onboard.mission.Mission(**(settings | changes))
+    return Mission(**(settings | changes))
 
 
-def test_the_team_drives_in_a_square(onboard: Any) -> None:
-    assert mission(onboard).problem().world.bounds.tolist() == [[-2, -2], [2, 2]]
+def test_the_team_drives_in_a_square() -> None:
+    assert mission().problem().world.bounds.tolist() == [[-2, -2], [2, 2]]
 
 
-def test_messages_are_the_same_after_they_were_sent(onboard: Any) -> None:
-    wire = onboard.mission
-    tick = wire.Tick(3, [0.1, float(np.float32(0.1))], [2], ["a", ""], [0.5, 0.0])
-    command = wire.Command(3, 1, [0.25, -1.0], "a", 0.5, "b")
-    assert wire.decode(wire.encode(tick), wire.Tick) == tick
-    assert wire.decode(wire.encode(command), wire.Command) == command
-    assert wire.decode(wire.encode(command), wire.Tick) is None
+def test_messages_are_the_same_after_they_were_sent() -> None:
+    tick = Tick(3, [0.1, float(np.float32(0.1))], [2], ["a", ""], [0.5, 0.0])
+    command = Command(3, 1, [0.25, -1.0], "a", 0.5, "b")
+    assert decode(encode(tick), Tick) == tick
+    assert decode(encode(command), Command) == command
+    assert decode(encode(command), Tick) is None
     for bad in (
         replace(command, control=[float("nan")]), replace(command, number=True), replace(command, ballot=1),
         replace(tick, lost=["1"]), replace(tick, state=None),
     ):  # fmt: skip
-        assert wire.decode(wire.encode(bad), type(bad)) is None
+        assert decode(encode(bad), type(bad)) is None
 
 
 @given(data=st.binary(max_size=64) | st.text(max_size=64).map(str.encode))
-def test_whatever_else_arrives_is_no_message(onboard: Any, data: bytes) -> None:
-    assert onboard.mission.decode(data, onboard.mission.Tick) is None
-    assert onboard.mission.decode(b'{"kind": "Tick", "number": ' + data, onboard.mission.Tick) is None
+def test_whatever_else_arrives_is_no_message(data: bytes) -> None:
+    assert decode(data, Tick) is None
+    assert decode(b'{"kind": "Tick", "number": ' + data, Tick) is None
 
 
 def timeline(out: Path) -> list[dict[str, str]]:

@@ -6,11 +6,13 @@ import csv
 import json
 from argparse import Namespace
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trial_support
 from examples.common import steps_to_solution, study_trials
 from examples.studies.paper import main
 from examples.studies.paper.figure import Figure, Group, Section, grouped
@@ -29,19 +31,10 @@ pytestmark = pytest.mark.studies
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def trial(seed: int = 0, **changes: Any) -> Trial:
-    values = {
-        "policy": "d4orm",
-        "config": "{}",
-        "problem": "abc",
-        "control_noise_std": 0.0,
-        "scenario": "circle",
-        "num_robots": 8,
-    }
-    values |= {"label": "d4orm", "model": "holonomic2d", "dt": 0.1, "steps": 50, "date": "2026-11-21"}
-    outcome = {"success": True, "status": "solved", "wall_time": 3.0, "preparation": 3.0, "travel_time": 6.0}
-    outcome |= {"history": "[[0.5,0,0.6],[1.5,1,0.5],[2.5,1,0.7]]", "makespan": 7.0, "mean_squared_jerk": 40.0}
-    return Trial(**{**values, **outcome, "seed": seed, **changes})
+trial = partial(
+    trial_support.trial, num_robots=8, date="2026-11-21", status="solved", wall_time=3.0, preparation=3.0, steps=50,
+    travel_time=6.0, makespan=7.0, mean_squared_jerk=40.0, history="[[0.5,0,0.6],[1.5,1,0.5],[2.5,1,0.7]]",
+)  # fmt: skip
 
 
 def figure(**changes: Any) -> Figure:
