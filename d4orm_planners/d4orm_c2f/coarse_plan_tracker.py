@@ -18,6 +18,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     STUCK_AFTER,
     WAITING_WITHIN,
     CoarsePlan,
+    CoarsePlanning,
     CoarseWaypoints,
     StagnationMonitor,
     coarse_problem,
@@ -28,7 +29,6 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     subgoal_indices,
     visible_subgoals,
 )
-from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import SamplingEngine
 from d4orm_planners.mapf.relay import relay_paths

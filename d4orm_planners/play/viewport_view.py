@@ -33,8 +33,8 @@ from d4orm_planners.play.meshes import (
     puck,
     solid,
 )
-from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
+from d4orm_planners.play.viewport import Frame
 
 Numbers: TypeAlias = NDArray[np.intp] | None
 """Numbers ``(N,)`` of what shapes stand for, where they are others than the shapes' own."""

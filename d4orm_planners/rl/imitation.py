@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -24,19 +24,24 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.base.planner_registry import make_policy, setting_names
+from d4orm_planners.base.policy import Policy, robot_indices
 from d4orm_planners.base.settings import Count, PathText
-from d4orm_planners.rl.algorithms import ALGORITHMS
+from d4orm_planners.rl.algorithms import ALGORITHMS, network_of
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
+from d4orm_planners.rl.dataset.minari_files import Samples, dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
-from d4orm_planners.rl.samples import Samples, dataset_samples, record_samples
-from d4orm_planners.rl.sb3_network import network_of
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
 
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
 __all__ = ["ImitationSettings", "imitate"]
+
+Driver = Callable[[FloatArray, FloatArray], FloatArray]
 
 LEARNER = "ppo"
 """Algorithm whose network learns, and whose policy it is then."""
@@ -129,7 +134,7 @@ class _ImitationRun:
         self._episodes.mkdir(exist_ok=True)
         self._env = VecNormalize(self._validation, clip_obs=CLIP, epsilon=EPSILON)
         set_random_seed(derived_seed(settings.seed, Stream.TRAINING, 0) % 2**32)
-        self._model = ALGORITHMS[LEARNER].make(self._env)
+        self._model = ALGORITHMS[LEARNER].make(self._env, None, {})
         checkpoint = self.checkpoints.latest()
         self.evaluations: list[Evaluation] = [] if checkpoint is None else checkpoint.evaluations
         if checkpoint is not None:
@@ -213,6 +218,33 @@ class _ImitationRun:
         if len(episodes) < 2:
             raise ValueError(f"dataset {path!r} has {len(episodes)} episodes; at least 2 are needed")
         return episodes
+
+
+def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None) -> Samples:
+    """Run an episode and ask the expert at every step what to do.
+
+    Args:
+        env: A :mod:`d4orm_env.navigation_v0` parallel environment of a team of one model.
+        expert: Policy that is asked.
+        seed: Seeds both.
+        learner: Policy that drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the
+            expert. With a learner the expert is asked where that has led the team.
+
+    Returns:
+        What the robots saw until they arrived, and what the expert said.
+    """
+    observations, _ = env.reset(seed=seed)
+    expert.reset(env, seed=seed)
+    limits, parts = env.unwrapped.problem.team.control_limits, []
+    while env.agents:
+        acting = {agent: observations[agent] for agent in env.agents}
+        asked = expert.act(acting, env.state())
+        seen, own = np.stack(list(acting.values())), limits[robot_indices(acting)]
+        controls = as_float32([asked[agent] for agent in acting])
+        parts.append(Samples(seen, controls, own))
+        driven = controls if learner is None else learner(seen, own)
+        observations, *_ = env.step(dict(zip(acting, driven, strict=True)))
+    return Samples.joined(parts)
 
 
 def normalize(env: VecNormalize, inputs: FloatArray) -> None:

@@ -34,9 +34,10 @@ if TYPE_CHECKING:
 AGENTS = ("team", "robot")
 """Owner of an episode of a dataset."""
 
-
 MAX_BYTES = 2**31
 """Largest array of an episode that is read."""
+UNREADABLE = (ValueError, KeyError, EOFError, RecursionError, zipfile.BadZipFile, zlib.error)
+"""Errors of reading arrays from a file that holds something else."""
 _FLAGS = ("acting", "terminations", "arrived", "collided", "margin_violated")
 _OF_STEPS = ("actions", "acting", "rewards", "terminations")
 """Arrays of ``T`` moments; the others have one more."""
@@ -198,7 +199,7 @@ class RecordedEpisode:
                 arrays = {name: archive.array(name, MAX_BYTES) for name in _ARRAYS}
                 metadata = json.loads(archive.array("metadata", MAX_BYTES).tobytes())
             _check(arrays, metadata)
-        except (ValueError, KeyError, EOFError, RecursionError, zipfile.BadZipFile, zlib.error) as error:
+        except UNREADABLE as error:
             raise ValueError(f"{path} is no recorded episode ({error}); remove it to record it anew") from None
         return cls(**arrays, metadata=metadata)
 
