@@ -5,7 +5,9 @@ Paper, section VI, Algorithm 4, lines 1 to 3 and 7.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -141,8 +143,7 @@ def _meets_resting(
     square = (offset**2).sum(axis=1)[:, None]
     share = np.clip((gap * offset[:, None]).sum(axis=2) / np.where(square > 0, square, 1), 0, 1)
     away = ((gap - share[:, :, None] * offset[:, None]) ** 2).sum(axis=2)
-    meets: BoolArray = (away <= (width[:, None] + radius) ** 2).any(axis=1)
-    return meets
+    return (away <= (width[:, None] + radius) ** 2).any(axis=1)
 
 
 STUCK_WITHIN, STUCK_AFTER = 3, 25
@@ -239,40 +240,26 @@ class CoarsePlanning:
         # A robot that has arrived at the rim of its goal could leave it within a coarse step.
         goals = np.where(arrived[:, None], joint.states[:, : problem.dimension], joint.goals)
         coarse = coarse_problem(problem.with_state(joint.states, goals), self._config.coarse_factor)
-        chosen, guidance = self._planned(coarse, joint.steps, initial, iterations, thorough)
+        seed = derived_seed(self._seed, Stream.COARSE_PLAN, joint.steps)
+        planner = self._thorough if thorough else self.planner
+        search = partial(self._searched, planner=planner, seed=seed, initial=initial, iterations=iterations)
+        chosen, guidance = _discs_first(search, coarse)
         last = joint.steps if self._last_step is None else self._last_step
         left = (last - joint.steps) // self._config.coarse_factor
         if 0 < left < coarse.horizon and not chosen.failed.any() and not chosen.trajectory.arrived[left].all():
             # It would come too late. Plans that come too late are none, if there are others.
             in_time = coarse.with_state(coarse.start, coarse.goal, horizon=left)
-            hurried, other = self._planned(in_time, joint.steps, initial, iterations, thorough)
+            hurried, other = _discs_first(search, in_time)
             if not hurried.failed.any():
                 return other
         return guidance
 
-    def _planned(
-        self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
-    ) -> tuple[Candidate, CoarsePlan]:
-        """A plan for the discs round the robots, who then move all at once; where there is none, for them themselves.
-
-        Footprints are planned one after another (:mod:`d4orm_planners.manoeuvres`), and the last ones come late.
-        """
-        team = coarse.team
-        if team.shapes and covered_by_discs(coarse):
-            discs = coarse.with_state(coarse.start, coarse.goal, team=team.replace(radius=team.radius))
-            chosen, plan = self._searched(discs, step, initial, iterations, thorough)
-            if not chosen.failed.any():
-                return chosen, plan
-        return self._searched(coarse, step, initial, iterations, thorough)
-
     def _searched(
-        self, coarse: Problem, step: int, initial: FloatArray | None, iterations: int, thorough: bool
+        self, coarse: Problem, planner: Planner, seed: int, initial: FloatArray | None, iterations: int
     ) -> tuple[Candidate, CoarsePlan]:
         """The first plan that passes the checks, or the best one."""
-        planner = self._thorough if thorough else self.planner
-        seed, interval = derived_seed(self._seed, Stream.COARSE_PLAN, step), self._config.check_interval
         start = None if initial is None else initial[: coarse.horizon]
-        search = SolveRun(planner, coarse, seed, start, check_interval=interval)
+        search = SolveRun(planner, coarse, seed, start, check_interval=self._config.check_interval)
         chosen, ordered = search.current, False
         for number in range(iterations):
             if not chosen.failed.any():
@@ -287,6 +274,22 @@ class CoarsePlanning:
         return chosen, CoarsePlan(
             problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered
         )
+
+
+def _discs_first(
+    search: Callable[[Problem], tuple[Candidate, CoarsePlan]], coarse: Problem
+) -> tuple[Candidate, CoarsePlan]:
+    """A plan for the discs round the robots, who then move all at once; where there is none, for them themselves.
+
+    Footprints are planned one after another (:mod:`d4orm_planners.manoeuvres`), and the last ones come late.
+    """
+    team = coarse.team
+    if team.shapes and covered_by_discs(coarse):
+        discs = coarse.with_state(coarse.start, coarse.goal, team=team.replace(radius=team.radius))
+        chosen, plan = search(discs)
+        if not chosen.failed.any():
+            return chosen, plan
+    return search(coarse)
 
 
 def _coarse_planner(config: D4ormC2FConfig, reroute: bool) -> Planner:

@@ -221,8 +221,7 @@ class CoarsePlanTracker:
         """``(K,)`` robots that are on time, or ahead of the team, and so have to wait."""
         due = self.guidance.path[min(self.index, len(self.guidance.path) - 1)]
         away = np.linalg.norm(joint.states[:, : self.problem.dimension] - due, axis=1)
-        waiting: BoolArray = (away < WAITING_WITHIN * self.problem.team.largest_radius) | (self._indices > self.index)
-        return waiting
+        return (away < WAITING_WITHIN * self.problem.team.largest_radius) | (self._indices > self.index)
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
         """Check whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
@@ -239,10 +238,7 @@ class CoarsePlanTracker:
     def _away(self, joint: JointState) -> FloatArray:
         """``(K,)`` distances of the robots from their waypoints [m]."""
         positions = joint.states[:, : self.problem.dimension]
-        away: FloatArray = np.linalg.norm(
-            positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1
-        )
-        return away
+        return np.linalg.norm(positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1)
 
     def refine(self, step: int, due: bool) -> bool:
         """Accept a finished refinement, and begin another if that is ``due``; whether one was accepted."""

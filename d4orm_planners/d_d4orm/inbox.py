@@ -271,5 +271,4 @@ def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, genera
 
 def _square_distances(points: Floats, centres: Floats) -> Floats:
     """``(n, c)``."""
-    gap2: Floats = ((points[:, None] - centres[None]) ** 2).sum(axis=2)
-    return gap2
+    return ((points[:, None] - centres[None]) ** 2).sum(axis=2)

@@ -73,7 +73,6 @@ class View:
                 viewport.update(frame, now)
 
     def _rebuild(self, frames: tuple[Frame, ...]) -> None:
-        """Make all shapes anew."""
         limits = in_space(view_limits(frames[0].problem))
         positions = _positions(len(frames), limits)
         with self._server.atomic():

@@ -165,7 +165,6 @@ class ViewportView:
         self._drag("goals", "goal", lambda scene, index, at, _: edits.move_goal(scene, index, at))
 
     def _add_bodies(self, frame: Frame) -> None:
-        """Add the dynamic obstacles."""
         if len(frame.bodies):
             radius = frame.bodies[:, -1]
             mesh, high = (puck(24), 0.5 * radius) if frame.problem.dimension == 2 else (ball(2), radius)

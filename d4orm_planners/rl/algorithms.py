@@ -167,8 +167,7 @@ class Algorithm:
             network |= {"activation_fn": torch.nn.ReLU}
         settings: dict[str, Any] = {"learning_rate": self.learning_rate, "gamma": self.gamma, **self.tunable, **tuned}
         settings |= {f"{self.buffer}_class": self.buffer_class, **self._settings(env)}
-        made: BaseAlgorithm = self.model("MlpPolicy", env, policy_kwargs=network, device="cpu", **settings)
-        return made
+        return self.model("MlpPolicy", env, policy_kwargs=network, device="cpu", **settings)
 
     def _settings(self, env: VecNormalize) -> dict[str, Any]:
         """Further keywords of Stable-Baselines3 for an environment."""

@@ -37,30 +37,20 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A point of the curve.
+    """A point of the curve."""
 
-    Attributes:
-        steps: Robot-steps trained, or in an imitation, learned from.
-        num_robots: Size of the team trained last.
-        scenario: Scenario trained last.
-        success_rate: Share of the validation episodes in which all arrived and none ever touched anything.
-        travel_time: Their mean arrival time [s], with the whole episode for robots that did not arrive.
-        seconds: Time that the stage took.
-        env_share: Share of it that went into the environments, instances that are drawn included; in an imitation, into
-            recording.
-        imitation_error: Root mean square of the actions less those of the expert, in units of the limits, in episodes
-            that were not learned from; ``None`` without an expert.
-        parts: Success rates of the parts of a mixture, in their order, of which ``success_rate`` is the mean.
-    """
-
-    steps: int
-    num_robots: int
-    scenario: str
-    success_rate: float
-    travel_time: float
-    seconds: float
+    steps: int  #: Robot-steps trained, or in an imitation, learned from
+    num_robots: int  #: Size of the team trained last
+    scenario: str  #: Scenario trained last
+    success_rate: float  #: Share of the validation episodes in which all arrived and none ever touched anything
+    travel_time: float  #: Their mean arrival time [s], with the whole episode for robots that did not arrive
+    seconds: float  #: Time that the stage took
+    #: Share of it that went into the environments, instances that are drawn included; in an imitation, into recording
     env_share: float
+    #: Root mean square of the actions less those of the expert, in units of the limits, in episodes that were not
+    #: learned from; ``None`` without an expert
     imitation_error: float | None = None
+    #: Success rates of the parts of a mixture, in their order, of which ``success_rate`` is the mean
     parts: Sequence[float] | None = None
 
     @property

@@ -122,8 +122,6 @@ def imitate(
 
 
 class _ImitationRun:
-    """An imitation under way."""
-
     def __init__(self, settings: ImitationSettings, out: Path, progress: Progress, command: str) -> None:
         self.settings, self._progress, self._command = settings, progress, command
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
@@ -156,7 +154,9 @@ class _ImitationRun:
         recorded = time.perf_counter() - begin
         known, held = self._samples(index)
         if not index:
-            normalize(self._env, known[0])
+            seen: Any = self._env.obs_rms
+            seen.mean, seen.var = (of(known[0], axis=0, dtype=np.float64) for of in (np.mean, np.var))
+            seen.count = float(len(known[0]))
         random = generator(settings.seed, Stream.TRAINING, index + 1)
         clone(
             self._model, self._env, *known, epochs=settings.epochs, random=random,
@@ -168,11 +168,12 @@ class _ImitationRun:
         self, index: int, steps: int, held: tuple[FloatArray, FloatArray], seconds: float, recorded: float
     ) -> None:
         """Judge what has been learned, and keep it."""
-        network = self._network(index, seconds)
+        network, (inputs, targets) = self._network(index, seconds), held
+        error = float(np.sqrt(np.mean((network(inputs) - targets) ** 2)))
+        outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
-            steps, self.settings.num_robots, self.settings.scenario,
-            *evaluate_network(network, self._validation, VALIDATION_SEED)[:2], seconds, recorded / seconds,
-            imitation_error(network, *held),
+            steps, self.settings.num_robots, self.settings.scenario, outcome.success_rate, outcome.travel_time,
+            seconds, recorded / seconds, error,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.conclude(index, self._model, self._env, network, self.evaluations)
@@ -247,13 +248,6 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver 
     return Samples.joined(parts)
 
 
-def normalize(env: VecNormalize, inputs: FloatArray) -> None:
-    """Have an environment normalise observations as these features ``(N, F)`` want it."""
-    seen: Any = env.obs_rms
-    seen.mean, seen.var = inputs.mean(axis=0, dtype=np.float64), inputs.var(axis=0, dtype=np.float64)
-    seen.count = float(len(inputs))
-
-
 def clone(
     model: Any,
     env: VecNormalize,
@@ -284,8 +278,3 @@ def clone(
             loss.backward()  # type: ignore[no-untyped-call]
             policy.optimizer.step()
     report(epochs)
-
-
-def imitation_error(network: Network, inputs: FloatArray, targets: FloatArray) -> float:
-    """Root mean square of a network's actions ``(N, m)`` less the expert's, in units of the limits."""
-    return float(np.sqrt(np.mean((network(inputs) - targets) ** 2)))

@@ -75,7 +75,6 @@ class TrainConfig(CheckedSettings):
         self._example()
 
     def _example(self) -> Problem:
-        """An instance of the scenario."""
         return self.task(self.scenario, self.num_robots).problem(0, self.model)
 
     def arguments(self, scenario: str) -> dict[str, Any]:
@@ -294,6 +293,5 @@ class TrainingSettings(TrainConfig):
 
     @property
     def _options(self) -> dict[str, Any]:
-        """Options of the environments."""
         own = {"observed_robots": self.observed_robots, "shortest_paths": self.shortest_paths}
         return {**self.sensors, **own, "reward": self.reward}

@@ -34,17 +34,11 @@ Progress = Callable[[str, int, int], object]
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a training.
+    """Result of a training."""
 
-    Attributes:
-        network: The policy with the best validation.
-        curve: One evaluation per stage.
-        policy_path: Path of the policy.
-    """
-
-    network: Network
-    curve: tuple[Evaluation, ...]
-    policy_path: Path
+    network: Network  #: The policy with the best validation
+    curve: tuple[Evaluation, ...]  #: One evaluation per stage
+    policy_path: Path  #: Path of the policy
 
 
 def train(
@@ -73,8 +67,6 @@ def train(
 
 
 class _TrainingRun:
-    """A training under way."""
-
     def __init__(self, settings: TrainingSettings, out: Path, progress: Progress, command: str) -> None:
         self.settings, self._out, self._progress, self._command = settings, out, progress, command
         self._algorithm: Algorithm = ALGORITHMS[settings.algorithm]

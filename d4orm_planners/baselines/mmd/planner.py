@@ -104,8 +104,7 @@ def first_conflict(positions: Floats, distances: Floats) -> tuple[int, int, tupl
 
 def _too_near(gaps: Floats, distances: Floats) -> BoolArray:
     """Check which gaps ``(..., 3)`` are no longer than the distances to keep [m]."""
-    too_near: BoolArray = gaps[..., 0] ** 2 + gaps[..., 1] ** 2 + gaps[..., 2] ** 2 <= distances**2
-    return too_near
+    return gaps[..., 0] ** 2 + gaps[..., 1] ** 2 + gaps[..., 2] ** 2 <= distances**2
 
 
 class Constraint(NamedTuple):
