@@ -5,7 +5,7 @@ M. Kelly, "An Introduction to Trajectory Optimization", SIAM Review, 2017.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import chain
 from typing import Any, NamedTuple, TypeAlias
 
@@ -46,13 +46,6 @@ class CollocatedMotion(NamedTuple):
     controls: Floats  #: ``(H, K, m)``
 
 
-class NonlinearProgram(NamedTuple):
-    """A program as CasADi takes it."""
-
-    functions: Mapping[str, Expression]  #: Variables ``x``, cost ``f`` and constraints ``g``, each one column
-    bounds: Mapping[str, Floats]  #: ``lbx``, ``ubx``, ``lbg`` and ``ubg`` of these
-
-
 class TeamProgram:
     """Direct collocation of a problem: the states and controls of all robots at all steps are variables.
 
@@ -87,8 +80,12 @@ class TeamProgram:
             for robot, model in enumerate(self.models)
         ]
 
-    def write(self, contacts: Contacts, arrivals: IntArray) -> NonlinearProgram:
-        """The program as CasADi takes it, with robots at their goals from steps ``arrivals`` ``(K,)`` on."""
+    def write(self, contacts: Contacts, arrivals: IntArray) -> tuple[dict[str, Expression], dict[str, Floats]]:
+        """The program as CasADi takes it, with robots at their goals from steps ``arrivals`` ``(K,)`` on.
+
+        Returns:
+            Variables ``x``, cost ``f`` and constraints ``g``, each one column; and their bounds.
+        """
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(arrivals), *self._contact_rows(contacts, arrivals)]
         sizes = [row.numel() for row, _, _ in rows]
@@ -99,7 +96,7 @@ class TeamProgram:
             "f": self._cost(),
             "g": ca.vertcat(*(ca.vec(row) for row, _, _ in rows)),
         }
-        return NonlinearProgram(functions, {"lbx": lowest, "ubx": highest, "lbg": lower, "ubg": upper})
+        return functions, {"lbx": lowest, "ubx": highest, "lbg": lower, "ubg": upper}
 
     def contacts(self, motion: CollocatedMotion, lookout: float | None) -> Contacts:
         """Find what comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""

@@ -173,8 +173,8 @@ class Algorithm:
         """Further keywords of Stable-Baselines3 for an environment."""
         raise NotImplementedError
 
-    def checked(self, tuned: Mapping[str, float], name: str) -> dict[str, float]:
-        """Values for :attr:`tunable`, whole where those here are.
+    def checked(self, tuned: Mapping[str, float]) -> dict[str, float]:
+        """``learner_settings``, values for :attr:`tunable`: whole where those here are.
 
         Raises:
             ValueError: For a keyword that is not one of them, or a value that makes no sense.
@@ -182,11 +182,11 @@ class Algorithm:
         values: dict[str, float] = {}
         for keyword, value in tuned.items():
             if keyword not in self.tunable:
-                raise ValueError(f"{name} has {keyword!r}; choose of {', '.join(self.tunable)}")
+                raise ValueError(f"learner_settings has {keyword!r}; choose of {', '.join(self.tunable)}")
             least = 1 if isinstance(self.tunable[keyword], int) else None
             if value < 0 or (least and (value < least or value != int(value))):
                 wanted = "a whole number of at least 1" if least else "at least 0"
-                raise ValueError(f"{name} has {keyword}={value:g}; it must be {wanted}")
+                raise ValueError(f"learner_settings has {keyword}={value:g}; it must be {wanted}")
             values[keyword] = int(value) if least else value
         return values
 

@@ -13,6 +13,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,6 +34,7 @@ from d4orm_planners.rl.algorithms import ALGORITHMS, network_of
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.dataset.minari_files import Samples, dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
+from d4orm_planners.rl.task_mixture import Instances
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
 
@@ -193,7 +195,9 @@ class _ImitationRun:
         if path.exists():
             return
         scenario = "random" if episode % 2 else settings.scenario
-        env = navigation_v0.parallel_env(num_robots=settings.num_robots, **settings.arguments(scenario))
+        task = settings.task(scenario, settings.num_robots)
+        instances = Instances(partial(task.problem, model=settings.model_in(scenario)), None, {})
+        env = navigation_v0.parallel_env(instances, settings.num_robots, **settings.options)
         expert = make_policy(settings.expert, **settings.all_expert_settings)
         seed = derived_seed(settings.seed, Stream.DEMONSTRATIONS, index, episode)
         record_samples(env, expert, seed, self._network(index).controls if index else None).save(path)
