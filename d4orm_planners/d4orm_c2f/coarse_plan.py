@@ -199,8 +199,6 @@ class CoarsePlanning:
     """Plans for the team of an episode.
 
     Args:
-        config: The settings.
-        seed: Of the episode.
         last_step: Time steps after which the episode ends; ``None`` if it goes on after robots arrive.
 
     Attributes:

@@ -42,9 +42,6 @@ class CoarsePlanTracker:
     """Leads a team through an episode.
 
     Args:
-        problem: The problem of the episode.
-        config: The settings.
-        seed: Of the episode.
         refiner: Engine of refinements.
         background: Thread that they are made in, if not between control loops.
         replanning: Thread that plans anew where loops have a deadline.

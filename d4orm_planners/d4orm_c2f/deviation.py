@@ -104,8 +104,6 @@ class Deviation:
     """Compares an episode with the model.
 
     Args:
-        problem: The robots.
-        engine: Engine for rollouts.
         config: The settings, which say what is estimated.
         docks: Whether robots stay at their goals, rather than drive through them to others.
 

@@ -46,9 +46,6 @@ class Window:
     """Plans finely over the prediction horizon, from wherever the robots are.
 
     Args:
-        problem: The problem of the episode.
-        config: The settings.
-        engine: Engine for rollouts and samples.
         docks: Whether robots stay at their goals, rather than drive through them to others.
 
     Attributes:

@@ -36,8 +36,6 @@ class Evaluator:
     """Evaluates candidates, and remembers some.
 
     Args:
-        engine: Engine for rollouts.
-        problem: The problem.
         remembered: Candidates of this process's own nodes that are remembered.
 
     Attributes:
@@ -88,9 +86,6 @@ class Inbox:
     """Takes messages from a transport; nothing that arrives makes it raise.
 
     Args:
-        evaluator: Evaluator of the candidates.
-        transport: Transport of the messages.
-        num_nodes: Number of nodes.
         own: The node that it belongs to, or ``None`` for an observer's.
         heard: Nodes whose messages reach it; ``None`` for all.
 

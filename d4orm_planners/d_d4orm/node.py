@@ -75,9 +75,7 @@ class Node:
 
     Args:
         number: Its number, from 0.
-        task: Common task of the nodes.
         planner: Planner that refines its candidate.
-        transport: Its access to the others.
         evaluator: Evaluator, in common with other nodes of this process.
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
             network the time at which it began, by which two nodes of one number know which was first.

@@ -29,10 +29,8 @@ class NodePool(ABC):
     """The nodes of one solve.
 
     Args:
-        nodes: The nodes.
         transports: All ends to close in the end.
         timeout: Seconds that are waited for stragglers: beyond the time limit, and when asynchronous in every round.
-        evaluator: Evaluator of all nodes.
 
     Attributes:
         alive: Nodes that have not failed.
