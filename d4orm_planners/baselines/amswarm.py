@@ -199,11 +199,6 @@ def _one_step_on(guess: Guess, dt: float) -> Guess:
     return Guess(position, velocity, acceleration)
 
 
-Degree = Annotated[Count, Field(ge=5, le=30)]
-Lookahead = Annotated[Count, Field(ge=2, le=1000)]
-Growth = Annotated[Number, Field(ge=1, le=10)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class AMSwarmConfig(PlannerConfig):
     """Settings of :class:`AMSwarm`; lengths are in steps of the fastest robot at full speed.
@@ -226,8 +221,8 @@ class AMSwarmConfig(PlannerConfig):
     """
 
     max_iterations: Count = 20
-    lookahead: Lookahead = 40
-    degree: Degree = 10
+    lookahead: Annotated[Count, Field(ge=2, le=1000)] = 40
+    degree: Annotated[Count, Field(ge=5, le=30)] = 10
     goal_steps: Count = 32
     goal_weight: Positive = 1.0
     smoothness: NotNegative = 1e-4
@@ -236,7 +231,7 @@ class AMSwarmConfig(PlannerConfig):
     clearance: NotNegative = 0.3
     perturbation: NotNegative = 0.5
     penalty: Positive = 2.0
-    growth: Growth = 1.05
+    growth: Annotated[Number, Field(ge=1, le=10)] = 1.05
     alternations: Steps = 100
     tolerance: Positive = 0.05
 

@@ -48,8 +48,6 @@ LOOK = 0.01
 GRACE = 0.05
 """Time that work which was asked to end is waited for [s]."""
 
-SolverIterations = Annotated[Count, Field(le=2**31 - 1)]  # IPOPT's own counter
-
 
 @dataclass(frozen=True, kw_only=True)
 class IpoptConfig(PlannerConfig):
@@ -77,7 +75,7 @@ class IpoptConfig(PlannerConfig):
     clearance: NotNegative = 0.02
     tolerance: Positive = 1e-3
     barrier: Positive = 1.0
-    solver_iterations: SolverIterations = 1000
+    solver_iterations: Annotated[Count, Field(le=2**31 - 1)] = 1000  # IPOPT's own counter
 
 
 @dataclass(frozen=True, eq=False)

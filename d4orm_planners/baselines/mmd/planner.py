@@ -30,7 +30,6 @@ PADDING = 2
 """Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published."""
 
 Stretch = Annotated[Number, Field(ge=1, le=100)]
-GuideSteps = Annotated[Count, Field(le=1000)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +58,7 @@ class MMDConfig(PlannerConfig):
     num_samples: Samples = 32
     num_steps: Steps = 25
     guide_from: ShareOrNone = 0.5
-    guide_steps: GuideSteps = 4
+    guide_steps: Annotated[Count, Field(le=1000)] = 4
     noise_scale: NotNegative = 0.5
     reuse_steps: Count | None = 3
     soft_pull: ShareOrNone = 0.5
