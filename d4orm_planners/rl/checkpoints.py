@@ -127,22 +127,14 @@ class Checkpoints:
     def conclude(
         self, index: int, model: BaseAlgorithm, env: VecNormalize, network: Network, evaluations: Sequence[Evaluation]
     ) -> Checkpoint:
-        """Write the policy, if the last of the evaluations is as good as any, the curve, and a stage's checkpoint."""
+        """Write the policy, if the last of the evaluations is as good as any, the curve, and a stage's checkpoint.
+
+        Older checkpoints are removed but for the last :data:`_KEEP`.
+        """
         if evaluations[-1].rank == max(evaluation.rank for evaluation in evaluations):
             network.save(self.policy_path)
         write_curve(self.policy_path.parent, evaluations)
         # Last, so that what a stage that was broken off has written is written again.
-        return self._save(index, model, env, evaluations)
-
-    def latest(self) -> Checkpoint | None:
-        """The last complete checkpoint."""
-        complete = self._complete()
-        return Checkpoint.read(complete[-1]) if complete else None
-
-    def _save(
-        self, index: int, model: BaseAlgorithm, env: VecNormalize, evaluations: Sequence[Evaluation]
-    ) -> Checkpoint:
-        """Write the checkpoint of stage ``index``, and remove the oldest."""
         final = self._folder / f"{index + 1:06d}"
         temporary = final.with_suffix(".partial")
         shutil.rmtree(temporary, ignore_errors=True)
@@ -156,6 +148,11 @@ class Checkpoints:
         for old in self._complete()[:-_KEEP]:
             shutil.rmtree(old)
         return Checkpoint.read(final)
+
+    def latest(self) -> Checkpoint | None:
+        """The last complete checkpoint."""
+        complete = self._complete()
+        return Checkpoint.read(complete[-1]) if complete else None
 
     def _complete(self) -> list[Path]:
         return sorted(path for path in self._folder.iterdir() if path.name.isdigit())
