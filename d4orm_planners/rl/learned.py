@@ -111,14 +111,13 @@ class LearnedPolicy(Policy):
     def _use(self, path: Path) -> None:
         self._path, self.training_time = path, None
         if path.suffix == ".zip":
-            self._actor: Network | SharedPolicy = from_sb3(
-                _load_zip(self.name, path), egocentric=self.config.egocentric
-            )
+            model = _load_zip(self.name, path)
+            self._actor: Network | SharedPolicy = from_sb3(model, egocentric=self.config.egocentric)
             return
-        self._actor = network = load_network(path)
-        self.training_time = network.training_time
+        network = load_network(path)
         if (algorithm := network.header.algorithm) != self.name:
             raise ValueError(f"policy file {path} was trained by {algorithm}; use make_policy({algorithm!r}, path=...)")
+        self._actor, self.training_time = network, network.training_time
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
