@@ -78,7 +78,7 @@ for _name, _path in {
     "i-mbd": "sampling.mbd:IterativeMBD",
     "ipopt": "baselines.ipopt:Ipopt",
     "mapf": "mapf.planner:MAPF",
-    "amswarm": "baselines.amswarm.planner:AMSwarm",
+    "amswarm": "baselines.amswarm:AMSwarm",
     "mmd": "baselines.mmd.planner:MMD",
 }.items():
     register_planner(_name, f"d4orm_planners.{_path}")

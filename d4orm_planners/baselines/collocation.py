@@ -5,23 +5,26 @@ M. Kelly, "An Introduction to Trajectory Optimization", SIAM Review, 2017.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from d4orm_env.core.arrays import Floats, IntArray
-from d4orm_env.core.lazy import load
+from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import inverse_initial_distance
 from d4orm_env.core.team import DEFAULT_RADIUS
 from d4orm_env.dynamics.collision import axis_gap
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, Ops
 from d4orm_env.dynamics.transition import TimeStep
-from d4orm_planners.baselines.ipopt_run import Expression, NonlinearProgram, Options, casadi, run_ipopt
+
+casadi: Any = LazyModule("casadi", "planner 'ipopt'", "ipopt")
+
+Expression: TypeAlias = Any
+"""CasADi's matrices, symbolic or of numbers; the library carries no types."""
 
 OBJECTIVE_SCALE = 10.0
 """Scale of the mean cost of a step, so that IPOPT's tolerance tells good motions from bad ones."""
@@ -77,29 +80,12 @@ class TeamProgram:
             for robot, model in enumerate(self.models)
         ]
 
-    def solve(
-        self,
-        guess: CollocatedMotion,
-        contacts: Contacts,
-        arrivals: IntArray,
-        options: Options,
-        should_stop: Callable[[], bool],
-    ) -> tuple[CollocatedMotion, str]:
-        """Solve from a guess, with robots at their goals by steps ``arrivals`` ``(K,)``, from which on they stay there.
-
-        ``should_stop`` is asked every hundredth of a second; it ends within a tenth, even where writing the program or
-        one of IPOPT's iterations takes longer.
+    def write(self, contacts: Contacts, arrivals: IntArray) -> tuple[dict[str, Expression], dict[str, Floats]]:
+        """The program as CasADi takes it, with robots at their goals from steps ``arrivals`` ``(K,)`` on.
 
         Returns:
-            The motion that IPOPT came to, feasible or not, and its word for how it ended.
+            Variables ``x``, cost ``f`` and constraints ``g``, each one column; and their bounds.
         """
-        write = partial(self._program, contacts, arrivals)
-        values, ended = run_ipopt(write, self._packed(guess), options, should_stop)
-        # IPOPT gives up where a function has no value; the guess is then the best there is.
-        return self._unpacked(values) if np.isfinite(values).all() else guess, ended
-
-    def _program(self, contacts: Contacts, arrivals: IntArray) -> NonlinearProgram:
-        """The program as CasADi takes it."""
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(arrivals), *self._contact_rows(contacts, arrivals)]
         sizes = [row.numel() for row, _, _ in rows]
@@ -110,7 +96,7 @@ class TeamProgram:
             "f": self._cost(),
             "g": ca.vertcat(*(ca.vec(row) for row, _, _ in rows)),
         }
-        return NonlinearProgram(functions, {"lbx": lowest, "ubx": highest, "lbg": lower, "ubg": upper})
+        return functions, {"lbx": lowest, "ubx": highest, "lbg": lower, "ubg": upper}
 
     def contacts(self, motion: CollocatedMotion, lookout: float | None) -> Contacts:
         """Find what comes within ``lookout`` [m] of the distance to keep, and when; everything always, for ``None``."""
@@ -272,15 +258,16 @@ class TeamProgram:
         distances = np.array([[self._min_gap(robot)] for robot in range(problem.num_robots)])
         low.states[:, :, : problem.dimension] = problem.world.bounds[0] + distances
         high.states[:, :, : problem.dimension] = problem.world.bounds[1] - distances
-        return self._packed(low), self._packed(high)
+        return self.packed(low), self.packed(high)
 
-    def _packed(self, motion: CollocatedMotion) -> Floats:
+    def packed(self, motion: CollocatedMotion) -> Floats:
         """The values of the variables, in the order of the program."""
         states = [motion.states[1:, robot, : unit.size] / unit for robot, unit in enumerate(self.units[0])]
         controls = [motion.controls[:, robot, : unit.size] / unit for robot, unit in enumerate(self.units[1])]
         return np.concatenate([part.ravel() for part in (*states, *controls)])
 
-    def _unpacked(self, values: Floats) -> CollocatedMotion:
+    def unpacked(self, values: Floats) -> CollocatedMotion:
+        """The motion that these values of the variables are."""
         problem = self.problem
         states = np.zeros((problem.horizon + 1, problem.num_robots, problem.state_size))
         states[0] = problem.start

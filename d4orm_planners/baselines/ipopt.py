@@ -1,22 +1,31 @@
-"""Numerical optimisation with IPOPT: the rival of the paper's section IV-B."""
+"""Numerical optimisation with IPOPT, through CasADi: the rival of the paper's section IV-B.
+
+A. Waechter and L. T. Biegler, "On the Implementation of an Interior-Point Filter Line-Search Algorithm for Large-Scale
+Nonlinear Programming", Mathematical Programming, 2006.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from threading import Event
 from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
 
+from d4orm_env.core.arrays import IntArray
 from d4orm_env.core.lazy import load
 from d4orm_env.core.seeds import Stream
 from d4orm_planners.base.candidate import Candidate, evaluate_controls
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Positive
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, TeamProgram
-from d4orm_planners.baselines.ipopt_run import casadi
+from d4orm_planners.baselines.collocation import CollocatedMotion, Contacts, Expression, TeamProgram, casadi
 from d4orm_planners.tracking.steering import prepare_drives, straight_drives
+
+Options = Mapping[str, object]
 
 FOUND = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 """IPOPT's words for a solution of the program."""
@@ -27,8 +36,17 @@ OUT_OF_TIME = "No_Time_After_Warm_Start"
 NEARLY_SOLVED = 1e-2
 """IPOPT's first barrier parameter in a round that begins where the last one ended."""
 
-
-SolverIterations = Annotated[Count, Field(le=2**31 - 1)]  # IPOPT's own counter
+FEASIBILITY = 1e-5
+"""Largest violation of a constraint that IPOPT may leave, in the program's units; the clearance makes up for it."""
+IPOPT = {"print_level": 0, "sb": "yes", "constr_viol_tol": FEASIBILITY}
+CASADI = {"print_time": False, "show_eval_warnings": False}
+"""Options of every solve."""
+ABANDONED = "Abandoned_At_Time_Limit"
+"""Status of a run that was left before IPOPT could end it."""
+LOOK = 0.01
+"""Period of asking the caller whether to stop [s]."""
+GRACE = 0.05
+"""Time that work which was asked to end is waited for [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +75,7 @@ class IpoptConfig(PlannerConfig):
     clearance: NotNegative = 0.02
     tolerance: Positive = 1e-3
     barrier: Positive = 1.0
-    solver_iterations: SolverIterations = 1000
+    solver_iterations: Annotated[Count, Field(le=2**31 - 1)] = 1000  # IPOPT's own counter
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +126,7 @@ class Ipopt(Planner):
         for _ in range(config.rounds):
             if best is not None and search.should_stop():
                 break
-            motion, note = program.solve(motion, contacts, arrivals, options, search.should_stop)
+            motion, note = solve_program(program, motion, contacts, arrivals, options, search.should_stop)
             candidate = evaluate_controls(search.engine, problem, motion.controls.astype(np.float32))
             if best is None or candidate.rank > best.rank:
                 best = candidate
@@ -136,7 +154,7 @@ class Ipopt(Planner):
             prepare_drives(problem)
         straight = evaluate_controls(search.engine, problem, straight_drives(problem).controls[:, :, 0])
         arrivals = np.full(problem.num_robots, problem.horizon)
-        return program.solve(_motion(straight), {}, arrivals, self._options(), search.should_stop)[0]
+        return solve_program(program, _motion(straight), {}, arrivals, self._options(), search.should_stop)[0]
 
     def _perturbed(self, search: SolveRun, program: TeamProgram, warm_start: CollocatedMotion) -> CollocatedMotion:
         random = np.random.default_rng(search.iteration_seed(Stream.PERTURBATION))
@@ -165,3 +183,80 @@ def _union(contacts: Contacts, more: Contacts) -> Contacts:
 
 def _size(contacts: Contacts) -> int:
     return sum(map(len, contacts.values()))
+
+
+def solve_program(
+    program: TeamProgram,
+    guess: CollocatedMotion,
+    contacts: Contacts,
+    arrivals: IntArray,
+    options: Options,
+    should_stop: Callable[[], bool],
+) -> tuple[CollocatedMotion, str]:
+    """Solve from a guess, with robots at their goals by steps ``arrivals`` ``(K,)``, from which on they stay there.
+
+    ``should_stop`` is asked every hundredth of a second; it ends within a tenth, even where writing the program or one
+    of IPOPT's iterations takes longer.
+
+    Returns:
+        The motion that IPOPT came to, feasible or not, and its word for how it ended.
+    """
+    start = reached = program.packed(guess)
+
+    def keep(values: Expression) -> None:
+        nonlocal reached
+        reached = values
+
+    def run(ends: Callable[[], bool]) -> str:
+        functions, bounds = program.write(contacts, arrivals)
+        stopper = _stopper({name: part.numel() for name, part in functions.items()}, keep, ends)
+        settings = {"ipopt": {**IPOPT, **options}, **CASADI, "iteration_callback": stopper}
+        solver = casadi.nlpsol("team", "ipopt", functions, settings)
+        keep(solver(x0=start, **bounds)["x"])
+        return str(solver.stats()["return_status"])
+
+    ended = _run_or_abandon(run, should_stop)
+    values = np.asarray(reached).ravel()
+    # IPOPT gives up where a function has no value; the guess is then the best there is.
+    return program.unpacked(values) if np.isfinite(values).all() else guess, ended
+
+
+def _run_or_abandon(work: Callable[[Callable[[], bool]], str], should_stop: Callable[[], bool]) -> str:
+    """Run work that releases the interpreter's lock in a thread; :data:`ABANDONED` if it does not end in time.
+
+    Ctrl-C reaches the caller at once. What was abandoned ends when it next asks; the process waits for that.
+    """
+    ending = Event()
+    pool = ThreadPoolExecutor(1)
+    try:
+        future = pool.submit(work, ending.is_set)
+        while not should_stop():
+            if wait([future], LOOK).done:
+                return future.result()
+        ending.set()
+        return future.result() if wait([future], GRACE).done else ABANDONED
+    finally:
+        ending.set()
+        pool.shutdown(wait=False)
+
+
+def _stopper(sizes: dict[str, int], keep: Callable[[Expression], None], ends: Callable[[], bool]) -> Expression:
+    """Return a callback for IPOPT, after every iteration of a program of these sizes, to end it at ``ends()``."""
+
+    class Stopper(casadi.Callback):
+        def __init__(self) -> None:
+            casadi.Callback.__init__(self)
+            self.construct("stopper", {})
+
+        def get_n_in(self) -> int:
+            return casadi.nlpsol_n_out()
+
+        def get_sparsity_in(self, index: int) -> Expression:
+            size = sizes.get(casadi.nlpsol_out(index).removeprefix("lam_"), 0)
+            return casadi.Sparsity.dense(size, min(size, 1))
+
+        def eval(self, arguments: Expression) -> list[int]:
+            keep(arguments[0])
+            return [int(ends())]
+
+    return Stopper()

@@ -37,9 +37,6 @@ CORNERS = 16
 """Corners of the polygons that stand for round obstacles and robots at rest."""
 
 
-Neighbors = Annotated[Whole, Field(ge=0, le=10**6)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class OrcaConfig(CheckedSettings):
     """Settings of :class:`Orca`.
@@ -59,7 +56,7 @@ class OrcaConfig(CheckedSettings):
     time_horizon: Positive = 1.0
     obstacle_time_horizon: Positive = 1.0
     neighbor_distance: Positive = 100.0
-    max_neighbors: Neighbors = 10
+    max_neighbors: Annotated[Whole, Field(ge=0, le=10**6)] = 10
     clearance: NotNegative | None = None
     shortest_paths: bool = True
     deviation: NotNegative = 0.1

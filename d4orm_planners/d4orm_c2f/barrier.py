@@ -76,8 +76,7 @@ class Barriers(NamedTuple):
     def missing(self, velocities: Floats) -> Floats:
         """``(R,)`` violations of the barriers by velocities ``(K, d)``, negative for none [m/s]."""
         padded = np.vstack([velocities, np.zeros((1, velocities.shape[1]))])
-        missing: Floats = self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
-        return missing
+        return self.least - (self.normals * (padded[self.one] - padded[self.other])).sum(axis=1)
 
 
 def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, speed_slack: float) -> Barriers:
@@ -98,7 +97,8 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
             least = -PARTING * room
         rows.append((one, other, normal, least + speed))
 
-    reaction, near = problem.dt if speed_slack else 0.0, _near(problem)
+    reaction = problem.dt if speed_slack else 0.0
+    near = NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
     offsets = positions[:, None] - positions
     separation = np.linalg.norm(offsets, axis=2)
     for i, j in np.argwhere(np.triu((separation > 0) & (separation < near) & (free[:, None] | free))).tolist():
@@ -119,12 +119,6 @@ def _barriers(problem: Problem, joint: JointState, free: BoolArray, gap: float, 
     return Barriers(
         np.array(one, np.int64), np.array(other, np.int64), np.array(normals).reshape(-1, d), np.array(least, float)
     )
-
-
-def _near(problem: Problem) -> float:
-    """Range of the barriers [m]."""
-    speed, acceleration = (problem.team.limits[:, limit].astype(np.float64) for limit in (SPEED, ACCELERATION))
-    return NEAR * problem.team.largest_radius + STOPS * float((speed**2 / (2 * acceleration)).max())
 
 
 @cached_kernel(variant="nearest", **OPTIONS)

@@ -18,6 +18,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     STUCK_AFTER,
     WAITING_WITHIN,
     CoarsePlan,
+    CoarsePlanning,
     CoarseWaypoints,
     StagnationMonitor,
     coarse_problem,
@@ -28,7 +29,6 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     subgoal_indices,
     visible_subgoals,
 )
-from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import SamplingEngine
 from d4orm_planners.mapf.planner import relay_paths
@@ -42,9 +42,6 @@ class CoarsePlanTracker:
     """Leads a team through an episode.
 
     Args:
-        problem: The problem of the episode.
-        config: The settings.
-        seed: Of the episode.
         refiner: Engine of refinements.
         background: Thread that they are made in, if not between control loops.
         replanning: Thread that plans anew where loops have a deadline.
@@ -221,8 +218,7 @@ class CoarsePlanTracker:
         """``(K,)`` robots that are on time, or ahead of the team, and so have to wait."""
         due = self.guidance.path[min(self.index, len(self.guidance.path) - 1)]
         away = np.linalg.norm(joint.states[:, : self.problem.dimension] - due, axis=1)
-        waiting: BoolArray = (away < WAITING_WITHIN * self.problem.team.largest_radius) | (self._indices > self.index)
-        return waiting
+        return (away < WAITING_WITHIN * self.problem.team.largest_radius) | (self._indices > self.index)
 
     def _is_lost(self, joint: JointState, moving: BoolArray) -> bool:
         """Check whether the robots under way are far from their waypoints, at the end of the path, or get no nearer."""
@@ -239,10 +235,7 @@ class CoarsePlanTracker:
     def _away(self, joint: JointState) -> FloatArray:
         """``(K,)`` distances of the robots from their waypoints [m]."""
         positions = joint.states[:, : self.problem.dimension]
-        away: FloatArray = np.linalg.norm(
-            positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1
-        )
-        return away
+        return np.linalg.norm(positions - self.guidance.path[self._indices, np.arange(len(positions))], axis=1)
 
     def refine(self, step: int, due: bool) -> bool:
         """Accept a finished refinement, and begin another if that is ``due``; whether one was accepted."""

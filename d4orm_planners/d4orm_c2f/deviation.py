@@ -56,8 +56,7 @@ class StateFilter:
         ahead = (walk + np.sqrt(walk**2 + 4 * walk * noise)) / 2
         believed = np.maximum(ahead / np.maximum(ahead + noise, np.finfo(np.float64).tiny), MIN_FILTER_GAIN)
         known = (count >= MIN_DIFFERENCES) & (noise > MIN_NOISE_SHARE * total)
-        gains: Floats = np.where(known, believed, 1.0)
-        return gains
+        return np.where(known, believed, 1.0)
 
     def update(self, measured: FloatArray, led_to: FloatArray, expected: FloatArray, going: BoolArray) -> FloatArray:
         """``(K, n)`` the states; ``measured`` itself as long as nothing tells of noise.
@@ -105,8 +104,6 @@ class Deviation:
     """Compares an episode with the model.
 
     Args:
-        problem: The robots.
-        engine: Engine for rollouts.
         config: The settings, which say what is estimated.
         docks: Whether robots stay at their goals, rather than drive through them to others.
 

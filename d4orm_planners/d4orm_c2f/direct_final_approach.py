@@ -128,11 +128,9 @@ def _keeps_clear(window: Problem, positions: FloatArray, robots: IntArray, arriv
 
 def _no_nearer(gaps: Floats, window: Problem) -> BoolArray:
     """``(...)`` bool: no gap of ``(T, ...)`` is less than the margin, or than the first one if that is less [m]."""
-    keeps: BoolArray = (gaps >= np.minimum(gaps[0] - window.rounding, window.margin)).all(axis=0)
-    return keeps
+    return (gaps >= np.minimum(gaps[0] - window.rounding, window.margin)).all(axis=0)
 
 
 def _arrival_times(trajectory: Trajectory) -> IntArray:
     """``(K,)`` time steps until each robot arrives; ``H + 1`` for one that does not."""
-    steps: IntArray = (~trajectory.arrived).sum(axis=0)
-    return steps
+    return (~trajectory.arrived).sum(axis=0)

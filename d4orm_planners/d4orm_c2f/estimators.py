@@ -47,11 +47,8 @@ class ActuatorGainEstimator:
     disturbances: predictive control with restricted constraints, Automatica 37, 2001). Noise comes to nothing on
     average: a mean that may be chance is not kept back.
 
-    Args:
-        problem: The robots, with the limits that are believed at first.
-
     Attributes:
-        problem: The same with the limits of speed, acceleration and turn rate that are believed now.
+        problem: The robots with the limits of speed, acceleration and turn rate that are believed now.
         added: ``(K, m)`` what is added to commands for some time; zero where it may be chance.
     """
 

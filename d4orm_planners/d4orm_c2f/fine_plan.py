@@ -46,9 +46,6 @@ class Window:
     """Plans finely over the prediction horizon, from wherever the robots are.
 
     Args:
-        problem: The problem of the episode.
-        config: The settings.
-        engine: Engine for rollouts and samples.
         docks: Whether robots stay at their goals, rather than drive through them to others.
 
     Attributes:
@@ -98,8 +95,7 @@ class Window:
 
     def _near_goals(self, now: Situation) -> BoolArray:
         """``(K,)`` robots whose subgoal is within the goal radius of the goal."""
-        near: BoolArray = np.linalg.norm(now.subgoals - now.joint.goals, axis=1) <= self.problem.goal_radius
-        return near
+        return np.linalg.norm(now.subgoals - now.joint.goals, axis=1) <= self.problem.goal_radius
 
     def _task(self, now: Situation) -> SamplingTask:
         """The deformation of the base towards the subgoals, or towards goals where these are near."""
@@ -209,8 +205,7 @@ class Window:
             return np.zeros(self.problem.num_robots, bool)
         away = np.linalg.norm(trajectory.positions[1:, :, None] - bodies.positions[:, None], axis=3)
         safety_distance = np.asarray(self.problem.team.radius)[:, None] + bodies.radius + margin
-        meets: BoolArray = (away <= safety_distance).any(axis=(0, 2))
-        return meets
+        return (away <= safety_distance).any(axis=(0, 2))
 
     def touching(self, joint: JointState, arrived: BoolArray, controls: FloatArray, gap: float) -> BoolArray:
         """``(K,)`` robots within a gap [m] of anything if all execute ``controls`` ``(T, K, m)``, and a stop."""
@@ -245,5 +240,4 @@ def _gaps(positions: FloatArray, radius: FloatArray, first: IntArray, second: In
     gap2 = np.zeros((len(positions), len(first)), positions.dtype)
     for axis in range(positions.shape[2]):
         gap2 += (positions[:, first, axis] - positions[:, second, axis]) ** 2
-    gaps: FloatArray = np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]
-    return gaps
+    return np.sqrt(gap2.min(axis=0)) - radius[first] - radius[second]

@@ -41,26 +41,16 @@ NEARLY = 1e-3
 
 @dataclass(frozen=True)
 class LoopRecord:
-    """Record of one control loop.
+    """Record of one control loop."""
 
-    Attributes:
-        step: The environment's step at which it began.
-        wall_time: Time used [s].
-        subgoal_index: Waypoint of the guidance that the team headed for.
-        predicted_margin: Least gap between the surfaces of any two robots over the prediction [m]; infinite for one
-            robot.
-        missed: Whether it took longer than the deadline, so that the last plan went on.
-        replanned: Whether the guidance was planned anew.
-        refined: Whether a refined guidance was taken over.
-    """
-
-    step: int
-    wall_time: float
-    subgoal_index: int
+    step: int  #: The environment's step at which it began
+    wall_time: float  #: Time used [s]
+    subgoal_index: int  #: Waypoint of the guidance that the team headed for
+    #: Least gap between the surfaces of any two robots over the prediction [m]; infinite for one robot
     predicted_margin: float
-    missed: bool
-    replanned: bool
-    refined: bool
+    missed: bool  #: Whether it took longer than the deadline, so that the last plan went on
+    replanned: bool  #: Whether the guidance was planned anew
+    refined: bool  #: Whether a refined guidance was taken over
 
 
 class D4ormC2F(StatePolicy):

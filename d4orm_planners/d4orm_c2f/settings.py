@@ -10,10 +10,6 @@ from pydantic import Field
 from d4orm_planners.base.settings import Count, EngineName, NotNegative, Positive, Samples, Steps, Whole, one_of
 from d4orm_planners.sampling.settings import PAPER, DiffusionSettings, SoftmaxSettings
 
-Credit = Annotated[str, one_of(("robot", "team"))]
-CoarsePreset = Annotated[str, one_of(("paper",))] | None
-Refinement = Annotated[str, one_of(("background", "sync", "off"))]
-
 PAPER_CONTROL = {
     "coarse_samples": PAPER["num_samples"],
     "coarse_steps": PAPER["num_steps"],
@@ -108,7 +104,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     coarse_samples: Samples = 256
     coarse_steps: Steps = 50
     coarse_repair_steps: Steps = 20
-    coarse_preset: CoarsePreset = None
+    coarse_preset: Annotated[str, one_of(("paper",))] | None = None
     warm_start: str | None = None
     coarse_iterations: Count = 20
     replan_iterations: Count = 2
@@ -120,7 +116,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     line_of_sight: bool = True
     num_samples: Samples = 128
     num_steps: Steps = 20
-    credit: Credit = "robot"
+    credit: Annotated[str, one_of(("robot", "team"))] = "robot"
     penalty: Positive = 10.0
     normalise_distance: bool = False
     safe_mix: bool = True
@@ -133,7 +129,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     expect_losses: bool = True
     stalls: bool = True
     last_resort: bool = True
-    refine: Refinement = "background"
+    refine: Annotated[str, one_of(("background", "sync", "off"))] = "background"
     refine_every: Count = 5
     replan: bool = True
     replan_distance: Positive = 10.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
@@ -35,8 +36,6 @@ class Evaluator:
     """Evaluates candidates, and remembers some.
 
     Args:
-        engine: Engine for rollouts.
-        problem: The problem.
         remembered: Candidates of this process's own nodes that are remembered.
 
     Attributes:
@@ -87,9 +86,6 @@ class Inbox:
     """Takes messages from a transport; nothing that arrives makes it raise.
 
     Args:
-        evaluator: Evaluator of the candidates.
-        transport: Transport of the messages.
-        num_nodes: Number of nodes.
         own: The node that it belongs to, or ``None`` for an observer's.
         heard: Nodes whose messages reach it; ``None`` for all.
 
@@ -98,6 +94,7 @@ class Inbox:
         dropped: Numbers of messages that were dropped, by :data:`~d4orm_planners.d_d4orm.transport.KINDS`.
         false_claims: Candidates that were not what their sender claimed. They count for what they are.
         namesake: The number of the last candidate that another node sent under this one's own number, or ``None``.
+        waited: Seconds spent so far waiting for messages.
     """
 
     def __init__(
@@ -117,11 +114,14 @@ class Inbox:
         self.dropped: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
         self.false_claims = 0
         self.namesake: int | None = None
+        self.waited = 0.0
 
     def receive(self, timeout: float = 0.0) -> list[Report]:
         """The new reports among what has arrived, by node; waits up to ``timeout`` [s] if nothing has."""
-        messages = []
-        for data in self._transport.collect(timeout):
+        messages, begin = [], time.perf_counter()
+        arrived = self._transport.collect(timeout)
+        self.waited += time.perf_counter() - begin
+        for data in arrived:
             try:
                 message = self._decoded(data)
             except MessageError as error:
@@ -266,5 +266,4 @@ def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, genera
 
 def _square_distances(points: Floats, centres: Floats) -> Floats:
     """``(n, c)``."""
-    gap2: Floats = ((points[:, None] - centres[None]) ** 2).sum(axis=2)
-    return gap2
+    return ((points[:, None] - centres[None]) ** 2).sum(axis=2)

@@ -1,10 +1,11 @@
-"""One node of D-D4orm: refine, broadcast, collect, choose (paper, Algorithm 5).
+"""One node of D-D4orm: refine, broadcast, collect, choose (paper, Algorithm 5); and its work in a thread.
 
 An observer may be told of all that it does, for timelines (section VIII-D).
 """
 
 from __future__ import annotations
 
+import atexit
 import threading
 import time
 from collections.abc import Callable
@@ -17,15 +18,17 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.base.candidate import Candidate
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d_d4orm.inbox import TOLERANCE, Evaluator, Inbox, choose
-from d4orm_planners.d_d4orm.transport import Message, TrafficStats, Transport, encode
+from d4orm_planners.d_d4orm.inbox import TOLERANCE, Evaluator, Inbox, Stopped, choose
+from d4orm_planners.d_d4orm.transport import Message, Transport, encode
 
 KINDS = ("computed", "sent", "received", "selected")
 """A node has made a candidate, sent it, got one, or chosen it to go on from."""
 
-
 RESEND = 0.2
 """Seconds after which a candidate is sent again, as messages may get lost."""
+
+LAST_WAIT = 30.0
+"""Seconds that the end of the process waits for an abandoned thread: native code must not be interrupted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +75,7 @@ class Node:
 
     Args:
         number: Its number, from 0.
-        task: Common task of the nodes.
         planner: Planner that refines its candidate.
-        transport: Its access to the others.
         evaluator: Evaluator, in common with other nodes of this process.
         sequence: The number before that of its first message; more than any that it sent before, if it did, and on a
             network the time at which it began, by which two nodes of one number know which was first.
@@ -83,8 +84,9 @@ class Node:
     Attributes:
         search: Its own search.
         candidate: The candidate that it made last.
-        transport: Transport of its messages, with a count.
         inbox: Messages of the others.
+        messages: Messages sent so far; each goes to all other nodes.
+        message_bytes: Their length together.
         excluded: Samples left out so far because their reward was not finite.
     """
 
@@ -103,9 +105,10 @@ class Node:
         self.search = SolveRun(planner, evaluator.problem, seed, task.controls, evaluator.engine, evaluator.own)
         self.search.cancelled = evaluator.stop
         self.candidate = self.search.current
-        self.transport = TrafficStats(transport)
+        self.messages = self.message_bytes = 0
+        self._transport = transport
         self._others = task.heard_by(number)
-        self.inbox = Inbox(evaluator, self.transport, task.num_nodes, number, self._others)
+        self.inbox = Inbox(evaluator, transport, task.num_nodes, number, self._others)
         self.excluded = 0
         self._task = task
         self._sequence = self._began = sequence
@@ -125,16 +128,12 @@ class Node:
         self._gather()
         self._choose()
 
-    def run(self, stop: threading.Event, timeout: float, improve: bool) -> None:
-        """Refine and exchange until asked to stop, or until there is a solution unless it is to be improved.
-
-        It waits for the others no longer than ``timeout`` [s].
-        """
-        while self.step(stop, timeout, improve):
-            pass
-
     def step(self, stop: threading.Event, timeout: float, improve: bool) -> bool:
-        """One round of :meth:`run`; True if there is to be another one."""
+        """Refine and exchange at its own pace, waiting for the others no longer than ``timeout`` [s].
+
+        Returns:
+            Whether to go on: not if asked to stop, nor with a solution unless it is to be improved.
+        """
         self.refine()
         if stop.is_set() or self.search.time_left == 0 or (self.search.best.solved and not improve):
             return False
@@ -181,7 +180,9 @@ class Node:
         self._sequence += 1
         message = Message(self.number, self._sequence, candidate.planned, candidate.reward, bool(candidate.solved))
         data = encode(message, self.search.problem)
-        self.transport.publish(data)
+        self._transport.publish(data)
+        self.messages += 1
+        self.message_bytes += len(data)
         self._note("sent", self.number, self._sequence, candidate, size=len(data))
 
     def _all_have(self, candidate: Candidate) -> bool:
@@ -240,3 +241,59 @@ class Node:
             now = time.perf_counter()
             start = now if begin is None else begin
             self._observer(Event(self.number, kind, start, now, of, sequence, candidate, size))
+
+
+class ThreadJob:
+    """Work of a node, to be done in a thread of its own; an exception is kept instead of lost."""
+
+    def __init__(self, node: Node, work: Callable[[Node], object]) -> None:
+        self.node = node
+        self.error: Exception | None = None
+        self._work = work
+        self._begin: float | None = None
+        self._end: float | None = None
+        self._over = threading.Event()
+        # A node that hangs must not keep the process from ending for ever.
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"d-d4orm-{node.number}")
+
+    def start(self) -> None:
+        """Begin.
+
+        Ctrl-C may come while the thread starts, so the pool must know of this job before.
+        """
+        self._begin = time.perf_counter()
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._work(self.node)
+        except Stopped:
+            pass
+        except Exception as error:  # whatever it is, it concerns this node only
+            self.error = error
+        finally:
+            self._end = time.perf_counter()
+            self._over.set()
+
+    @property
+    def running(self) -> bool:
+        """True if it has begun and is not over."""
+        return self._begin is not None and not self._over.is_set()
+
+    @property
+    def seconds(self) -> float:
+        """Time that it has taken."""
+        if self._begin is None:
+            return 0.0
+        return (self._end or time.perf_counter()) - self._begin
+
+    def wait(self, timeout: float | None) -> None:
+        """Wait while it runs, no longer than ``timeout`` [s]."""
+        # A thread whose start was interrupted cannot be joined before it has run.
+        if self._begin is not None and self._over.wait(timeout):
+            self._thread.join()
+
+    def leave(self) -> None:
+        """Wait for it no longer, except at the end of the process."""
+        if self.running:
+            atexit.register(self.wait, LAST_WAIT)

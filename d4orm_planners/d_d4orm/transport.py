@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 import threading
-import time
 import zlib
 from collections import deque
 from dataclasses import dataclass
@@ -212,33 +211,3 @@ class LocalNetwork:
             ends = [end for end in self._ends if end is not sender]
         for end in ends:
             end.put(data)
-
-
-class TrafficStats:
-    """A transport that counts.
-
-    Attributes:
-        messages: Messages published so far; each goes to all other nodes.
-        message_bytes: Their length together.
-        waited: Seconds spent in :meth:`collect` so far.
-    """
-
-    def __init__(self, transport: Transport) -> None:
-        self.messages = self.message_bytes = 0
-        self.waited = 0.0
-        self._transport = transport
-
-    def publish(self, data: bytes) -> None:
-        self._transport.publish(data)
-        self.messages += 1
-        self.message_bytes += len(data)
-
-    def collect(self, timeout: float = 0.0) -> list[bytes]:
-        begin = time.perf_counter()
-        try:
-            return self._transport.collect(timeout)
-        finally:
-            self.waited += time.perf_counter() - begin
-
-    def close(self) -> None:
-        self._transport.close()

@@ -209,12 +209,12 @@ MOST_WAITING = 100
 
 
 class CommandQueue:
-    """Commands from any threads for one that executes them."""
+    """Commands from any threads for one that executes them, until it is ``closed``."""
 
     def __init__(self) -> None:
         self._waiting: dict[object, Command] = {}
         self._changed = threading.Condition()
-        self._closed, self._dropped = False, 0
+        self.closed, self._dropped = False, 0
 
     def put(self, command: Command, setting: str | None = None) -> None:
         """Add a command; it takes the place of one for the same setting that waits. Beyond so many it is dropped."""
@@ -229,7 +229,7 @@ class CommandQueue:
     def take(self) -> Command | None:
         """The command that has waited longest; ``None`` where there is none, or the queue is closed."""
         with self._changed:
-            if self._closed or not self._waiting:
+            if self.closed or not self._waiting:
                 return None
             return self._waiting.pop(next(iter(self._waiting)))
 
@@ -242,18 +242,13 @@ class CommandQueue:
     def wait(self, timeout: float) -> None:
         """Until there is a command, the queue is closed, or so many seconds have passed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._waiting, timeout)
+            self._changed.wait_for(lambda: self.closed or self._waiting, timeout)
 
     def close(self) -> None:
         """Wake waiting calls; there is nothing to take any more."""
         with self._changed:
-            self._closed = True
+            self.closed = True
             self._changed.notify_all()
-
-    @property
-    def closed(self) -> bool:
-        """True if it was closed."""
-        return self._closed
 
     @property
     def empty(self) -> bool:

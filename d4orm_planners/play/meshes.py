@@ -146,23 +146,14 @@ HEIGHT, MARGIN_HEIGHT = 0.5, 0.1
 
 
 class BodyGroup(NamedTuple):
-    """Bodies of one shape.
+    """Bodies of one shape."""
 
-    Attributes:
-        name: Of the instances.
-        bodies: ``(N,)`` numbers among the team's bodies.
-        robots: ``(N,)`` whose they are.
-        mesh: Their shape.
-        scales: ``(N, 3)``.
-        margin: Their shape with the margin, and the scales of that.
-    """
-
-    name: str
-    bodies: NDArray[np.intp]
-    robots: NDArray[np.intp]
-    mesh: trimesh.Trimesh
-    scales: FloatArray
-    margin: tuple[trimesh.Trimesh, FloatArray]
+    name: str  #: Of the instances
+    bodies: NDArray[np.intp]  #: ``(N,)`` numbers among the team's bodies
+    robots: NDArray[np.intp]  #: ``(N,)`` whose they are
+    mesh: trimesh.Trimesh  #: Their shape
+    scales: FloatArray  #: ``(N, 3)``
+    margin: tuple[trimesh.Trimesh, FloatArray]  #: Their shape with the margin, and the scales of that
 
 
 def body_groups(problem: Problem) -> list[BodyGroup]:

@@ -112,7 +112,6 @@ class MessageValidator:
     """Lets those messages of a page come through that ask for what it offers.
 
     Args:
-        server: The page.
         refuse: Called with the reason when a page asks for anything else.
     """
 

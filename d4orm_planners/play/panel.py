@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import viser
@@ -21,9 +21,8 @@ from d4orm_env.scenarios.schema import parse
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.play import edits
 from d4orm_planners.play.origin_check import LARGEST_UPLOAD
-from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
-from d4orm_planners.play.sliders import DisturbanceSliders
+from d4orm_planners.play.viewport import Frame
 
 if TYPE_CHECKING:
     from d4orm_planners.play.playground import View
@@ -41,6 +40,37 @@ POLICIES = {
 
 MODELS = ("scenario's own", "holonomic2d", "velocity2d", "differential_drive", "unicycle", "car", "holonomic3d")
 OWN_MODEL = MODELS[0]
+
+
+class Levels(NamedTuple):
+    """Levels of one disturbance that a slider offers."""
+
+    label: str  #: Its name on the page, with its unit
+    low: float  #: Least level
+    high: float  #: Greatest level
+    step: float  #: Between levels
+    off: float  #: The level at which nothing goes wrong
+
+
+SLIDERS = {
+    "control_noise": Levels("Noise on controls", 0.0, 1.0, 0.02, 0.0),
+    "correlated_noise": Levels("Slow noise on controls", 0.0, 1.0, 0.02, 0.0),
+    "bias": Levels("Bias of controls", 0.0, 0.5, 0.01, 0.0),
+    "gain": Levels("Gain of controls off by", 0.0, 0.8, 0.02, 0.0),
+    "quantisation": Levels("Controls rounded to", 0.0, 1.0, 0.05, 0.0),
+    "delay": Levels("Controls late [steps]", 0, 10, 1, 0),
+    "dropout": Levels("Controls lost", 0.0, 0.95, 0.05, 0.0),
+    "state_noise": Levels("Noise on positions seen [m]", 0.0, 0.2, 0.005, 0.0),
+    "state_delay": Levels("States seen late [steps]", 0, 10, 1, 0),
+    "occlusion": Levels("Sight [m]", 0.2, 10.0, 0.2, 10.0),
+    "push": Levels("Pushes per robot [1/s]", 0.0, 2.0, 0.05, 0.0),
+    "stall": Levels("Robots that stall", 0.0, 1.0, 0.05, 0.0),
+    "intruder": Levels("Intruders", 0, 8, 1, 0),
+    "drag": Levels("Drag [1/s]", 0.0, 2.0, 0.05, 0.0),
+    "limit_mismatch": Levels("Limits are truly times", 0.3, 1.5, 0.05, 1.0),
+}
+"""Sliders for what goes wrong, by name and attribute, see :mod:`~d4orm_env.disturbances.disturbance_registry`."""
+
 STATUS_EVERY = 0.2
 PUSH = 0.8
 """Velocity that a push gives a robot [m/s]."""
@@ -61,7 +91,7 @@ class Panel:
         with self._gui.add_folder("Who drives", expand_by_default=False):
             self._add_policies()
         with self._gui.add_folder("What goes wrong", expand_by_default=False):
-            self._sliders = DisturbanceSliders(server.gui, session)
+            self._add_disturbances()
         with self._gui.add_folder("Change the scene"):
             self._add_edits()
         with self._gui.add_folder("Another scene", expand_by_default=False):
@@ -86,7 +116,8 @@ class Panel:
         # The controls then say what is, unless a change waits that they show already.
         if refused != self._refused and not self._session.busy:
             self._refused = refused
-            self._sliders.follow()
+            for name, slider in self._sliders.items():
+                slider.value = self._session.levels.get(name, SLIDERS[name].off)
             for name, box in self._drivers.items():
                 box.value = name in self._session.policies
 
@@ -121,13 +152,34 @@ class Panel:
         if event.client is not None:  # a viewer's, not this program's
             self._session.choose(*(name for name, box in self._drivers.items() if box.value))
 
+    def _add_disturbances(self) -> None:
+        self._gui.add_markdown("From the next step on, the same for all that drive.")
+        self._sliders: dict[str, Any] = {name: self._gui.add_slider(*levels) for name, levels in SLIDERS.items()}
+
+        def disturb() -> None:
+            chosen = {name: slider.value for name, slider in self._sliders.items()}
+            self._session.disturb({name: level for name, level in chosen.items() if level != SLIDERS[name].off})
+
+        def turn(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+            if event.client is not None:  # a viewer's, not this program's
+                disturb()
+
+        def clear(_: object) -> None:
+            for name, slider in self._sliders.items():
+                slider.value = SLIDERS[name].off
+            disturb()
+
+        for slider in self._sliders.values():
+            slider.on_update(turn)
+        self._gui.add_button("Nothing").on_click(clear)
+
     def _add_edits(self) -> None:
         self._gui.add_markdown("Drag robots, goals and obstacles; drag a robot with Shift to push it.")
         changes: dict[str, edits.Edit] = {
-            "Add robot": self._drawn(edits.add_robot),
+            "Add robot": partial(edits.add_robot, random=self._random),
             "Remove robot": edits.remove_robot,
-            "Add disc": self._drawn(lambda scene, random: edits.add_obstacle(scene, "disc", random)),
-            "Add box": self._drawn(lambda scene, random: edits.add_obstacle(scene, "box", random)),
+            "Add disc": partial(edits.add_obstacle, kind="disc", random=self._random),
+            "Add box": partial(edits.add_obstacle, kind="box", random=self._random),
             "Remove obstacle": edits.remove_obstacle,
         }
         for name, change in changes.items():
@@ -138,10 +190,6 @@ class Panel:
         """Push the robot that is farthest from its goal, any way."""
         direction = self._random.normal(size=self._session.frame.problem.dimension)
         self._session.push(None, PUSH * direction / np.linalg.norm(direction))
-
-    def _drawn(self, change: Callable[[Problem, np.random.Generator], Problem]) -> edits.Edit:
-        """A change that draws at random, with other numbers each time."""
-        return lambda scene: change(scene, self._random)
 
     def _add_scenes(self) -> None:
         names = tuple(name for name in list_scenarios() if name != "map")

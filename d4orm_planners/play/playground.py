@@ -23,8 +23,8 @@ from d4orm_env.render.panels import view_limits
 from d4orm_planners.play.meshes import Points, in_space
 from d4orm_planners.play.origin_check import LOOPBACK, MessageValidator, OriginCheck
 from d4orm_planners.play.panel import THEME, Panel
-from d4orm_planners.play.scene_frame import Frame
 from d4orm_planners.play.session import Session
+from d4orm_planners.play.viewport import Frame
 from d4orm_planners.play.viewport_view import ViewportView
 
 GAP = 0.12
@@ -73,7 +73,6 @@ class View:
                 viewport.update(frame, now)
 
     def _rebuild(self, frames: tuple[Frame, ...]) -> None:
-        """Make all shapes anew."""
         limits = in_space(view_limits(frames[0].problem))
         positions = _positions(len(frames), limits)
         with self._server.atomic():

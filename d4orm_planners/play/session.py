@@ -22,8 +22,7 @@ from d4orm_env.core.summary_line import count
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render.replay import Replay
 from d4orm_planners.play.edits import MOST_WAITING, CommandQueue, Edit, followed, queued
-from d4orm_planners.play.scene_frame import Frame, Status
-from d4orm_planners.play.viewport import Drivers, EpisodeOptions, Viewport
+from d4orm_planners.play.viewport import Drivers, EpisodeOptions, Frame, Status, Viewport
 
 _IDLE = 0.1
 _MOST_EDITING = 0.25

@@ -1,4 +1,7 @@
-"""One of the policies that drive the same scene side by side: its team, in an episode that goes on and is recorded."""
+"""One of the policies that drive the same scene side by side: its team, in an episode that goes on and is recorded.
+
+A frame of it is what the page shows.
+"""
 
 from __future__ import annotations
 
@@ -24,16 +27,62 @@ from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.policy import Policy
 from d4orm_planners.play.edits import check_robot
-from d4orm_planners.play.scene_frame import Frame, Status, closest_approach, guidance, plan
 
 MOST_STEPS = 6000
 """Ten minutes at the usual time step; what is older is forgotten."""
-
-
 MOST_CYCLES = 10_000_000
 """Steps of an episode that ends only when it is changed."""
 HORIZON = "predict_horizon"
 """Setting of policies that look ahead."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Common status of all that drive side by side."""
+
+    generation: int  #: Counts changes of team, world and policies
+    number: int  #: Counts moments
+    time: float  #: Simulated seconds since the scene was made
+    since: float  #: ``time.perf_counter()`` when this moment began
+    pace: float  #: Seconds from one step to the next at this speed
+    state: str  #: ``"running"``, ``"paused"``, ``"planning"`` or ``"arrived"``
+    message: str  #: Last error, for people
+    refused: int  #: Counts what was asked for and could not be
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A moment of a team that a policy drives: read by the page while the session goes on."""
+
+    status: Status  #: Common status
+    policy: str  #: Name of what drives
+    problem: Problem  #: Team and world; its start and goals are those of the last change
+    states: FloatArray  #: ``(K, n)`` now
+    before: FloatArray  #: ``(K, d)`` positions a step ago [m]
+    goals: FloatArray  #: ``(K, d)`` [m]
+    arrived: BoolArray  #: ``(K,)``
+    collided: BoolArray  #: ``(K,)``
+    loop: float  #: Seconds that the policy took for this step
+    replanned: float  #: Seconds that it took to plan after the last change
+    closest: float  #: Least distance between surfaces [m], negative in contact
+    plan: FloatArray | None  #: ``(P, K, d)`` where the policy has just planned to lead the team, if it says so
+    guidance: FloatArray | None  #: ``(P, K, d)`` the coarse plan that it follows, likewise
+    subgoals: FloatArray | None  #: ``(K, d)`` what it heads for next, likewise
+    bodies: FloatArray  #: ``(N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what is no robot
+
+    def positions(self, now: float) -> FloatArray:
+        """``(K, d)`` where to draw the robots at a time of ``time.perf_counter()``: on their way here."""
+        return self.before + self._share(now) * (self.states[:, : self.problem.dimension] - self.before)
+
+    def body_positions(self, now: float) -> FloatArray:
+        """``(N, d)`` likewise for what is no robot."""
+        d = self.problem.dimension
+        return self.bodies[:, :d] - (1 - self._share(now)) * np.float32(self.problem.dt) * self.bodies[:, d : 2 * d]
+
+    def _share(self, now: float) -> np.float32:
+        """Return the share of the step before this moment that has been shown."""
+        status = self.status
+        return np.float32(min(max((now - status.since) / max(status.pace, 1e-3), 0.0), 1.0))
 
 
 class EpisodeBuffer:
@@ -202,12 +251,11 @@ class Viewport:
             goals=joint.goals,
             arrived=joint.arrived,
             collided=np.array(self._env.last_step.collided),
-            finished=self.finished,
             loop=self._loop,
             replanned=self._replanned,
             closest=closest_approach(self._scene, joint.states),
-            plan=plan(self._policy, joint.steps),
-            guidance=guidance(self._policy),
+            plan=_plan(self._policy, joint.steps),
+            guidance=_guidance(self._policy),
             subgoals=getattr(self._policy, "subgoals", None),
             bodies=self._bodies,
         )
@@ -226,3 +274,27 @@ class Viewport:
     def _remember(self) -> None:
         joint, last = self._joint, self._env.last_step
         self.recording.add(joint.states, joint.goals, joint.arrived, last.collided, last.margin_violated, self._bodies)
+
+
+def closest_approach(problem: Problem, states: FloatArray) -> float:
+    """Least distance between the surfaces of two robots, or of one and an obstacle or the bounds [m]."""
+    positions = states[:, : problem.dimension].astype(np.float64)
+    radius = np.asarray(problem.team.radius, np.float64)
+    least = float((problem.world.clearance(positions) - radius).min())
+    gaps = np.linalg.norm(positions[:, None] - positions, axis=2) - radius[:, None] - radius
+    gaps[np.diag_indices(len(positions))] = np.inf
+    return min(least, float(gaps.min()))
+
+
+def _plan(policy: object, steps: int) -> FloatArray | None:
+    """``(P, K, d)`` where a policy that predicts, or executes a plan, leads the team after so many steps."""
+    predicted, whole = getattr(policy, "predicted", None), getattr(policy, "plan", None)
+    if predicted is not None:
+        return np.asarray(predicted, np.float32)
+    return None if whole is None else np.asarray(whole.trajectory.positions[steps:], np.float32)
+
+
+def _guidance(policy: object) -> FloatArray | None:
+    """``(P, K, d)`` of a policy that follows a coarse plan."""
+    coarse = getattr(policy, "guidance", None)
+    return None if coarse is None else np.asarray(coarse.path, np.float32)

@@ -15,26 +15,10 @@ from numpy.typing import NDArray
 from d4orm_env.core.arrays import FloatArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.render.panels import robot_colors, view_limits
-from d4orm_planners.play import edits
-from d4orm_planners.play.meshes import (
-    NO_LINES,
-    BodyGroup,
-    PathLines,
-    Points,
-    ball,
-    body_groups,
-    body_positions,
-    edges,
-    goal_poses,
-    heading_lines,
-    in_space,
-    linear,
-    polylines,
-    puck,
-    solid,
-)
-from d4orm_planners.play.scene_frame import Frame
+from d4orm_planners.play import edits, meshes
+from d4orm_planners.play.meshes import BodyGroup, PathLines, Points, in_space, linear
 from d4orm_planners.play.session import Session
+from d4orm_planners.play.viewport import Frame
 
 Numbers: TypeAlias = NDArray[np.intp] | None
 """Numbers ``(N,)`` of what shapes stand for, where they are others than the shapes' own."""
@@ -79,16 +63,16 @@ class ViewportView:
         self._trail: list[FloatArray] = []
         self._paths = {name: PathLines(frame.problem) for name in ("plans", "guidance")}
         self._colors = self._own_colors = 255 * robot_colors(frame.problem.num_robots)
-        self._groups = body_groups(frame.problem)
+        self._groups = meshes.body_groups(frame.problem)
         self._positions: dict[str, Points] = {}
         self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=position)}
         self._add_team(frame)
         self._add_world(frame.problem)
         self._add_bodies(frame)
         for name, wide in {"heading": 2.0, **WIDTHS}.items():
-            color = INK if name == "heading" else NO_LINES[1]
+            color = INK if name == "heading" else meshes.NO_LINES[1]
             self._nodes[name] = self._scene.add_line_segments(
-                f"{self._root}/{name}", NO_LINES[0], color, thickness=wide, thickness_units="screen",
+                f"{self._root}/{name}", meshes.NO_LINES[0], color, thickness=wide, thickness_units="screen",
             )  # fmt: skip
 
     def name(self, text: str, position: Points) -> None:
@@ -114,7 +98,7 @@ class ViewportView:
         goals = self._with_held("goal", in_space(frame.goals))
         self._positions = {"robot": positions, "goal": goals}
         self._move_team(frame, positions)
-        nodes["heading"].points = heading_lines(frame.problem, frame.states, positions)
+        nodes["heading"].points = meshes.heading_lines(frame.problem, frame.states, positions)
         nodes["goals"].batched_positions = goals
         if len(frame.bodies):
             nodes["bodies"].batched_positions = in_space(frame.body_positions(now))
@@ -127,7 +111,7 @@ class ViewportView:
 
     def _move_team(self, frame: Frame, positions: Points) -> None:
         """Move all bodies, their robots to ``positions`` ``(K, 3)``."""
-        shown, turns = body_positions(frame.problem, frame.states, positions)
+        shown, turns = meshes.body_positions(frame.problem, frame.states, positions)
         for group in self._groups:
             margins = self._nodes[f"margins_{group.name}"]
             margins.visible = self._shown["margins"]
@@ -150,7 +134,7 @@ class ViewportView:
         flat = problem.dimension == 2
         mark, dot = 1.5 * radius if flat else 1.4 * radius, 0.35 * radius
         positions, goals = in_space(frame.positions(time.perf_counter())), in_space(frame.goals)
-        shown = body_positions(problem, frame.states, positions)[0]
+        shown = meshes.body_positions(problem, frame.states, positions)[0]
         for group in self._groups:
             at, colors = shown[group.bodies], self._colors[group.robots]
             self._add_many(group.name, group.mesh, at, group.scales, colors, 1.0)
@@ -159,16 +143,15 @@ class ViewportView:
                 group.name, "robot", lambda scene, index, at, _: edits.move_robot(scene, index, at), group.robots
             )
             self._drag_pushes(group)
-        diamond = puck(4, 0.2) if flat else ball(0)
+        diamond = meshes.puck(4, 0.2) if flat else meshes.ball(0)
         self._add_many("goals", diamond, goals, np.stack([mark] * 3, axis=1), self._colors, 0.6 if flat else 0.35)
-        self._add_many("subgoals", ball(0), positions, np.stack([dot] * 3, axis=1), self._colors, 0.9)
+        self._add_many("subgoals", meshes.ball(0), positions, np.stack([dot] * 3, axis=1), self._colors, 0.9)
         self._drag("goals", "goal", lambda scene, index, at, _: edits.move_goal(scene, index, at))
 
     def _add_bodies(self, frame: Frame) -> None:
-        """Add the dynamic obstacles."""
         if len(frame.bodies):
             radius = frame.bodies[:, -1]
-            mesh, high = (puck(24), 0.5 * radius) if frame.problem.dimension == 2 else (ball(2), radius)
+            mesh, high = (meshes.puck(24), 0.5 * radius) if frame.problem.dimension == 2 else (meshes.ball(2), radius)
             positions = in_space(frame.bodies[:, : frame.problem.dimension])
             self._add_many("bodies", mesh, positions, np.stack([radius, radius, high], axis=1), np.array(BODY), 1.0)
 
@@ -187,7 +170,9 @@ class ViewportView:
         floor, top = (low[0, 2], low[1, 2]) if problem.dimension == 3 else (0.0, 0.3)
         for kind in edits.KINDS:
             for index, shape in enumerate(getattr(problem.world, kind)):
-                mesh, centre = solid(kind, np.asarray(shape, np.float64), problem.dimension, float(floor), float(top))
+                mesh, centre = meshes.solid(
+                    kind, np.asarray(shape, np.float64), problem.dimension, float(floor), float(top)
+                )
                 name = f"{kind}_{index}"
                 self._nodes[name] = self._scene.add_mesh_simple(
                     f"{self._root}/{name}", np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32),
@@ -197,7 +182,7 @@ class ViewportView:
                 self._drag(name, name, partial(_move_obstacle, kind, index))
         if problem.world.lower is not None:
             self._nodes["bounds"] = self._scene.add_line_segments(
-                f"{self._root}/bounds", edges(in_space(problem.world.bounds)), BOUND,
+                f"{self._root}/bounds", meshes.edges(in_space(problem.world.bounds)), BOUND,
                 thickness=2.0, thickness_units="screen",
             )  # fmt: skip
 
@@ -280,16 +265,16 @@ class ViewportView:
         return 20 if self._shown["dark"] else 255
 
     def _draw_lines(self, frame: Frame) -> None:
-        lines = dict.fromkeys(WIDTHS, NO_LINES)
+        lines = dict.fromkeys(WIDTHS, meshes.NO_LINES)
         if len(self._trail) > 1 and self._shown["trails"]:
             trail = np.stack(self._trail)
             taken = np.linspace(0, len(trail) - 1, TRAIL_SEGMENTS + 1).round().astype(np.intp)
             knots = [np.unique(taken)] * trail.shape[1]
-            lines["trails"] = polylines(trail, self._colors, self._paper, (0.2, 1.0), knots)
+            lines["trails"] = meshes.polylines(trail, self._colors, self._paper, (0.2, 1.0), knots)
         for name, path, shades in (("plans", frame.plan, (1.0, 0.4)), ("guidance", frame.guidance, (0.8, 0.25))):
             if path is not None and len(path) > 1 and self._shown[name]:
                 lines[name] = self._paths[name].drawn(path, self._colors, self._paper, shades)
-        poses, owners = goal_poses(frame.problem, self._positions["goal"])
+        poses, owners = meshes.goal_poses(frame.problem, self._positions["goal"])
         lines["goal_poses"] = poses, linear(np.repeat(self._colors[owners][:, None], 2, axis=1))
         for name, (points, colors) in lines.items():
             self._nodes[name].points, self._nodes[name].colors = points, colors

@@ -1,6 +1,6 @@
 """The algorithms of Stable-Baselines3 that are used here, with the settings that suit many robots at once.
 
-Their buffers hand out the steps in which a robot acted, and no others.
+Their buffers hand out the steps in which a robot acted, and no others. Their policies become networks of this package.
 """
 
 from __future__ import annotations
@@ -13,18 +13,25 @@ from typing import Any, ClassVar
 import numpy as np
 import stable_baselines3
 import torch
+from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
-from stable_baselines3.common.utils import FloatSchedule, set_random_seed
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 
 from d4orm_env.envs.features import Features
+from d4orm_planners.rl.network import FORMAT, KINDS, SUM_SCALE, Header, Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
-from d4orm_planners.rl.sb3_network import SetExtractor
 from d4orm_planners.rl.task_mixture import MixedVecEnv
 
-_AS_THEY_ARE: Mapping[str, float] = MappingProxyType({})
+START_COUNT = 1e6
+"""Observations that a trained network's normalisation counts for: what it knows is not forgotten."""
+WIDTHS = (64, 32)
+"""Widths of the layers that neighbours go through, and of those of obstacles."""
 
 
 class _MaskedBuffer(BaseBuffer):
@@ -92,34 +99,67 @@ class MaskedReplayBuffer(_MaskedBuffer, ReplayBuffer):
         return rows, slots
 
 
+class _Set(nn.Module):
+    """Rows ``(N, R, row)`` and the robot itself ``(N, own)`` to what all rows have in common, ``(N, 2 * width)``."""
+
+    def __init__(self, row: int, own: int, width: int) -> None:
+        super().__init__()
+        self.first, self.own = nn.Linear(row, width), nn.Linear(own, width, bias=False)
+        self.second = nn.Linear(width, width)
+
+    def forward(self, rows: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+        hidden = torch.relu(self.first(rows) + self.own(own)[:, None])
+        hidden = torch.relu(self.second(hidden)) * rows[..., :1]
+        if not rows.shape[1]:
+            return hidden.new_zeros(len(rows), 2 * hidden.shape[2])
+        return torch.cat([hidden.amax(dim=1), SUM_SCALE * hidden.sum(dim=1)], dim=1)
+
+
+class SetExtractor(BaseFeaturesExtractor):
+    """Pooled features of neighbours and obstacles, beside a robot's own."""
+
+    def __init__(self, observation_space: Box, features: Features) -> None:
+        own = features.own_size
+        super().__init__(observation_space, own + 2 * sum(WIDTHS))
+        self._features = features
+        rows = (features.neighbor_size, features.obstacle_size)
+        self._sets = [_Set(row, own, width) for row, width in zip(rows, WIDTHS, strict=True)]
+        for kind, part in zip(KINDS, self._sets, strict=True):
+            self.add_module(kind, part)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        own, *rows = self._features.parts(observations)
+        return torch.cat([own, *(part(listed, own) for part, listed in zip(self._sets, rows, strict=True))], dim=1)
+
+    def arrays(self) -> dict[str, torch.Tensor]:
+        """Parameters by the names that policy files have for them."""
+        named: dict[str, torch.Tensor] = {}
+        for kind, part in zip(KINDS, self._sets, strict=True):
+            named |= {
+                f"{kind}_weight_0": part.first.weight,
+                f"{kind}_own": part.own.weight,
+                f"{kind}_bias_0": part.first.bias,
+                f"{kind}_weight_1": part.second.weight,
+                f"{kind}_bias_1": part.second.bias,
+            }
+        return named
+
+
 class Algorithm:
-    """One of Stable-Baselines3's algorithms.
+    """One of Stable-Baselines3's algorithms."""
 
-    Attributes:
-        model: Its class.
-        buffer: Attribute in which a model keeps what it learns from.
-        buffer_class: Class of that.
-        num_envs: Robots that act at once, unless configured otherwise.
-        steps_per_update: Steps that each of them takes between two updates.
-        learning_rate: At the beginning; it falls linearly to a tenth.
-        gamma: Discount per step.
-        network: Further keywords of its networks.
-        tunable: Further keywords of Stable-Baselines3 that a training may set otherwise, with their values here.
-    """
-
-    model: ClassVar[Any]
-    buffer: ClassVar[str]
-    buffer_class: ClassVar[type[BaseBuffer]]
-    num_envs: ClassVar[int]
-    steps_per_update: ClassVar[int]
-    learning_rate: ClassVar[float] = 3e-4
-    gamma: ClassVar[float] = 0.99
-    network: ClassVar[Mapping[str, object]] = MappingProxyType({})
+    model: ClassVar[Any]  #: Its class
+    buffer: ClassVar[str]  #: Attribute in which a model keeps what it learns from
+    buffer_class: ClassVar[type[BaseBuffer]]  #: Class of that
+    num_envs: ClassVar[int]  #: Robots that act at once, unless configured otherwise
+    steps_per_update: ClassVar[int]  #: Steps that each of them takes between two updates
+    learning_rate: ClassVar[float] = 3e-4  #: At the beginning; it falls linearly to a tenth
+    gamma: ClassVar[float] = 0.99  #: Discount per step
+    network: ClassVar[Mapping[str, object]] = MappingProxyType({})  #: Further keywords of its networks
+    #: Further keywords of Stable-Baselines3 that a training may set otherwise, with their values here
     tunable: ClassVar[Mapping[str, float]]
 
-    def make(
-        self, env: VecNormalize, sets: Features | None = None, tuned: Mapping[str, float] = _AS_THEY_ARE
-    ) -> BaseAlgorithm:
+    def make(self, env: VecNormalize, sets: Features | None, tuned: Mapping[str, float]) -> BaseAlgorithm:
         """A new model, whose first weights are drawn from the global random state."""
         network: dict[str, object] = {"net_arch": [128, 128], **self.network}
         if sets is not None:
@@ -127,15 +167,14 @@ class Algorithm:
             network |= {"activation_fn": torch.nn.ReLU}
         settings: dict[str, Any] = {"learning_rate": self.learning_rate, "gamma": self.gamma, **self.tunable, **tuned}
         settings |= {f"{self.buffer}_class": self.buffer_class, **self._settings(env)}
-        made: BaseAlgorithm = self.model("MlpPolicy", env, policy_kwargs=network, device="cpu", **settings)
-        return made
+        return self.model("MlpPolicy", env, policy_kwargs=network, device="cpu", **settings)
 
     def _settings(self, env: VecNormalize) -> dict[str, Any]:
         """Further keywords of Stable-Baselines3 for an environment."""
         raise NotImplementedError
 
-    def checked(self, tuned: Mapping[str, float], name: str) -> dict[str, float]:
-        """Values for :attr:`tunable`, whole where those here are.
+    def checked(self, tuned: Mapping[str, float]) -> dict[str, float]:
+        """``learner_settings``, values for :attr:`tunable`: whole where those here are.
 
         Raises:
             ValueError: For a keyword that is not one of them, or a value that makes no sense.
@@ -143,11 +182,11 @@ class Algorithm:
         values: dict[str, float] = {}
         for keyword, value in tuned.items():
             if keyword not in self.tunable:
-                raise ValueError(f"{name} has {keyword!r}; choose of {', '.join(self.tunable)}")
+                raise ValueError(f"learner_settings has {keyword!r}; choose of {', '.join(self.tunable)}")
             least = 1 if isinstance(self.tunable[keyword], int) else None
             if value < 0 or (least and (value < least or value != int(value))):
                 wanted = "a whole number of at least 1" if least else "at least 0"
-                raise ValueError(f"{name} has {keyword}={value:g}; it must be {wanted}")
+                raise ValueError(f"learner_settings has {keyword}={value:g}; it must be {wanted}")
             values[keyword] = int(value) if least else value
         return values
 
@@ -157,10 +196,6 @@ class Algorithm:
         model.action_space.seed(seed)
         buffer = getattr(model, self.buffer)
         buffer.source, buffer.random = robots, np.random.default_rng(seed)
-
-    def set_learning_rate(self, model: BaseAlgorithm, remaining: float, first: float | None = None) -> None:
-        """Set the rate for the share of the training that remains, 1 to 0, from ``first`` on, by default its own."""
-        model.lr_schedule = FloatSchedule((first or self.learning_rate) * (0.1 + 0.9 * remaining))
 
 
 def _batch_size(steps: int, num_envs: int) -> int:
@@ -202,3 +237,90 @@ class _SAC(Algorithm):
 
 ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _SAC()})
 """Algorithms by the names of their policies."""
+
+
+def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: VecNormalize) -> Network:
+    """The deterministic policy of a Stable-Baselines3 model.
+
+    Args:
+        header: Fields of :class:`~d4orm_planners.rl.network.Header` that the model does not tell.
+        model: A PPO or SAC model with fully connected layers.
+        normalization: Its ``VecNormalize``.
+    """
+    arrays = {name: parameter.detach().numpy() for name, parameter in _parameters(model).items()}
+    arrays["reward_variance"] = normalization.ret_rms.var
+    if (sets := _set_extractor(model)) is None:
+        seen = _seen(normalization)
+        arrays |= {"observation_mean": seen.mean, "observation_variance": seen.var}
+    actor = _actor(model)
+    full = Header(
+        format=FORMAT,
+        activation="relu" if any(isinstance(layer, nn.ReLU) for layer in actor) else "tanh",
+        squashed=_squashed(model),
+        layers=sum(isinstance(layer, nn.Linear) for layer in actor),
+        encoder=None if sets is None else "sets",
+        **header,
+    )
+    return Network(full, {name: np.array(value, np.float32) for name, value in arrays.items()})
+
+
+def set_network(model: BaseAlgorithm, normalization: VecNormalize, network: Network) -> None:
+    """Have a model act as a network does, in its own normalisation; what it thinks of states is left as it is.
+
+    Raises:
+        ValueError: If it is another kind of network; the message says which is wanted.
+    """
+    arrays, parameters, sets = network.arrays, _parameters(model), _set_extractor(model)
+    theirs_kind, mine_kind = network.header.encoder or "flat", "flat" if sets is None else "sets"
+    if theirs_kind != mine_kind:
+        raise ValueError(
+            f"the policy to start from is a {theirs_kind} network, and a {mine_kind} one is wanted; give "
+            f"network={theirs_kind!r}, or another policy"
+        )
+    mine = {name: tuple(parameter.shape) for name, parameter in parameters.items()}
+    theirs = {name: array.shape for name, array in arrays.items() if not name.endswith(("_mean", "_variance"))}
+    if mine != theirs or network.header.squashed != _squashed(model):
+        raise ValueError(
+            f"the policy to start from is a network of {network.header.algorithm} with layers {theirs}, and {mine} are "
+            "wanted; give one that was trained for the same robots by the same algorithm"
+        )
+    with torch.no_grad():
+        for name, parameter in parameters.items():
+            parameter.copy_(torch.as_tensor(arrays[name]))
+    if sets is None:
+        seen = _seen(normalization)
+        seen.mean, seen.var = (arrays[f"observation_{part}"].astype(np.float64) for part in ("mean", "variance"))
+        seen.count = START_COUNT
+
+
+def _seen(normalization: VecNormalize) -> RunningMeanStd:
+    """Mean and variance of the features, which are one array."""
+    assert not isinstance(normalization.obs_rms, dict)
+    return normalization.obs_rms
+
+
+def _squashed(model: BaseAlgorithm) -> bool:
+    return hasattr(model.policy, "actor")
+
+
+def _actor(model: BaseAlgorithm) -> list[nn.Module]:
+    """Return the layers that a model acts by, in order."""
+    policy: Any = model.policy
+    if _squashed(model):
+        return [*policy.actor.latent_pi, policy.actor.mu]
+    return [*policy.mlp_extractor.policy_net, policy.action_net]
+
+
+def _set_extractor(model: BaseAlgorithm) -> SetExtractor | None:
+    policy: Any = model.policy
+    extractor = (policy.actor if _squashed(model) else policy).features_extractor
+    return extractor if isinstance(extractor, SetExtractor) else None
+
+
+def _parameters(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
+    """Parameters of what a model acts by, by the names that policy files have for them."""
+    named: dict[str, torch.Tensor] = {}
+    for index, layer in enumerate(layer for layer in _actor(model) if isinstance(layer, nn.Linear)):
+        named |= {f"weight_{index}": layer.weight, f"bias_{index}": layer.bias}
+    sets = _set_extractor(model)
+    return named if sets is None else named | sets.arrays()

@@ -37,30 +37,20 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A point of the curve.
+    """A point of the curve."""
 
-    Attributes:
-        steps: Robot-steps trained, or in an imitation, learned from.
-        num_robots: Size of the team trained last.
-        scenario: Scenario trained last.
-        success_rate: Share of the validation episodes in which all arrived and none ever touched anything.
-        travel_time: Their mean arrival time [s], with the whole episode for robots that did not arrive.
-        seconds: Time that the stage took.
-        env_share: Share of it that went into the environments, instances that are drawn included; in an imitation, into
-            recording.
-        imitation_error: Root mean square of the actions less those of the expert, in units of the limits, in episodes
-            that were not learned from; ``None`` without an expert.
-        parts: Success rates of the parts of a mixture, in their order, of which ``success_rate`` is the mean.
-    """
-
-    steps: int
-    num_robots: int
-    scenario: str
-    success_rate: float
-    travel_time: float
-    seconds: float
+    steps: int  #: Robot-steps trained, or in an imitation, learned from
+    num_robots: int  #: Size of the team trained last
+    scenario: str  #: Scenario trained last
+    success_rate: float  #: Share of the validation episodes in which all arrived and none ever touched anything
+    travel_time: float  #: Their mean arrival time [s], with the whole episode for robots that did not arrive
+    seconds: float  #: Time that the stage took
+    #: Share of it that went into the environments, instances that are drawn included; in an imitation, into recording
     env_share: float
+    #: Root mean square of the actions less those of the expert, in units of the limits, in episodes that were not
+    #: learned from; ``None`` without an expert
     imitation_error: float | None = None
+    #: Success rates of the parts of a mixture, in their order, of which ``success_rate`` is the mean
     parts: Sequence[float] | None = None
 
     @property
@@ -137,22 +127,14 @@ class Checkpoints:
     def conclude(
         self, index: int, model: BaseAlgorithm, env: VecNormalize, network: Network, evaluations: Sequence[Evaluation]
     ) -> Checkpoint:
-        """Write the policy, if the last of the evaluations is as good as any, the curve, and a stage's checkpoint."""
+        """Write the policy, if the last of the evaluations is as good as any, the curve, and a stage's checkpoint.
+
+        Older checkpoints are removed but for the last :data:`_KEEP`.
+        """
         if evaluations[-1].rank == max(evaluation.rank for evaluation in evaluations):
             network.save(self.policy_path)
         write_curve(self.policy_path.parent, evaluations)
         # Last, so that what a stage that was broken off has written is written again.
-        return self._save(index, model, env, evaluations)
-
-    def latest(self) -> Checkpoint | None:
-        """The last complete checkpoint."""
-        complete = self._complete()
-        return Checkpoint.read(complete[-1]) if complete else None
-
-    def _save(
-        self, index: int, model: BaseAlgorithm, env: VecNormalize, evaluations: Sequence[Evaluation]
-    ) -> Checkpoint:
-        """Write the checkpoint of stage ``index``, and remove the oldest."""
         final = self._folder / f"{index + 1:06d}"
         temporary = final.with_suffix(".partial")
         shutil.rmtree(temporary, ignore_errors=True)
@@ -166,6 +148,11 @@ class Checkpoints:
         for old in self._complete()[:-_KEEP]:
             shutil.rmtree(old)
         return Checkpoint.read(final)
+
+    def latest(self) -> Checkpoint | None:
+        """The last complete checkpoint."""
+        complete = self._complete()
+        return Checkpoint.read(complete[-1]) if complete else None
 
     def _complete(self) -> list[Path]:
         return sorted(path for path in self._folder.iterdir() if path.name.isdigit())

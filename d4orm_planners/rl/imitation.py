@@ -13,9 +13,10 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -24,19 +25,25 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env import navigation_v0
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, as_float32
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.base.planner_registry import make_policy, setting_names
+from d4orm_planners.base.policy import Policy, robot_indices
 from d4orm_planners.base.settings import Count, PathText
-from d4orm_planners.rl.algorithms import ALGORITHMS
+from d4orm_planners.rl.algorithms import ALGORITHMS, network_of
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
+from d4orm_planners.rl.dataset.minari_files import Samples, dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
-from d4orm_planners.rl.samples import Samples, dataset_samples, record_samples
-from d4orm_planners.rl.sb3_network import network_of
+from d4orm_planners.rl.task_mixture import Instances
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
 
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
 __all__ = ["ImitationSettings", "imitate"]
+
+Driver = Callable[[FloatArray, FloatArray], FloatArray]
 
 LEARNER = "ppo"
 """Algorithm whose network learns, and whose policy it is then."""
@@ -117,8 +124,6 @@ def imitate(
 
 
 class _ImitationRun:
-    """An imitation under way."""
-
     def __init__(self, settings: ImitationSettings, out: Path, progress: Progress, command: str) -> None:
         self.settings, self._progress, self._command = settings, progress, command
         # First of all, because it refuses what cannot be learned, and nothing is to be written then.
@@ -129,7 +134,7 @@ class _ImitationRun:
         self._episodes.mkdir(exist_ok=True)
         self._env = VecNormalize(self._validation, clip_obs=CLIP, epsilon=EPSILON)
         set_random_seed(derived_seed(settings.seed, Stream.TRAINING, 0) % 2**32)
-        self._model = ALGORITHMS[LEARNER].make(self._env)
+        self._model = ALGORITHMS[LEARNER].make(self._env, None, {})
         checkpoint = self.checkpoints.latest()
         self.evaluations: list[Evaluation] = [] if checkpoint is None else checkpoint.evaluations
         if checkpoint is not None:
@@ -151,7 +156,9 @@ class _ImitationRun:
         recorded = time.perf_counter() - begin
         known, held = self._samples(index)
         if not index:
-            normalize(self._env, known[0])
+            seen: Any = self._env.obs_rms
+            seen.mean, seen.var = (of(known[0], axis=0, dtype=np.float64) for of in (np.mean, np.var))
+            seen.count = float(len(known[0]))
         random = generator(settings.seed, Stream.TRAINING, index + 1)
         clone(
             self._model, self._env, *known, epochs=settings.epochs, random=random,
@@ -163,11 +170,12 @@ class _ImitationRun:
         self, index: int, steps: int, held: tuple[FloatArray, FloatArray], seconds: float, recorded: float
     ) -> None:
         """Judge what has been learned, and keep it."""
-        network = self._network(index, seconds)
+        network, (inputs, targets) = self._network(index, seconds), held
+        error = float(np.sqrt(np.mean((network(inputs) - targets) ** 2)))
+        outcome = evaluate_network(network, self._validation, VALIDATION_SEED)
         evaluation = Evaluation(
-            steps, self.settings.num_robots, self.settings.scenario,
-            *evaluate_network(network, self._validation, VALIDATION_SEED)[:2], seconds, recorded / seconds,
-            imitation_error(network, *held),
+            steps, self.settings.num_robots, self.settings.scenario, outcome.success_rate, outcome.travel_time,
+            seconds, recorded / seconds, error,
         )  # fmt: skip
         self.evaluations = [*self.evaluations, evaluation]
         self.checkpoints.conclude(index, self._model, self._env, network, self.evaluations)
@@ -187,7 +195,9 @@ class _ImitationRun:
         if path.exists():
             return
         scenario = "random" if episode % 2 else settings.scenario
-        env = navigation_v0.parallel_env(num_robots=settings.num_robots, **settings.arguments(scenario))
+        task = settings.task(scenario, settings.num_robots)
+        instances = Instances(partial(task.problem, model=settings.model_in(scenario)), None, {})
+        env = navigation_v0.parallel_env(instances, settings.num_robots, **settings.options)
         expert = make_policy(settings.expert, **settings.all_expert_settings)
         seed = derived_seed(settings.seed, Stream.DEMONSTRATIONS, index, episode)
         record_samples(env, expert, seed, self._network(index).controls if index else None).save(path)
@@ -215,11 +225,31 @@ class _ImitationRun:
         return episodes
 
 
-def normalize(env: VecNormalize, inputs: FloatArray) -> None:
-    """Have an environment normalise observations as these features ``(N, F)`` want it."""
-    seen: Any = env.obs_rms
-    seen.mean, seen.var = inputs.mean(axis=0, dtype=np.float64), inputs.var(axis=0, dtype=np.float64)
-    seen.count = float(len(inputs))
+def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None) -> Samples:
+    """Run an episode and ask the expert at every step what to do.
+
+    Args:
+        env: A :mod:`d4orm_env.navigation_v0` parallel environment of a team of one model.
+        expert: Policy that is asked.
+        seed: Seeds both.
+        learner: Policy that drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the
+            expert. With a learner the expert is asked where that has led the team.
+
+    Returns:
+        What the robots saw until they arrived, and what the expert said.
+    """
+    observations, _ = env.reset(seed=seed)
+    expert.reset(env, seed=seed)
+    limits, parts = env.unwrapped.problem.team.control_limits, []
+    while env.agents:
+        acting = {agent: observations[agent] for agent in env.agents}
+        asked = expert.act(acting, env.state())
+        seen, own = np.stack(list(acting.values())), limits[robot_indices(acting)]
+        controls = as_float32([asked[agent] for agent in acting])
+        parts.append(Samples(seen, controls, own))
+        driven = controls if learner is None else learner(seen, own)
+        observations, *_ = env.step(dict(zip(acting, driven, strict=True)))
+    return Samples.joined(parts)
 
 
 def clone(
@@ -252,8 +282,3 @@ def clone(
             loss.backward()  # type: ignore[no-untyped-call]
             policy.optimizer.step()
     report(epochs)
-
-
-def imitation_error(network: Network, inputs: FloatArray, targets: FloatArray) -> float:
-    """Root mean square of a network's actions ``(N, m)`` less the expert's, in units of the limits."""
-    return float(np.sqrt(np.mean((network(inputs) - targets) ** 2)))

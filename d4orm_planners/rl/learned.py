@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, IntArray
+from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
-from d4orm_planners.rl.detours import Detours
-from d4orm_planners.rl.network import SUFFIX, Network, load_network, range_sensors
+from d4orm_planners.rl.network import SUFFIX, Header, Network, load_network, range_sensors
 from d4orm_planners.tracking.steering import brake_to_dock, goals_along_paths
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
 
-    from d4orm_env.core.problem import Problem
     from d4orm_env.core.world import World
 
 SHIPPED = Path(__file__).parent / "policies"
@@ -98,7 +97,7 @@ class LearnedPolicy(Policy):
     def observation_options(self, problem: Problem) -> Mapping[str, object]:
         """As in training, where the policy is a file of this package."""
         self._choose(problem)
-        return self._actor.network.header.observation_options if isinstance(self._actor, _NetworkActor) else {}
+        return self._actor.header.observation_options if isinstance(self._actor, Network) else {}
 
     def _choose(self, problem: Problem) -> None:
         """Act by the file for robots of the team's model in a world like this, or else by the nearest."""
@@ -113,10 +112,12 @@ class LearnedPolicy(Policy):
         self._path, self.training_time = path, None
         if path.suffix == ".zip":
             model = _load_zip(self.name, path)
-            self._actor: _NetworkActor | SharedPolicy = from_sb3(model, egocentric=self.config.egocentric)
-        else:
-            self._actor = _NetworkActor(self.name, path)
-            self.training_time = self._actor.network.training_time
+            self._actor: Network | SharedPolicy = from_sb3(model, egocentric=self.config.egocentric)
+            return
+        network = load_network(path)
+        if (algorithm := network.header.algorithm) != self.name:
+            raise ValueError(f"policy file {path} was trained by {algorithm}; use make_policy({algorithm!r}, path=...)")
+        self._actor, self.training_time = network, network.training_time
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:
         super().reset(env, seed)
@@ -125,10 +126,34 @@ class LearnedPolicy(Policy):
             self._actor.reset(env, seed)
             return
         options = env.unwrapped.options
-        self._actor.check_rays(range_sensors(options.observed_rays, options.ray_range))
-        self._actor.check(self.problem, env.observation_space(env.possible_agents[0]).shape)
+        self._check_sensors(self._actor.header, range_sensors(options.observed_rays, options.ray_range))
+        self._check_team(self._actor, env.observation_space(env.possible_agents[0]).shape)
         hiding = options.communication_range is not None or options.line_of_sight
         self._detours = Detours(self.problem) if self.config.detours and not hiding else None
+
+    def _check_sensors(self, header: Header, given: str) -> None:
+        """Refuse other range sensors than those of the training; their numbers could pass for neighbours."""
+        if (trained := header.range_sensors) != given:
+            raise ValueError(
+                f"the policy in {self._path.name} was trained with {trained}, and this environment has {given}; make "
+                "it as in training"
+            )
+
+    def _check_team(self, network: Network, observation_shape: tuple[int, ...]) -> None:
+        """Refuse robots, and observations, of another kind than those of the training."""
+        header, models = network.header, set(self.problem.team.models)
+        if models != {header.model}:
+            raise ValueError(
+                f"the policy in {self._path.name} was trained for {header.model} robots, and this team has "
+                f"{', '.join(sorted(models))}; train one for them with 'd4orm train --model'"
+            )
+        if len(observation_shape) != 1 or network.features_for(observation_shape[0]) is None:
+            robots = f"observed_robots={header.num_neighbors}" if header.encoder is None else "any observed_robots"
+            raise ValueError(
+                f"the policy in {self._path.name} was trained for observations of {network.features.slices.size} "
+                f"numbers, and this environment's have shape {observation_shape}; make it with {robots}, "
+                f"observed_obstacles={header.num_obstacles}, and do not wrap its observations"
+            )
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         require_reset(self)
@@ -138,9 +163,9 @@ class LearnedPolicy(Policy):
             return self._actor.act(observations, state)
         seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
         robots, joint = robot_indices(observations), split_state(self.problem, state)
-        self._look_along_paths(self._actor.network, robots, seen, joint)
-        controls = self._actor.network.controls(seen, self.problem.team.control_limits[robots])
-        if not self._actor.network.header.brakes:
+        self._look_along_paths(self._actor, robots, seen, joint)
+        controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
+        if not self._actor.header.brakes:
             controls = brake_to_dock(self.problem, robots, controls, joint)
         return within_limits(self.problem, dict(zip(observations, controls)))
 
@@ -180,40 +205,53 @@ class SAC(LearnedPolicy):
     name = "sac"
 
 
-class _NetworkActor:
-    """Acts by a policy file."""
+class Detours:
+    """Shortest paths round arrived robots, in one episode.
 
-    def __init__(self, algorithm: str, path: Path) -> None:
-        self.network: Network = load_network(path)
-        self.path = path
-        if self.network.header.algorithm != algorithm:
-            raise ValueError(
-                f"policy file {path} was trained by {self.network.header.algorithm}; use make_policy("
-                f"{self.network.header.algorithm!r}, path=...)"
-            )
+    A robot without memory that heads straight for its goal stops behind others that have arrived. A path is found when
+    a robot first needs it, and again when another one has arrived.
+    """
 
-    def check(self, problem: Problem, observation_shape: tuple[int, ...]) -> None:
-        header, features = self.network.header, self.network.features
-        if set(problem.team.models) != {header.model}:
-            raise ValueError(
-                f"the policy in {self.path.name} was trained for {header.model} robots, and this team has "
-                f"{', '.join(sorted(set(problem.team.models)))}; train one for them with 'd4orm train --model'"
-            )
-        if len(observation_shape) != 1 or self.network.features_for(observation_shape[0]) is None:
-            robots = f"observed_robots={header.num_neighbors}" if header.encoder is None else "any observed_robots"
-            raise ValueError(
-                f"the policy in {self.path.name} was trained for observations of {features.slices.size} numbers, "
-                f"and this environment's have shape {observation_shape}; make it with {robots}, "
-                f"observed_obstacles={header.num_obstacles}, and do not wrap its observations"
-            )
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self._radius = problem, problem.team.radius
+        self._arrived = np.zeros(problem.num_robots, np.bool_)
+        self._alone: dict[int, Problem] = {}
 
-    def check_rays(self, given: str) -> None:
-        """Refuse other range sensors than those of the training; their numbers could pass for neighbours."""
-        if (trained := self.network.header.range_sensors) != given:
-            raise ValueError(
-                f"the policy in {self.path.name} was trained with {trained}, and this environment has {given}; make it "
-                "as in training"
-            )
+    def goals(self, joint: JointState, positions: FloatArray) -> FloatArray:
+        """Return where robots should head: their goals, or along their paths where an arrived robot is in the way.
+
+        Args:
+            joint: The team.
+            positions: ``(K, d)`` where the robots are [m].
+
+        Returns:
+            ``(K, d)`` [m].
+        """
+        if (joint.arrived != self._arrived).any():
+            self._arrived, self._alone, world = joint.arrived, {}, self._problem.world
+            balls = np.column_stack([joint.states[self._arrived, : world.dimension], self._radius[self._arrived]])
+            kind = "circles" if world.dimension == 2 else "spheres"
+            self._world = world.replace(**{kind: np.concatenate([world.balls, balls])})
+        heads = joint.goals.copy()
+        for robot in self._blocked(joint, positions).tolist():
+            if robot not in self._alone:
+                one = self._problem.select([robot])
+                start = joint.states[[robot], : one.state_size]
+                self._alone[robot] = one.with_state(start, joint.goals[[robot]], world=self._world)
+            heads[robot] = goals_along_paths(self._alone[robot], positions[[robot]], joint.goals[[robot]])[0]
+        return heads
+
+    def _blocked(self, joint: JointState, positions: FloatArray) -> IntArray:
+        """Numbers of the robots that an arrived one is in the way of."""
+        arrived, ahead = self._arrived, joint.goals - positions
+        offsets = joint.states[arrived, : self._problem.dimension] - positions[:, None]
+        along = (
+            np.einsum("kd,knd->kn", ahead, offsets)
+            / np.maximum((ahead * ahead).sum(axis=1), np.finfo(np.float32).tiny)[:, None]
+        )
+        distances = np.linalg.norm(offsets - np.clip(along, 0, 1)[..., None] * ahead[:, None], axis=2)
+        safety_distance = self._radius[:, None] + self._radius[arrived] + self._problem.margin
+        return np.flatnonzero((distances < safety_distance).any(axis=1) & ~arrived)
 
 
 def _load_zip(algorithm: str, path: Path) -> Any:

@@ -39,46 +39,30 @@ SUM_SCALE = 0.25
 
 
 class Header(BaseModel):
-    """Header of a policy file.
-
-    Attributes:
-        format: Version of the file format.
-        algorithm: ``"ppo"`` or ``"sac"``.
-        model: Robot model that it was trained for.
-        dimension: Position dimensions of the observations.
-        num_neighbors: Robots in an observation.
-        num_obstacles: Obstacles in an observation.
-        num_rays: Rays of its range sensor; ``None`` is none.
-        ray_range: Range of that [m]; ``None`` without rays.
-        activation: Between the layers.
-        squashed: Whether the output goes through tanh.
-        layers: Number of layers; those of sets come before them and are not counted.
-        encoder: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.network`. Such
-            a policy acts for any number of observed robots.
-        frame: Direction of the first axis of a robot's frame; ``None`` is to the goal.
-        shortest_paths: Whether it heads along the shortest paths, see :meth:`Features.along`; ``None`` is straight.
-        brakes: Whether it has learned to slow down for its goals; ``None`` is not, and go-to-goal brakes for it.
-        training: The command and its settings, for people, and the ``training_time`` [s].
-    """
+    """Header of a policy file."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    format: int
-    algorithm: str
-    model: str
-    dimension: int = Field(ge=2, le=3)
-    num_neighbors: int = Field(ge=0, le=1000)
-    num_obstacles: int = Field(ge=0, le=1000)
-    num_rays: int | None = Field(default=None, ge=1, le=1000)
-    ray_range: float | None = Field(default=None, gt=0)
-    activation: str
-    squashed: bool
-    layers: int = Field(ge=1, le=16)
+    format: int  #: Version of the file format
+    algorithm: str  #: ``"ppo"`` or ``"sac"``
+    model: str  #: Robot model that it was trained for
+    dimension: int = Field(ge=2, le=3)  #: Position dimensions of the observations
+    num_neighbors: int = Field(ge=0, le=1000)  #: Robots in an observation
+    num_obstacles: int = Field(ge=0, le=1000)  #: Obstacles in an observation
+    num_rays: int | None = Field(default=None, ge=1, le=1000)  #: Rays of its range sensor; ``None`` is none
+    ray_range: float | None = Field(default=None, gt=0)  #: Range of that [m]; ``None`` without rays
+    activation: str  #: Between the layers
+    squashed: bool  #: Whether the output goes through tanh
+    layers: int = Field(ge=1, le=16)  #: Number of layers; those of sets come before them and are not counted
+    #: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.network`. Such a policy
+    #: acts for any number of observed robots
     encoder: Literal["sets"] | None = None
-    frame: Literal["heading"] | None = None
+    frame: Literal["heading"] | None = None  #: Direction of the first axis of a robot's frame; ``None`` is to the goal
+    #: Whether it heads along the shortest paths, see :meth:`Features.along`; ``None`` is straight
     shortest_paths: Literal[True] | None = None
+    #: Whether it has learned to slow down for its goals; ``None`` is not, and go-to-goal brakes for it
     brakes: Literal[True] | None = None
-    training: dict[str, object]
+    training: dict[str, object]  #: The command and its settings, for people, and the ``training_time`` [s]
 
     @property
     def range_sensors(self) -> str:
@@ -139,8 +123,7 @@ class Network:
             hidden = hidden @ self.arrays[f"weight_{layer}"].T + self.arrays[f"bias_{layer}"]
             if layer < self.header.layers - 1:
                 hidden = activation(hidden)
-        actions: FloatArray = np.tanh(hidden) if self.header.squashed else np.clip(hidden, -1, 1)
-        return actions
+        return np.tanh(hidden) if self.header.squashed else np.clip(hidden, -1, 1)
 
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
         """``(N, m)`` most likely controls for ``(N, D)`` observations of robots with limits ``(N, m)``.
@@ -161,7 +144,6 @@ class Network:
         return self.features.of_observation_size(size)
 
     def _inputs(self, features: FloatArray) -> FloatArray:
-        """Return the input of the first layer."""
         if self.header.encoder == "sets":
             return encode(self.features, self.arrays, np.clip(features, -CLIP, CLIP))
         mean, variance = self.arrays["observation_mean"], self.arrays["observation_variance"]
@@ -290,8 +272,7 @@ def encode(features: Features, arrays: Mapping[str, FloatArray], seen: FloatArra
         hidden = np.maximum(hidden @ arrays[f"{kind}_weight_1"].T + arrays[f"{kind}_bias_1"], 0) * rows[..., :1]
         # No value is below zero, which stands for an empty set.
         parts += [hidden.max(axis=1, initial=0), SUM_SCALE * hidden.sum(axis=1)]
-    joined: FloatArray = np.concatenate(parts, axis=1)
-    return joined
+    return np.concatenate(parts, axis=1)
 
 
 def _width(weight: FloatArray | None) -> int | None:

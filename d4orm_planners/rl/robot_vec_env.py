@@ -235,8 +235,7 @@ class RobotVecEnv(SharedVecEnv):
         """``(B * K, N)`` which of the observed robots each robot is not shown, by what those of each world are."""
         observed = self.features.slices.num_neighbors
         shown = np.repeat([observed if most is None else most for most in max_observed], self._shape[1])
-        hidden: BoolArray = np.arange(observed) >= shown[:, None]
-        return hidden
+        return np.arange(observed) >= shown[:, None]
 
     def _finish_worlds(self, ended: BoolArray, infos: Info) -> None:
         self.finished = []

@@ -97,20 +97,13 @@ MIXTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class TrainTask:
-    """One part of a mixture.
+    """One part of a mixture."""
 
-    Attributes:
-        scenario: Name, file or import path.
-        num_robots: Size of its teams.
-        settings: Arguments of the scenario.
-        max_observed: Number of observed robots shown at most; ``None`` is all.
-        disturbances: Levels by name, see :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`.
-    """
-
-    scenario: str
-    num_robots: int
-    settings: Mapping[str, object]
-    max_observed: int | None = None
+    scenario: str  #: Name, file or import path
+    num_robots: int  #: Size of its teams
+    settings: Mapping[str, object]  #: Arguments of the scenario
+    max_observed: int | None = None  #: Number of observed robots shown at most; ``None`` is all
+    #: Levels by name, see :func:`~d4orm_env.disturbances.disturbance_registry.disturbances_at`
     disturbances: Mapping[str, object] = field(default_factory=dict)
 
     @classmethod

@@ -75,19 +75,11 @@ class TrainConfig(CheckedSettings):
         self._example()
 
     def _example(self) -> Problem:
-        """An instance of the scenario."""
         return self.task(self.scenario, self.num_robots).problem(0, self.model)
 
-    def arguments(self, scenario: str) -> dict[str, Any]:
-        """Arguments of environments of the scenario to be learned, or of ``random`` with robots like its own, but for
-        their number.
-        """
-        draw = partial(self.task(scenario, self.num_robots).problem, model=self.model_in(scenario))
-        return {"scenario": Instances(draw, None, {}), **self.sensors}
-
     @property
-    def sensors(self) -> dict[str, Any]:
-        """Arguments of environments that say which range sensors the robots have."""
+    def options(self) -> dict[str, Any]:
+        """Arguments of environments: here, which range sensors the robots have."""
         return {"observed_rays": self.observed_rays, "ray_range": self.ray_range}
 
     def task(self, scenario: str, num_robots: int) -> TrainTask:
@@ -98,14 +90,14 @@ class TrainConfig(CheckedSettings):
         """The model of its robots; ``None`` is the scenario's own."""
         return self.model if scenario == self.scenario else self._example().team.models[0]
 
-    def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
+    def validation(self) -> RobotVecEnv | MixedVecEnv:
         """Worlds to judge by.
 
         Raises:
             ValueError: If one policy cannot be learned for the team.
         """
         task = self.task(self.scenario, self.num_robots)
-        return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **{**self.sensors, **options})
+        return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **self.options)
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Return the header of a policy file: what a model does not tell."""
@@ -209,7 +201,7 @@ class TrainingSettings(TrainConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        tuned = ALGORITHMS[self.algorithm].checked(self.learner_settings, "learner_settings")
+        tuned = ALGORITHMS[self.algorithm].checked(self.learner_settings)
         object.__setattr__(self, "learner_settings", tuned)
         known = TrainingReward.term_names
         for name in self.reward_settings:
@@ -277,23 +269,17 @@ class TrainingSettings(TrainConfig):
             drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
             instances = Instances(partial(task.problem, model=model), seeds, drawn[key])
             own_seed = derived_seed(seed, Stream.TRAINING_WORLDS, part)
-            parts.append(task.worlds(max_observed, own_seed, instances, model, **self._options))
+            parts.append(task.worlds(max_observed, own_seed, instances, model, **self.options))
         return MixedVecEnv(parts) if self.mixture else parts[0]
 
-    def validation(self, **options: Any) -> RobotVecEnv | MixedVecEnv:
-        """Worlds to judge by.
-
-        Raises:
-            ValueError: If one policy cannot be learned for the team.
-        """
-        options = {**self._options, **options}
+    def validation(self) -> RobotVecEnv | MixedVecEnv:
         if not self.mixture:
-            return super().validation(**options)
-        count = -(-self.validation_worlds // len(self.tasks))
+            return super().validation()
+        count, options = -(-self.validation_worlds // len(self.tasks)), self.options
         return MixedVecEnv([part.validation(count, VALIDATION_SEED, self.model, **options) for part in self.tasks])
 
     @property
-    def _options(self) -> dict[str, Any]:
-        """Options of the environments."""
+    def options(self) -> dict[str, Any]:
+        """Arguments of environments: what robots observe, and what they are rewarded for."""
         own = {"observed_robots": self.observed_robots, "shortest_paths": self.shortest_paths}
-        return {**self.sensors, **own, "reward": self.reward}
+        return {**super().options, **own, "reward": self.reward}

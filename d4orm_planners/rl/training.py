@@ -12,18 +12,19 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.utils import FloatSchedule, set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.seeds import Stream, derived_seed
-from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm
+from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm, network_of, set_network
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network, range_sensors
-from d4orm_planners.rl.sb3_network import leave_as_they_are, network_of, set_network
 from d4orm_planners.rl.train_config import MIXTURE, VALIDATION_SEED, Drawn, Stage, TrainingSettings, make_stages
 
 __all__ = ["TrainingResult", "TrainingSettings", "train"]
@@ -33,17 +34,11 @@ Progress = Callable[[str, int, int], object]
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a training.
+    """Result of a training."""
 
-    Attributes:
-        network: The policy with the best validation.
-        curve: One evaluation per stage.
-        policy_path: Path of the policy.
-    """
-
-    network: Network
-    curve: tuple[Evaluation, ...]
-    policy_path: Path
+    network: Network  #: The policy with the best validation
+    curve: tuple[Evaluation, ...]  #: One evaluation per stage
+    policy_path: Path  #: Path of the policy
 
 
 def train(
@@ -72,8 +67,6 @@ def train(
 
 
 class _TrainingRun:
-    """A training under way."""
-
     def __init__(self, settings: TrainingSettings, out: Path, progress: Progress, command: str) -> None:
         self.settings, self._out, self._progress, self._command = settings, out, progress, command
         self._algorithm: Algorithm = ALGORITHMS[settings.algorithm]
@@ -123,10 +116,11 @@ class _TrainingRun:
         making = time.perf_counter() - begin
         normalized = VecNormalize(robots, clip_obs=CLIP, gamma=self._algorithm.gamma, epsilon=EPSILON)
         if settings.network == "sets":
-            leave_as_they_are(normalized)
+            _leave_as_they_are(normalized)
         model = self._model = self._restored(normalized)
         self._algorithm.prepare(model, robots, self._training_seed(index + 1))
-        self._algorithm.set_learning_rate(model, 1 - done / self._total, settings.learning_rate)
+        first_rate = settings.learning_rate or self._algorithm.learning_rate
+        model.lr_schedule = FloatSchedule(first_rate * (0.1 + 0.9 * (1 - done / self._total)))
         watch = _Watch(lambda steps: self._progress(_describe(stage, self.evaluations), done + steps, self._total))
         model.learn(stage.steps, callback=watch, reset_num_timesteps=False)
         seconds = time.perf_counter() - begin
@@ -189,3 +183,15 @@ class _Watch(BaseCallback):
 def _describe(stage: Stage, evaluations: list[Evaluation]) -> str:
     last = f"; success {evaluations[-1].success_rate:.0%}" if evaluations else ""
     return f"{stage.scenario}, {stage.num_robots} robots{last}"
+
+
+def _leave_as_they_are(env: VecNormalize) -> None:
+    """Have features not normalised: every row of a set must be in the same units, and features are of order one."""
+    fixed: Any = _Fixed(shape=env.observation_space.shape or ())
+    fixed.var[:] = 1 - EPSILON
+    env.obs_rms = fixed
+
+
+class _Fixed(RunningMeanStd):
+    def update(self, arr: Any) -> None:
+        """Nothing is learned from what is seen."""

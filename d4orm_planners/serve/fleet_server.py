@@ -14,24 +14,8 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller, ControlSetpoint
-from d4orm_planners.serve.wire import (
-    BOOL,
-    DIAGNOSTICS,
-    ODOMETRY,
-    POSE,
-    TRAJECTORY,
-    TWIST,
-    RosSession,
-    Subscriber,
-    diagnostics,
-    full_state,
-    heading_of,
-    position_of,
-    state_from,
-    time_of,
-    turned,
-    twist,
-)
+from d4orm_planners.serve import wire
+from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
 from d4orm_planners.tracking import ros_messages as ros
 
 NODE = "d4orm"
@@ -64,7 +48,7 @@ class FleetRobot:
 
     def take_pose(self, stamped: Any, base: float) -> None:
         """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by ``base`` seconds at least."""
-        now, position = time_of(stamped.header), position_of(stamped.pose.position)
+        now, position = wire.time_of(stamped.header), position_of(stamped.pose.position)
         passed = np.inf if self.posed is None else now - self.posed[0]
         if passed < base and passed >= 0:
             return
@@ -115,19 +99,19 @@ class FleetServer:
         unknown = np.full(problem.state_size, np.nan, np.float32)
         self._robots = [FleetRobot(name, unknown) for name in names]
         self._by_name = {name: robot for robot, name in enumerate(names)}
-        self._odometry = session.subscriber("*/odom", ODOMETRY)
-        self._poses = session.subscriber("*/pose", POSE)
-        self._goal = session.subscriber("*/goal", POSE)
-        self._commands = [session.publisher(f"{name}/cmd_vel", TWIST) for name in names]
-        self._setpoints = [session.publisher(f"{name}/setpoint", TRAJECTORY) for name in names]
-        self._diagnostics = session.publisher("diagnostics", DIAGNOSTICS)
+        self._odometry = session.subscriber("*/odom", wire.ODOMETRY)
+        self._poses = session.subscriber("*/pose", wire.POSE)
+        self._goal = session.subscriber("*/goal", wire.POSE)
+        self._commands = [session.publisher(f"{name}/cmd_vel", wire.TWIST) for name in names]
+        self._setpoints = [session.publisher(f"{name}/setpoint", wire.TRAJECTORY) for name in names]
+        self._diagnostics = session.publisher("diagnostics", wire.DIAGNOSTICS)
         self._planner = ThreadPoolExecutor(1, thread_name_prefix="serve")
         self._begun: Future[None] | None = None
         self._setpoint: ControlSetpoint | None = None
         self._pace, self._braking = 1.0, _braking(problem)
         self._emergency = self._replan = False
         self._commanding = threading.RLock()
-        self._e_stop = session.subscriber("e_stop", BOOL, self._mind)
+        self._e_stop = session.subscriber("e_stop", wire.BOOL, self._mind)
         self._inputs = self._odometry, self._poses, self._goal, self._e_stop
         self.state, self._told, self.loops, self.refusal = WAITING, -np.inf, [0.0], ""
 
@@ -190,7 +174,7 @@ class FleetServer:
             if np.isfinite(position_of(message.pose.position)).all():
                 robot = self._robots[number]
                 robot.take_pose(message, BASE * self._problem.dt)
-                own = turned(robot.velocity, -heading_of(message.pose.orientation))
+                own = turned(robot.velocity, -wire.heading_of(message.pose.orientation))
                 self._hear(number, message.pose, own, now)
         for number, message in self._taken(self._goal):
             self._take_goal(number, message.pose.position)
@@ -212,9 +196,9 @@ class FleetServer:
                     self._stand()
 
     def _hear(self, number: int, pose: Any, velocity: Floats, now: float) -> None:
-        state, robot = state_from(self._problem, number, pose, velocity), self._robots[number]
+        state, robot = wire.state_from(self._problem, number, pose, velocity), self._robots[number]
         if np.isfinite(state).all():
-            robot.state, robot.heading, robot.heard = state, heading_of(pose.orientation), now
+            robot.state, robot.heading, robot.heard = state, wire.heading_of(pose.orientation), now
 
     def _take_goal(self, number: int, position: Any) -> None:
         goals = self._problem.goal.copy()
@@ -235,7 +219,7 @@ class FleetServer:
 
     def _drive(self, setpoint: ControlSetpoint) -> None:
         commands = [
-            twist(self._problem, number, robot.state, setpoint.control[number], robot.heading)
+            wire.twist(self._problem, number, robot.state, setpoint.control[number], robot.heading)
             for number, robot in enumerate(self._robots)
         ]
         with self._commanding:
@@ -246,7 +230,7 @@ class FleetServer:
             for number, (robot, command, point) in enumerate(zip(self._robots, commands, points)):
                 robot.command = command
                 self._commands[number].publish(command)
-                self._setpoints[number].publish(full_state(robot.name, *point))
+                self._setpoints[number].publish(wire.full_state(robot.name, *point))
 
     def _brake(self) -> None:
         """Slow all robots down on their last arcs, by the same share."""
@@ -259,7 +243,7 @@ class FleetServer:
             stand = last.position[number] if robot.stand is None else robot.stand
             robot.stand = stand + self._pace * dt * velocity
             point = (robot.stand, self._pace * velocity, (self._pace - before) / dt * velocity, robot.heading)
-            self._setpoints[number].publish(full_state(robot.name, *point))
+            self._setpoints[number].publish(wire.full_state(robot.name, *point))
             self._commands[number].publish(ros.twist(self._pace * position_of(own), self._pace * turn_rate))
 
     def _stand(self) -> None:
@@ -271,7 +255,7 @@ class FleetServer:
                 if robot.stand is None and np.isfinite(robot.state).all():
                     robot.stand = robot.state[:d].astype(np.float64)
                 if robot.stand is not None:
-                    setpoint.publish(full_state(robot.name, robot.stand, still, still, robot.heading))
+                    setpoint.publish(wire.full_state(robot.name, robot.stand, still, still, robot.heading))
 
     def _diagnosis(self, now: float) -> Any:
         silent, refused = self._silent(now), sum(topic.refused for topic in self._inputs)
@@ -282,7 +266,7 @@ class FleetServer:
             "unreadable messages": str(refused),
             "refused": self.refusal,
         }
-        return diagnostics(NODE, LEVELS[self.state], self.state, values)
+        return wire.diagnostics(NODE, LEVELS[self.state], self.state, values)
 
 
 def _braking(problem: Problem) -> float:

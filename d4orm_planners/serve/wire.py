@@ -13,7 +13,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -37,13 +37,6 @@ DEPTH = 64
 RELIABLE = f"::,{DEPTH}:,:,:,,"
 """Quality of service as tokens have it: all as by default, but for the depth."""
 _ATTACHMENT = struct.Struct("<qqB16s")
-
-
-class Received(NamedTuple):
-    """A message, and the name of its topic without the slash in front."""
-
-    topic: str
-    message: Any
 
 
 class RosSession:
@@ -140,8 +133,8 @@ class Subscriber:
         if self._heard is not None:
             self._heard(self)
 
-    def take(self) -> list[Received]:
-        """Return the messages since the last call, oldest first."""
+    def take(self) -> list[tuple[str, Any]]:
+        """Return the messages since the last call, oldest first, each after its topic without the slash in front."""
         received = []
         while self._samples:
             sample = self._samples.popleft()
@@ -151,7 +144,7 @@ class Subscriber:
                 self.refused += 1
                 continue
             parts = str(sample.key_expr).split("/")
-            received.append(Received("/".join(parts[1:-2]), message))
+            received.append(("/".join(parts[1:-2]), message))
         return received
 
 
@@ -191,8 +184,7 @@ def position_of(point: Any) -> Floats:
 
 def time_of(header: Any) -> float:
     """Time of a ``std_msgs/Header`` [s]."""
-    seconds: float = header.stamp.sec + 1e-9 * header.stamp.nanosec
-    return seconds
+    return header.stamp.sec + 1e-9 * header.stamp.nanosec
 
 
 def turned(vector: Floats, angle: float) -> Floats:

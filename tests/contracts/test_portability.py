@@ -15,7 +15,7 @@ import pytest
 from d4orm_env import make_problem, rollout
 from d4orm_env.engine import cpu
 from d4orm_env.paths import lattice, looking, wavefront
-from d4orm_planners.baselines.amswarm.alternation import alternate
+from d4orm_planners.baselines.alternation import alternate
 from d4orm_planners.engine import path_index, weighting
 from d4orm_planners.engine import score as sampling
 from d4orm_planners.engine.weighting import softmax_weights

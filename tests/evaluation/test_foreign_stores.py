@@ -159,7 +159,7 @@ DAMAGES: dict[str, Callable[[Path], None]] = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_dataset_is_refused(name: str, recorded: Path, tmp_path: Path) -> None:
-    from d4orm_planners.rl.samples import dataset_samples
+    from d4orm_planners.rl.dataset.minari_files import dataset_samples
 
     shutil.copytree(recorded, tmp_path / "copy")
     size = observation_size()
@@ -178,7 +178,7 @@ def observation_size() -> int:
 
 
 def test_no_code_that_a_dataset_names_is_run(recorded: Path, tmp_path: Path) -> None:
-    from d4orm_planners.rl.samples import dataset_samples
+    from d4orm_planners.rl.dataset.minari_files import dataset_samples
 
     shutil.copytree(recorded, tmp_path / "copy")
     (tmp_path / "harm.py").write_text(f"open({str(tmp_path / 'harmed')!r}, 'w')\ndef scene(): pass\n")

@@ -15,9 +15,8 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.baselines.amswarm.alternation import Neighbourhood, alternate
-from d4orm_planners.baselines.amswarm.bernstein import Guess, first_coefficients, sample_basis
-from d4orm_planners.baselines.amswarm.planner import AMSwarmConfig, make_method
+from d4orm_planners.baselines.alternation import Guess, Neighbourhood, alternate
+from d4orm_planners.baselines.amswarm import AMSwarmConfig, first_coefficients, make_method, sample_basis
 
 # The polynomials.
 
@@ -54,12 +53,12 @@ def plainly(
 ) -> Any:
     """The coefficients of robot 0 among discs, with all constraints as rows of one matrix, one axis at a time."""
     basis = sample_basis(config.degree, config.lookahead, dt)
-    late = basis.position[-config.goal_steps :]
-    hessian = config.goal_weight * late.T @ late + config.smoothness * basis.jerk.T @ basis.jerk
+    late = basis[0][-config.goal_steps :]
+    hessian = config.goal_weight * late.T @ late + config.smoothness * basis[3].T @ basis[3]
     linear = config.goal_weight * late.sum(axis=0)[:, None] * goal
     centres = [*bodies.paths[1:], *(np.tile(box[:2], (config.lookahead, 1)) for box in bodies.boxes)]
     reach = [bodies.radius[0] + r + bodies.margin for r in (*bodies.radius[1:], *bodies.boxes[:, 4])]
-    rows = np.concatenate([basis.position] * (1 + len(centres)) + [basis.velocity, basis.acceleration])
+    rows = np.concatenate([basis[0]] * (1 + len(centres)) + [basis[1], basis[2]])
 
     def projected(position: Any, velocity: Any, acceleration: Any) -> Any:
         parts = [position]

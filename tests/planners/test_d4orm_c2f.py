@@ -25,8 +25,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import Episode, make_policy, run_episode
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.policy_threads import Background
-from d4orm_planners.d4orm_c2f.coarse_plan import coarse_problem
-from d4orm_planners.d4orm_c2f.coarse_planning import CoarsePlanning
+from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlanning, coarse_problem
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
 from d4orm_planners.d4orm_c2f.fine_plan import Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F

@@ -18,6 +18,7 @@ from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, make_planner
 from d4orm_planners.baselines.collocation import CollocatedMotion, TeamProgram
+from d4orm_planners.baselines.ipopt import solve_program
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 
 MODELS = ("holonomic2d", "holonomic3d", "velocity2d", "differential_drive", "unicycle", "car")
@@ -105,7 +106,7 @@ def test_the_motion_is_what_the_engine_rolls_out(model: str) -> None:
     still = CollocatedMotion(
         np.repeat(problem.start[None].astype(float), 46, axis=0), np.zeros((45, 2, problem.control_size))
     )
-    motion, note = program.solve(still, {}, np.array([45, 45]), {"tol": 1e-3}, lambda: False)
+    motion, note = solve_program(program, still, {}, np.array([45, 45]), {"tol": 1e-3}, lambda: False)
     assert note == "Solve_Succeeded"
     rolled_out = get_sampling_engine("cpu").rollout(problem, motion.controls)
     moving = ~rolled_out.arrived
@@ -149,15 +150,14 @@ def test_an_infeasible_problem_ends_cleanly() -> None:
 
 
 def test_ctrl_c_stops_ipopt(monkeypatch: pytest.MonkeyPatch) -> None:
-    solve = TeamProgram.solve
     timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
 
     def solve_and_be_interrupted(*arguments: Any) -> Any:
         if timer.ident is None:  # not started yet
             timer.start()
-        return solve(*arguments)
+        return solve_program(*arguments)
 
-    monkeypatch.setattr(TeamProgram, "solve", solve_and_be_interrupted)
+    monkeypatch.setattr("d4orm_planners.baselines.ipopt.solve_program", solve_and_be_interrupted)
     problem = make_problem("circle", num_robots=16)
     plan = make_planner("ipopt", engine="cpu", perturbation=2.0).solve(problem, time_limit=60)
     timer.join()

@@ -16,8 +16,7 @@ from d4orm_env.envs.joint_state import JointState
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.rl.detours import Detours
-from d4orm_planners.rl.learned import SEEN_OBSTACLES, SHIPPED
+from d4orm_planners.rl.learned import SEEN_OBSTACLES, SHIPPED, Detours
 from d4orm_planners.rl.network import Header, Network, load_network
 
 OWN, NEIGHBOR, OBSTACLE = 11, 9, 5
@@ -103,8 +102,8 @@ def test_the_policy_of_the_package_is_that_for_the_world() -> None:
         env = navigation_v0.parallel_env(scenario, num_robots=4)
         env.reset(seed=0)
         policy.reset(env)
-        assert bool(policy._actor.network.header.shortest_paths) == along
-        assert policy._actor.network.header.num_obstacles == SEEN_OBSTACLES
+        assert bool(policy._actor.header.shortest_paths) == along
+        assert policy._actor.header.num_obstacles == SEEN_OBSTACLES
 
 
 def test_programs_that_make_the_environment_have_robots_observe_what_the_policy_was_trained_with() -> None:

@@ -17,8 +17,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.baselines.mmd.constraint_tree import Constraint, Planning, count_conflicts, first_conflict
-from d4orm_planners.baselines.mmd.guiding import PathSurroundings, guide
+from d4orm_planners.baselines.mmd.motions import PathSurroundings, drive_motions, guide
 from d4orm_planners.baselines.mmd.path_frame import (
     FEATURES,
     MODES,
@@ -28,7 +27,7 @@ from d4orm_planners.baselines.mmd.path_frame import (
     sine_table,
     world_space,
 )
-from d4orm_planners.baselines.mmd.planner import MMDConfig
+from d4orm_planners.baselines.mmd.planner import Constraint, MMDConfig, Planning, count_conflicts, first_conflict
 from d4orm_planners.baselines.mmd.prior import (
     CLIP,
     LEVELS,
@@ -42,7 +41,6 @@ from d4orm_planners.baselines.mmd.prior import (
     predict,
 )
 from d4orm_planners.baselines.mmd.prior_training import draw_examples, modes_of
-from d4orm_planners.baselines.mmd.tracking import drive_motions
 
 # The network.
 

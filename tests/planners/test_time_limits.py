@@ -13,8 +13,7 @@ from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, list_planners, make_planner
 from d4orm_planners.base.planner_registry import PLANNERS
 from d4orm_planners.base.solve import SolveRun, Stopwatch
-from d4orm_planners.baselines.ipopt import OUT_OF_TIME
-from d4orm_planners.baselines.ipopt_run import ABANDONED
+from d4orm_planners.baselines.ipopt import ABANDONED, OUT_OF_TIME
 from d4orm_planners.engine.sampling_types import SamplingRules, SamplingTask, get_sampling_engine
 from d4orm_planners.sampling.weights import SoftmaxWeights
 

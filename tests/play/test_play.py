@@ -25,8 +25,8 @@ from d4orm_env.scenarios.problem_files import scenario_text
 from d4orm_planners.base.display import markdown_text
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits
-from d4orm_planners.play.scene_frame import closest_approach
 from d4orm_planners.play.session import Session
+from d4orm_planners.play.viewport import closest_approach
 
 TIMEOUT = 60.0
 
@@ -343,7 +343,7 @@ def test_whatever_goes_wrong_goes_wrong_from_the_next_step_on(session: Session, 
     assert len(session.frame.bodies) == (2 if name == "intruder" else 0)
     status = session.frame.status
     assert not status.message
-    until(lambda: session.frame.status.time > status.time or session.frame.finished)
+    until(lambda: session.frame.status.time > status.time or session.frame.status.state == "arrived")
     session.disturb({})
     until(lambda: not session.levels)
     assert not session._viewports[0]._env.unwrapped._simulation.setup.disturbances

@@ -19,9 +19,9 @@ from d4orm_env.envs.features import Features
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.cli import app as cli
-from d4orm_planners.rl.imitation import OTHERS_DRIVE, ImitationSettings, imitate
+from d4orm_planners.rl.dataset.minari_files import Samples, dataset_samples
+from d4orm_planners.rl.imitation import OTHERS_DRIVE, ImitationSettings, imitate, record_samples
 from d4orm_planners.rl.network import load_network
-from d4orm_planners.rl.samples import Samples, dataset_samples, record_samples
 from d4orm_planners.rl.training import TrainingSettings, train
 
 TINY = ImitationSettings(

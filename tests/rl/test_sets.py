@@ -206,7 +206,7 @@ def test_the_network_of_a_training_answers_in_numpy_as_in_torch(trained: Path) -
     import stable_baselines3
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from d4orm_planners.rl.sb3_network import network_of, set_network
+    from d4orm_planners.rl.algorithms import network_of, set_network
 
     network = load_network(trained / "policy.safetensors")
     assert network.header.encoder == "sets"
@@ -421,7 +421,7 @@ def test_a_learner_has_the_settings_asked_for(algorithm: str, settings: dict, tm
 
     asked = replace(TINY, algorithm=algorithm, learner_settings=settings)
     env = VecNormalize(asked.worlds(None))  # type: ignore[arg-type]
-    model = ALGORITHMS[algorithm].make(env, tuned=asked.learner_settings)
+    model = ALGORITHMS[algorithm].make(env, None, asked.learner_settings)
     for name, value in {**ALGORITHMS[algorithm].tunable, **asked.learner_settings}.items():
         had = getattr(model, name)
         assert (had(1.0) if callable(had) else had) == value

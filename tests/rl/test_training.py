@@ -161,7 +161,7 @@ def test_a_trained_policy_acts_as_its_model_does(trained: tuple[TrainingSettings
     assert network.header.training["seed"] == 5
     last = sorted((out / "checkpoints").iterdir())[-1]
     model = getattr(stable_baselines3, settings.algorithm.upper()).load(last / "model.zip", device="cpu")
-    from d4orm_planners.rl.sb3_network import network_of
+    from d4orm_planners.rl.algorithms import network_of
 
     class Same:
         mean = network.arrays["observation_mean"]

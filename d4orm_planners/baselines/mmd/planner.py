@@ -1,27 +1,35 @@
-"""MMD as a planner: single-robot diffusion and conflict-based search."""
+"""MMD as a planner: single-robot diffusion, and conflict-based search over it (CBS, ECBS, xECBS).
+
+The search decides which robot plans again, and under which constraints.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from bisect import insort
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
+from d4orm_env.paths.spaces import Space
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Number, Samples, ShareOrNone, Steps
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.mmd.constraint_tree import Planning, Tree
-from d4orm_planners.baselines.mmd.guiding import guide
-from d4orm_planners.baselines.mmd.path_frame import make_frame, world_space
-from d4orm_planners.baselines.mmd.prior import Denoiser
-from d4orm_planners.baselines.mmd.tracking import motion_kernel
+from d4orm_planners.baselines.mmd.motions import PathSurroundings, guide, motion_kernel
+from d4orm_planners.baselines.mmd.path_frame import PathFrame, make_frame, world_space
+from d4orm_planners.baselines.mmd.prior import Batch, Denoiser
 from d4orm_planners.mapf.planner import NoPaths
 
+SLACK = 1 / 75
+"""Added to distances when conflicts are sought, for rounding, in radii of the largest robot."""
+PADDING = 2
+"""Number of a motion's 64 points by which a constraint outlasts its conflict on either side, as published."""
+
 Stretch = Annotated[Number, Field(ge=1, le=100)]
-GuideSteps = Annotated[Count, Field(le=1000)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +58,7 @@ class MMDConfig(PlannerConfig):
     num_samples: Samples = 32
     num_steps: Steps = 25
     guide_from: ShareOrNone = 0.5
-    guide_steps: GuideSteps = 4
+    guide_steps: Annotated[Count, Field(le=1000)] = 4
     noise_scale: NotNegative = 0.5
     reuse_steps: Count | None = 3
     soft_pull: ShareOrNone = 0.5
@@ -63,6 +71,193 @@ class MMDConfig(PlannerConfig):
         super().__post_init__()
         if self.slowest < self.quickest:
             raise ValueError(f"slowest is {self.slowest:g}; it must be at least quickest, which is {self.quickest:g}")
+
+
+def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> IntArray:
+    """``(B, 2)`` numbers of other robots that each of some paths conflicts with, and of steps at which it does.
+
+    Args:
+        positions: ``(B, T, 3)`` the paths [m].
+        others: ``(S, T, 3)`` where the others are [m].
+        distances: ``(S,)`` to keep from each [m].
+    """
+    steps = _too_near(positions[:, None] - others, distances[:, None]).sum(axis=2)
+    return np.stack([(steps > 0).sum(axis=1), steps.sum(axis=1)], axis=1)
+
+
+def first_conflict(positions: Floats, distances: Floats) -> tuple[int, int, tuple[int, int]]:
+    """Number of pairs in conflict, and the step and the robots of the earliest conflict; robots are -1 for none.
+
+    Args:
+        positions: ``(K, T, 3)`` [m].
+        distances: ``(K, K)`` to keep [m].
+    """
+    one, other = np.tril_indices(len(positions), -1)
+    near = _too_near(positions[one] - positions[other], distances[one, other, None])
+    if not near.any():
+        return 0, positions.shape[1], (-1, -1)
+    step = int(near.any(axis=0).argmax())
+    pair = int(near[:, step].argmax())
+    return int(near.any(axis=1).sum()), step, (int(one[pair]), int(other[pair]))
+
+
+def _too_near(gaps: Floats, distances: Floats) -> BoolArray:
+    """Check which gaps ``(..., 3)`` are no longer than the distances to keep [m]."""
+    return gaps[..., 0] ** 2 + gaps[..., 1] ** 2 + gaps[..., 2] ** 2 <= distances**2
+
+
+class Constraint(NamedTuple):
+    """A sphere that one robot's centre has to be out of for some steps."""
+
+    sphere: tuple[float, float, float, float]  #: Centre and radius [m]
+    span: tuple[int, int]  #: First and last step
+
+
+@dataclass(frozen=True, eq=False)
+class RobotMotion:
+    """Motion of one robot in a node of the tree."""
+
+    motions: FloatArray  #: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with
+    controls: FloatArray  #: ``(H, m)``
+    positions: Floats  #: ``(H+1, 3)`` [m]
+    cost: int  #: Steps until it arrives
+    fails: bool  #: Whether it comes too near to an obstacle or does not arrive
+
+
+@dataclass(frozen=True, order=True)
+class TreeNode:
+    """A node of the tree; the one to be expanded next is the least."""
+
+    conflicts: int  #: Pairs in conflict, and robots that fail by themselves
+    cost: int  #: Sum of the robots' steps until arrival
+    number: int  #: Of the node, counted as they are made
+    motions: tuple[RobotMotion, ...] = field(compare=False)  #: Of the robots
+    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)  #: Of each robot
+    pair: tuple[int, int] = field(compare=False)  #: Two robots in conflict, or -1
+    step: int = field(compare=False)  #: Of their conflict
+
+    @property
+    def controls(self) -> FloatArray:
+        """``(H, K, m)``."""
+        return np.stack([motion.controls for motion in self.motions], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Tree:
+    """The state of the search: nodes that are not expanded yet, best first, and how many were made."""
+
+    frames: tuple[PathFrame, ...]
+    space: Space
+    nodes: tuple[TreeNode, ...]
+    made: int
+
+    def with_nodes(self, added: list[TreeNode]) -> Tree:
+        """The tree with its best node expanded to these."""
+        nodes = list(self.nodes[1:])
+        for node in added:
+            insort(nodes, node)
+        return replace(self, nodes=tuple(nodes), made=self.made + len(added))
+
+
+class Planning:
+    """Planner of one robot around the others of a problem; all that changes is in nodes."""
+
+    def __init__(
+        self, problem: Problem, config: MMDConfig, denoiser: Denoiser, frames: tuple[PathFrame, ...], space: Space
+    ) -> None:
+        self._problem, self._config, self._denoiser = problem, config, denoiser
+        self._frames, self._space = frames, space
+        radius, self._slack = np.asarray(problem.team.radius, np.float64), SLACK * problem.team.largest_radius
+        self._distances: Floats = radius[:, None] + radius + problem.margin + self._slack
+        self.steps = 0
+
+    def root(self, seeds: list[int]) -> TreeNode:
+        """All robots' motions, one after another around those that have planned (soft constraints only)."""
+        motions: list[RobotMotion] = []
+        for robot, seed in enumerate(seeds):
+            motions.append(self._plan(robot, motions, list(range(robot)), (), seed, None))
+        return self.node(0, tuple(motions), ((),) * len(seeds))
+
+    def node(
+        self, number: int, motions: tuple[RobotMotion, ...], constraints: tuple[tuple[Constraint, ...], ...]
+    ) -> TreeNode:
+        """A node with its conflicts counted and the first one found."""
+        positions = np.stack([motion.positions for motion in motions])
+        pairs, step, pair = first_conflict(positions, self._distances)
+        failing = sum(motion.fails for motion in motions)
+        cost = sum(motion.cost for motion in motions)
+        return TreeNode(pairs + failing, cost, number, motions, constraints, pair, step)
+
+    def children(self, node: TreeNode, number: int, seeds: list[int], unlucky: int) -> list[TreeNode]:
+        """Return a node's children: for each of two robots in conflict, one in which it keeps clear of where they met.
+
+        In a node without a pair in conflict a robot that fails plans from noise, or if none does, ``unlucky``.
+        """
+        one, another = node.pair
+        if one < 0:
+            failing = [robot for robot, motion in enumerate(node.motions) if motion.fails]
+            robot = failing[0] if failing else unlucky
+            return [self._child(node, number, robot, node.constraints[robot], seeds[0], from_noise=True)]
+        added = []
+        for count, (robot, other) in enumerate(((one, another), (another, one))):
+            own = (*node.constraints[robot], self._constraint(node, robot, other))
+            added.append(self._child(node, number + count, robot, own, seeds[count], from_noise=False))
+        return added
+
+    def _child(
+        self, node: TreeNode, number: int, robot: int, own: tuple[Constraint, ...], seed: int, *, from_noise: bool
+    ) -> TreeNode:
+        others = [other for other in range(len(node.motions)) if other != robot]
+        before = None if from_noise or self._config.reuse_steps is None else node.motions[robot].motions
+        motion = self._plan(robot, list(node.motions), others, own, seed, before)
+        motions = tuple(motion if k == robot else kept for k, kept in enumerate(node.motions))
+        constraints = tuple(own if k == robot else kept for k, kept in enumerate(node.constraints))
+        return self.node(number, motions, constraints)
+
+    def _constraint(self, node: TreeNode, robot: int, other: int) -> Constraint:
+        """To keep out of a sphere about the middle between two robots for a while."""
+        middle = (node.motions[robot].positions[node.step] + node.motions[other].positions[node.step]) / 2
+        radius = self._config.constraint_radius * self._distances[robot, other]
+        motion = self._frames[robot].quickest * self._config.quickest / self._problem.dt
+        padding = max(1, round(PADDING * motion / 64))
+        x, y, z = map(float, middle)
+        return Constraint((x, y, z, float(radius)), (node.step - padding, node.step + padding))
+
+    def _plan(
+        self,
+        robot: int,
+        motions: list[RobotMotion],
+        others: list[int],
+        constraints: tuple[Constraint, ...],
+        seed: int,
+        before: FloatArray | None,
+    ) -> RobotMotion:
+        """The motion of a robot that conflicts least with these others, of those that were denoised together."""
+        config, frame = self._config, self._frames[robot]
+        paths = np.stack([motions[other].positions for other in others]) if others else np.empty((0, 1, 3))
+        distances = self._distances[robot, others]
+        surroundings = PathSurroundings(
+            space=self._space,
+            clearance=frame.safety_distance + config.clearance * self._problem.stride,
+            size=self._problem.team.largest_radius,
+            dt=self._problem.dt,
+            spheres=np.array([constraint.sphere for constraint in constraints]).reshape(-1, 4),
+            spans=np.array([constraint.span for constraint in constraints], np.int64).reshape(-1, 2),
+            others=paths,
+            radii=distances * config.constraint_radius,
+            pull=config.soft_pull,
+        )
+        batch = self._denoiser.denoise(robot, frame, surroundings, seed, before)
+        self.steps += batch.steps
+        return self._choose(batch, paths, distances, frame.safety_distance)
+
+    def _choose(self, batch: Batch, paths: Floats, distances: Floats, safety_distance: float) -> RobotMotion:
+        driven = batch.driven
+        counts = count_conflicts(driven.positions, paths, distances)
+        fails = (driven.arrivals > self._problem.horizon) | (driven.clearances < safety_distance + self._slack)
+        best = int(np.lexsort((driven.arrivals, counts[:, 1], counts[:, 0], fails))[0])
+        controls, positions = driven.controls[best].copy(), driven.positions[best].copy()
+        return RobotMotion(batch.motions, controls, positions, int(driven.arrivals[best]), bool(fails[best]))
 
 
 class MMD(Planner):

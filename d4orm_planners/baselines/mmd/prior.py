@@ -20,9 +20,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.engine.sample_noise import draw_normals, draw_uniforms
-from d4orm_planners.baselines.mmd.guiding import PathSurroundings, guide
+from d4orm_planners.baselines.mmd.motions import PathSurroundings, TrackedMotions, drive_motions, guide
 from d4orm_planners.baselines.mmd.path_frame import FEATURES, MODES, PathFrame, sine_table
-from d4orm_planners.baselines.mmd.tracking import TrackedMotions, drive_motions
 
 if TYPE_CHECKING:
     from d4orm_planners.baselines.mmd.planner import MMDConfig

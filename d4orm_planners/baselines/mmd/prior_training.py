@@ -157,8 +157,7 @@ class DenoisingNetwork(nn.Module):
         layer = torch.relu(self.into(torch.cat([noisy, level], dim=1)) + self.context(features))
         for hidden in self.hidden:
             layer = layer + torch.relu(hidden(layer))
-        result: Tensor = self.out(layer)
-        return result
+        return self.out(layer)
 
 
 def train(

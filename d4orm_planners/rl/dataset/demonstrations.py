@@ -34,9 +34,10 @@ if TYPE_CHECKING:
 AGENTS = ("team", "robot")
 """Owner of an episode of a dataset."""
 
-
 MAX_BYTES = 2**31
 """Largest array of an episode that is read."""
+UNREADABLE = (ValueError, KeyError, EOFError, RecursionError, zipfile.BadZipFile, zlib.error)
+"""Errors of reading arrays from a file that holds something else."""
 _FLAGS = ("acting", "terminations", "arrived", "collided", "margin_violated")
 _OF_STEPS = ("actions", "acting", "rewards", "terminations")
 """Arrays of ``T`` moments; the others have one more."""
@@ -147,32 +148,21 @@ def _described(thing: object) -> object:
 
 @dataclass(frozen=True, eq=False)
 class RecordedEpisode:
-    """One episode of a team, ``T`` steps long: every robot at every time, those that have docked included.
+    """One episode of a team, ``T`` steps long: every robot at every time, those that have docked included."""
 
-    Attributes:
-        observations: ``(T+1, K, D)`` float32.
-        actions: ``(T, K, m)`` float32 as the policy gave them, in physical units, before anything disturbed or clipped
-            them; zero for robots that have left.
-        acting: ``(T, K)`` bool: whose action counted.
-        rewards: ``(T, K)`` float32 of every robot.
-        terminations: ``(T, K)`` bool: which robots the step ended for, because they had arrived.
-        arrived: ``(T+1, K)`` bool, likewise ``collided`` and ``margin_violated``.
-        distance_to_goal: ``(T+1, K)`` float32 [m].
-        state: ``(T+1, S)`` float32, ``env.state()``.
-        metadata: Seed, digest of the problem, and the episode's metrics.
-    """
-
-    observations: FloatArray
+    observations: FloatArray  #: ``(T+1, K, D)`` float32
+    #: ``(T, K, m)`` float32 as the policy gave them, in physical units, before anything disturbed or clipped them;
+    #: zero for robots that have left
     actions: FloatArray
-    acting: BoolArray
-    rewards: FloatArray
-    terminations: BoolArray
-    arrived: BoolArray
+    acting: BoolArray  #: ``(T, K)`` bool: whose action counted
+    rewards: FloatArray  #: ``(T, K)`` float32 of every robot
+    terminations: BoolArray  #: ``(T, K)`` bool: which robots the step ended for, because they had arrived
+    arrived: BoolArray  #: ``(T+1, K)`` bool, likewise ``collided`` and ``margin_violated``
     collided: BoolArray
     margin_violated: BoolArray
-    distance_to_goal: FloatArray
-    state: FloatArray
-    metadata: Mapping[str, Any]
+    distance_to_goal: FloatArray  #: ``(T+1, K)`` float32 [m]
+    state: FloatArray  #: ``(T+1, S)`` float32, ``env.state()``
+    metadata: Mapping[str, Any]  #: Seed, digest of the problem, and the episode's metrics
 
     @property
     def success(self) -> bool:
@@ -198,7 +188,7 @@ class RecordedEpisode:
                 arrays = {name: archive.array(name, MAX_BYTES) for name in _ARRAYS}
                 metadata = json.loads(archive.array("metadata", MAX_BYTES).tobytes())
             _check(arrays, metadata)
-        except (ValueError, KeyError, EOFError, RecursionError, zipfile.BadZipFile, zlib.error) as error:
+        except UNREADABLE as error:
             raise ValueError(f"{path} is no recorded episode ({error}); remove it to record it anew") from None
         return cls(**arrays, metadata=metadata)
 

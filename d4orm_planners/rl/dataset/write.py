@@ -51,41 +51,17 @@ class Recording:
 
     folder: Path
 
-    def claim(self, demonstrations: Demonstrations) -> None:
-        """Make the folder, or find out whether it is one for the same demonstrations.
-
-        Raises:
-            ValueError: If it is not.
-            OSError: If it cannot be made.
-        """
-        self.folder.mkdir(parents=True, exist_ok=True)
-        claim_folder(self.folder / IDENTITY, demonstrations.identity, "a dataset")
-
     def seeds(self, kind: str = _WHOLE) -> set[int]:
         """Seeds of the episodes that are there, or of those that have been left out."""
         return {int(path.stem) for path in self.folder.glob(f"*.{kind}") if path.stem.isdecimal()}
 
-    def load(self, seed: int) -> RecordedEpisode:
-        """The episode of a seed.
-
-        Raises:
-            ValueError: If the file is damaged.
-        """
-        return RecordedEpisode.load(self._path(seed))
+    def path(self, seed: int, kind: str = _WHOLE) -> Path:
+        """File of the episode of a seed."""
+        return self.folder / f"{seed}.{kind}"
 
     def forget(self, seed: int) -> None:
         """Remove the episode of a seed."""
-        self._path(seed).unlink(missing_ok=True)
-
-    def keep(self, seed: int, episode: RecordedEpisode | None) -> None:
-        """Write down an episode, or that it is left out."""
-        if episode is None:
-            self._path(seed, _DROPPED).touch()
-        else:
-            episode.save(self._path(seed))
-
-    def _path(self, seed: int, kind: str = _WHOLE) -> Path:
-        return self.folder / f"{seed}.{kind}"
+        self.path(seed).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -104,8 +80,10 @@ class _Task:
         except Exception as error:  # whatever a policy raises
             yield self.seed, describe(error)
             return
-        dropped = self.demonstrations.only_success and not episode.success
-        self.recording.keep(self.seed, None if dropped else episode)
+        if self.demonstrations.only_success and not episode.success:
+            self.recording.path(self.seed, _DROPPED).touch()
+        else:
+            episode.save(self.recording.path(self.seed))
         yield self.seed, ""
 
     def lost(self, done: int, reason: str) -> tuple[list[tuple[int, str]], None]:
@@ -149,7 +127,8 @@ def write_dataset(
     name = checked_id(demonstrations.dataset_id if dataset_id is None else dataset_id)
     folder = (dataset_folder(name) if out is None else Path(out)).absolute()  # Minari takes no other
     recording, files = Recording(folder / "recording"), dataset_files(demonstrations, folder / "data")
-    recording.claim(demonstrations)
+    recording.folder.mkdir(parents=True, exist_ok=True)
+    claim_folder(recording.folder / IDENTITY, demonstrations.identity, "a dataset")
     _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
     _pack(recording, files, shard_size)
     files.write_main(_metadata(demonstrations, name, len(recording.seeds(_DROPPED))))
@@ -237,13 +216,12 @@ def _pack(recording: Recording, files: DatasetFiles, shard_size: int) -> None:
     seeds = sorted(recording.seeds())
     for begin in range(0, len(seeds), shard_size):
         part = seeds[begin : begin + shard_size]
-        files.add_shard([recording.load(seed) for seed in part])
+        files.add_shard([RecordedEpisode.load(recording.path(seed)) for seed in part])
         for seed in part:
             recording.forget(seed)
 
 
 def _metadata(demonstrations: Demonstrations, dataset_id: str, dropped: int) -> dict[str, object]:
-    """Return the metadata of the dataset."""
     identity = demonstrations.identity
     return {
         "dataset_id": dataset_id,

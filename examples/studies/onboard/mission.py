@@ -12,7 +12,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from d4orm_env import Problem, Team, World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.d4orm_d.planner import D4ormDConfig
-from d4orm_planners.d_d4orm.settings import DD4ormConfig
+from d4orm_planners.d_d4orm.planner import DD4ormConfig
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 
 TICK = 0.1

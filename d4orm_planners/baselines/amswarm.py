@@ -1,7 +1,12 @@
-"""AMSwarm, the rival of the paper's section VIII-C, as a planner."""
+"""AMSwarm, the rival of the paper's section VIII-C: receding-horizon planning, every robot for itself.
+
+Motions are Bernstein polynomials of the time, sampled at every step of a horizon (R. T. Farouki, *The Bernstein
+polynomial basis: a centennial retrospective*, Computer Aided Geometric Design, 2012).
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -17,8 +22,7 @@ from d4orm_env.engine.types import Engine
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig, State
 from d4orm_planners.base.settings import Count, NotNegative, Number, Positive, Share, Steps
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.amswarm.alternation import Neighbourhood, alternate
-from d4orm_planners.baselines.amswarm.bernstein import Guess, Method, first_coefficients, sample_basis
+from d4orm_planners.baselines.alternation import Guess, Method, Neighbourhood, alternate
 from d4orm_planners.tracking.steering import present_velocities, track_velocities
 
 
@@ -111,14 +115,59 @@ class Swarm:
         return Guess(positions + share * ahead, still, still)
 
 
+def sample_basis(degree: int, steps: int, dt: float) -> Floats:
+    """``(4, T, n+1)`` the basis of a degree ``n`` of at least 3, sampled after each of ``T`` steps of ``dt`` [s].
+
+    A motion with coefficients ``c`` ``(n+1, d)`` has the positions ``basis[0] @ c``, and then velocities [1/s],
+    accelerations [1/s^2] and jerks [1/s^3].
+    """
+    times = np.arange(1, steps + 1) / steps
+    scale, derivatives = 1.0, []
+    for order in range(4):
+        values = scale * _polynomials(degree - order, times)
+        # A polynomial's derivative is n times the difference of two of degree n - 1.
+        for _ in range(order):
+            values = -np.diff(values, axis=1, prepend=0, append=0)
+        derivatives.append(values)
+        scale *= (degree - order) / (steps * dt)
+    return np.stack(derivatives)
+
+
+def first_coefficients(
+    degree: int, duration: float, position: Floats, velocity: Floats, acceleration: Floats
+) -> Floats:
+    """``(3, ...)`` the coefficients that a motion of ``duration`` [s] begins with in that state."""
+    second = position + velocity * duration / degree
+    third = 2 * second - position + acceleration * duration**2 / (degree * (degree - 1))
+    return np.stack([position, second, third])
+
+
+def _polynomials(degree: int, times: Floats) -> Floats:
+    """``(T, degree+1)`` values of the Bernstein polynomials at times from 0 to 1."""
+    values = np.empty((len(times), degree + 1))
+    for index in range(degree + 1):
+        values[:, index] = math.comb(degree, index) * _power(times, index) * _power(1 - times, degree - index)
+    return values
+
+
+def _power(base: Floats, exponent: int) -> Floats:
+    """Return a power by multiplication, which has the same bits on every processor."""
+    result = np.ones_like(base)
+    for _ in range(exponent):
+        result = result * base
+    return result
+
+
 def make_method(config: AMSwarmConfig, dt: float, stride: float) -> Method:
     """The settings as the kernel takes them, for steps of ``dt`` [s] in which robots drive ``stride`` [m] at most."""
     basis = sample_basis(config.degree, config.lookahead, dt)
-    late = basis.position[-min(config.goal_steps, config.lookahead) :]
+    late = basis[0, -min(config.goal_steps, config.lookahead) :]
     squares = [_squares(samples) for samples in basis[:3]]
-    squares.append(config.goal_weight * _squares(late) + config.smoothness * _squares(basis.jerk))
+    squares.append(config.goal_weight * _squares(late) + config.smoothness * _squares(basis[3]))
     return Method(
-        *basis[:3],
+        position=basis[0],
+        velocity=basis[1],
+        acceleration=basis[2],
         squares=np.stack(squares),
         goal=config.goal_weight * late.sum(axis=0),
         barrier=config.barrier,
@@ -150,11 +199,6 @@ def _one_step_on(guess: Guess, dt: float) -> Guess:
     return Guess(position, velocity, acceleration)
 
 
-Degree = Annotated[Count, Field(ge=5, le=30)]
-Lookahead = Annotated[Count, Field(ge=2, le=1000)]
-Growth = Annotated[Number, Field(ge=1, le=10)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class AMSwarmConfig(PlannerConfig):
     """Settings of :class:`AMSwarm`; lengths are in steps of the fastest robot at full speed.
@@ -177,8 +221,8 @@ class AMSwarmConfig(PlannerConfig):
     """
 
     max_iterations: Count = 20
-    lookahead: Lookahead = 40
-    degree: Degree = 10
+    lookahead: Annotated[Count, Field(ge=2, le=1000)] = 40
+    degree: Annotated[Count, Field(ge=5, le=30)] = 10
     goal_steps: Count = 32
     goal_weight: Positive = 1.0
     smoothness: NotNegative = 1e-4
@@ -187,7 +231,7 @@ class AMSwarmConfig(PlannerConfig):
     clearance: NotNegative = 0.3
     perturbation: NotNegative = 0.5
     penalty: Positive = 2.0
-    growth: Growth = 1.05
+    growth: Annotated[Number, Field(ge=1, le=10)] = 1.05
     alternations: Steps = 100
     tolerance: Positive = 0.05
 

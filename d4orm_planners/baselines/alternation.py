@@ -17,18 +17,43 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, Floats, Whole
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_planners.baselines.amswarm.bernstein import (
-    Guess,
-    Method,
-    Targets,
-    accumulate,
-    raise_multiplier,
-    sample,
-    solve,
-)
 
 MOST_PENALTY = 5e7
 """Largest weight of the constraints, as in the authors' code: it would overflow in the end."""
+
+
+class Method(NamedTuple):
+    """Weights and limits of the alternation, with its basis."""
+
+    position: Floats  #: ``(T, n+1)`` samples of the basis, as the next two
+    velocity: Floats  #: ``(T, n+1)``
+    acceleration: Floats  #: ``(T, n+1)``
+    #: ``(4, n+1, n+1)`` sums of squares over all steps: of the constraints on positions, velocities and accelerations,
+    #: and of the objective
+    squares: Floats
+    goal: Floats  #: ``(n+1,)`` what the objective wants of the coefficients, per metre of goal
+    barrier: float  #: Share ``gamma`` of its distance beyond the safety distance that a robot may use up in a step
+    lookout: float  #: Bodies are avoided that come within the safety distance and this [m]
+    penalty: float  #: First weight ``rho`` of the constraints
+    growth: float  #: Factor by which it grows from one alternation to the next
+    alternations: int  #: At most
+    tolerance: float  #: Largest violation, and change of a position, at which it ends, in SI units
+
+
+class Guess(NamedTuple):
+    """Samples of a motion at steps 1 to T, each ``(T, d)``: positions [m], velocities [m/s], accelerations [m/s^2]."""
+
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+
+
+class Targets(NamedTuple):
+    """Sums over all constraints that directions and lengths make of a :class:`Guess`, each ``(T, d)``."""
+
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
 
 
 class Neighbourhood(NamedTuple):
@@ -76,19 +101,19 @@ def alternate(
     squares = rows * method.squares[0] + method.squares[1] + bends * method.squares[2]
     violation, penalty = _project(method, bodies, robot, limits, active, motion[0], guess, targets), method.penalty
     for _ in range(method.alternations):
-        accumulate(method, targets, bends, right)
+        _accumulate(method, targets, bends, right)
         for i in range(size):
             for j in range(size):
                 matrix[i, j] = method.squares[3, i, j] + penalty * squares[i, j]
             for axis in range(d):
                 right[i, axis] = method.goal[i] * goal[axis] + multiplier[i, axis] + penalty * right[i, axis]
-        solve(matrix, right, fixed, motion)
-        change = sample(method, motion, guess)
+        _solve(matrix, right, fixed, motion)
+        change = _sample(method, motion, guess)
         violation = _project(method, bodies, robot, limits, active, motion[0], guess, targets)
         if max(violation, change) <= method.tolerance:
             break
-        accumulate(method, targets, bends, right)
-        raise_multiplier(squares, motion, right, penalty, multiplier)
+        _accumulate(method, targets, bends, right)
+        _raise_multiplier(squares, motion, right, penalty, multiplier)
         penalty = min(penalty * method.growth, MOST_PENALTY)
     return violation
 
@@ -220,3 +245,71 @@ def _shorten(vector: Floats, most: float, target: Floats) -> float:
     for axis in range(len(vector)):
         target[axis] = factor * vector[axis]
     return length - most
+
+
+@compiled
+def _raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: float, multiplier: Floats) -> None:
+    """Add to the multiplier ``(n+1, d)`` what the constraints are violated by."""
+    size, d = motion.shape
+    for i in range(size):
+        for axis in range(d):
+            now = 0.0
+            for j in range(size):
+                now += squares[i, j] * motion[j, axis]
+            multiplier[i, axis] -= penalty * (now - right[i, axis])
+
+
+@compiled
+def _accumulate(method: Method, targets: Targets, bends: float, right: Floats) -> None:
+    """Add up the targets' share of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
+    (steps, size), d = method.position.shape, right.shape[1]
+    for i in range(size):
+        for axis in range(d):
+            total = 0.0
+            for step in range(steps):
+                total += method.position[step, i] * targets.position[step, axis]
+                total += method.velocity[step, i] * targets.velocity[step, axis]
+                total += bends * method.acceleration[step, i] * targets.acceleration[step, axis]
+            right[i, axis] = total
+
+
+@compiled
+def _solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
+    """The free coefficients of a positive definite system, by Cholesky's method; overwrites its arguments."""
+    size, d = motion.shape
+    for i in range(fixed, size):
+        for axis in range(d):
+            for j in range(fixed):
+                right[i, axis] -= matrix[i, j] * motion[j, axis]
+        for j in range(fixed, i + 1):
+            for k in range(fixed, j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(matrix[i, i]) if i == j else matrix[i, j] / matrix[j, j]
+    for axis in range(d):
+        for i in range(fixed, size):
+            for k in range(fixed, i):
+                right[i, axis] -= matrix[i, k] * right[k, axis]
+            right[i, axis] /= matrix[i, i]
+        for i in range(size - 1, fixed - 1, -1):
+            for k in range(i + 1, size):
+                right[i, axis] -= matrix[k, i] * right[k, axis]
+            right[i, axis] /= matrix[i, i]
+            motion[i, axis] = right[i, axis]
+
+
+@compiled
+def _sample(method: Method, motion: Floats, guess: Guess) -> float:
+    """Make the guess the samples of a motion; return the largest change of a position along an axis [m]."""
+    (steps, size), d, change = method.position.shape, motion.shape[1], 0.0
+    for step in range(steps):
+        for axis in range(d):
+            position = velocity = acceleration = 0.0
+            for i in range(size):
+                position += method.position[step, i] * motion[i, axis]
+                velocity += method.velocity[step, i] * motion[i, axis]
+                acceleration += method.acceleration[step, i] * motion[i, axis]
+            change = max(change, abs(position - guess.position[step, axis]))
+            guess.position[step, axis] = position
+            guess.velocity[step, axis] = velocity
+            guess.acceleration[step, axis] = acceleration
+    return change

@@ -1,1 +1,0 @@
-"""AMSwarm: receding-horizon planning by alternating minimisation, every robot for itself."""
