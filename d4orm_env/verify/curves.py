@@ -53,7 +53,7 @@ def verify_curves(
     watches = [pairs, *obstacles]
 
     def robots_at(samples: Indices) -> tuple[Floats, Floats]:
-        times: Floats = samples.ravel() * (dt / sub_steps)
+        times = samples.ravel().astype(np.float64) * (dt / sub_steps)
         path = position(times).reshape(*samples.shape, len(radius), problem.dimension)
         return path, heading(times).reshape(*samples.shape, len(radius))
 
