@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,8 @@ SHORTER = 3
 """Divisor of the fresh steps that a robot takes before it stops if it would violate the margin otherwise."""
 NEAREST = 256
 """Pairs among which the least gap is looked for at first."""
+FEWER, IN_TIME = (1, 2, 4), 0.8
+"""Divisors of the denoising steps where a deadline leaves no time for all, and the share of it that is used."""
 
 
 class Prediction(NamedTuple):
@@ -27,6 +30,7 @@ class Prediction(NamedTuple):
     controls: FloatArray  #: ``(H_predict + S, K, m)`` with the ``S`` steps that a stop may take
     positions: FloatArray  #: ``(1 + H_predict + S, K, d)`` where they lead, with the present position first [m]
     gap: float  #: Least gap between the surfaces of any two robots that they keep [m]; infinite for one robot
+    num_steps: int = 0  #: Denoising steps made
 
 
 class Situation(NamedTuple):
@@ -55,7 +59,9 @@ class Window:
     def __init__(self, problem: Problem, config: D4ormC2FConfig, engine: SamplingEngine, docks: bool) -> None:
         self.problem, self._config, self._engine, self._docks = problem, config, engine, docks
         self._rules = SamplingRules(config.weights)
-        self._noise_scale = config.noise_scale(config.num_steps)
+        divisors = FEWER if config.deadline is not None else FEWER[:1]
+        self._schedules = [config.noise_scale(-(-config.num_steps // divisor)) for divisor in divisors]
+        self._seconds = 0.0, 0.0  # of a denoising step, and of all the rest, in the last loop
         limits = problem.team.limits
         self._stop_steps = int(np.ceil(np.max(limits[:, 0] / (limits[:, 1] * problem.dt))))
 
@@ -63,7 +69,8 @@ class Window:
         """Compile, so that the first control loop is as quick as the others."""
         window = self.problem.with_state(joint.states, joint.goals, horizon=self._config.predict_horizon)
         task = SamplingTask(window, self.no_controls(), arrived=joint.arrived)
-        self._engine.prepare(task, self._rules, self._noise_scale, self._config.num_samples)
+        for schedule in self._schedules:
+            self._engine.prepare(task, self._rules, schedule, self._config.num_samples)
         self.stop(joint)
 
     def no_controls(self) -> FloatArray:
@@ -71,13 +78,26 @@ class Window:
         shape = (self._config.predict_horizon, self.problem.num_robots, self.problem.control_size)
         return np.zeros(shape, np.float32)
 
-    def predict(self, now: Situation, seed: int) -> Prediction:
-        """Fine controls towards the subgoals."""
+    def predict(self, now: Situation, seed: int, seconds: float | None = None) -> Prediction:
+        """Fine controls towards the subgoals, by as many denoising steps as there is time for if ``seconds`` are left.
+
+        The time that steps take is that of the last loop.
+        """
+        step, rest = self._seconds
+        left = np.inf if seconds is None else IN_TIME * seconds - rest
+        schedule = next((each for each in self._schedules if len(each) * step <= left), self._schedules[-1])
+        began = perf_counter()
+        mean = self._engine.denoise(
+            self._task(now), self._rules, np.zeros_like(now.base), schedule, self._config.num_samples, seed
+        ).mean
+        denoised = perf_counter()
+        prediction = self._from_samples(now, mean)
+        self._seconds = (denoised - began) / len(schedule), perf_counter() - denoised
+        return prediction._replace(num_steps=len(schedule))
+
+    def _from_samples(self, now: Situation, mean: FloatArray) -> Prediction:
         problem, config = self.problem, self._config
-        result = self._engine.denoise(
-            self._task(now), self._rules, np.zeros_like(now.base), self._noise_scale, config.num_samples, seed
-        )
-        sampled = np.clip(now.base + result.mean, *problem.team.control_bounds).astype(np.float32)
+        sampled = np.clip(now.base + mean, *problem.team.control_bounds).astype(np.float32)
         controls = sampled if now.careful is None else np.where(now.stuck[:, None], now.careful, sampled)
         radius = arrival_radius(problem, self._docks)
         joint, horizon = now.joint, config.predict_horizon

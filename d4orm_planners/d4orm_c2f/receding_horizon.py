@@ -51,6 +51,7 @@ class LoopRecord:
     missed: bool  #: Whether it took longer than the deadline, so that the last plan went on
     replanned: bool  #: Whether the guidance was planned anew
     refined: bool  #: Whether a refined guidance was taken over
+    num_steps: int  #: Denoising steps made; fewer than the settings say where a deadline asks for it
 
 
 class D4ormC2F(StatePolicy):
@@ -197,13 +198,15 @@ class D4ormC2F(StatePolicy):
         careful = tracker.followed(joint, len(base)) if stuck.any() else None
         inflation, limit = self._deviation.margin_inflation(self.config.reaction_time), self.config.deadline
         now = Situation(joint, arrived, subgoals, base, left, careful, stuck, inflation)
-        work = partial(self._window.predict, now, seed)
-        result = self._control.run(work, None if limit is None else limit - (time.perf_counter() - begin))
-        margin, missed = float("nan"), result is None
+        seconds = None if limit is None else limit - (time.perf_counter() - begin)
+        result = self._control.run(partial(self._window.predict, now, seed, seconds), seconds)
+        margin, num_steps = float("nan"), 0
         if result is not None:
-            self._plan, self._next, self.predicted, margin = result.controls, 0, result.positions, result.gap
+            self._plan, self._next, self.predicted, margin, num_steps = result.controls, 0, *result[1:]
         used = time.perf_counter() - begin
-        self.loops.append(LoopRecord(joint.steps, used, int(targets.max()), margin, missed, replanned, refined))
+        self.loops.append(
+            LoopRecord(joint.steps, used, int(targets.max()), margin, result is None, replanned, refined, num_steps)
+        )
 
     def _base(self, joint: JointState) -> FloatArray:
         """``(H_predict, K, m)`` controls to deform: what is left of the last loop's.

@@ -90,8 +90,9 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
         replan_distance: The guidance is planned anew for robots this far from it, and for all if they are so on
             average, in steps of the fastest at full speed.
         patience: Steps without progress towards the goals after which the guidance is planned anew too.
-        deadline: Seconds that a control loop may take; one that takes longer is left behind, and the last plan goes on.
-            ``None`` waits for every loop.
+        deadline: Seconds that a control loop may take. Loops that would take longer make a half or a quarter of
+            ``num_steps``; one that does all the same is left behind, and the last plan goes on. ``None`` waits for
+            every loop.
         control_noise_std: Gaussian noise that the controller adds to its controls, in their units.
 
     Raises:

@@ -223,10 +223,10 @@ def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.Monk
     policy = controller(deadline=1.0)
     in_time = Window.predict
 
-    def predict(self: Window, now: Any, seed: int) -> Any:
+    def predict(self: Window, now: Any, *rest: Any) -> Any:
         if now.joint.steps == 10:
             time.sleep(1.3)
-        return in_time(self, now, seed)
+        return in_time(self, now, *rest)
 
     monkeypatch.setattr(Window, "predict", predict)
     executed = episode(policy, problem)
@@ -235,6 +235,26 @@ def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.Monk
     assert executed.trajectory.controls[10].any()
     assert not policy.loops[20].missed
     assert_verified(problem, executed)
+
+
+def test_loops_with_a_deadline_make_as_many_steps_as_there_is_time_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step takes 50 ms: of 20, 10 and 5 only the last are done within half a second, and without a deadline all."""
+    problem, at_once = circle(4), CpuSamplingEngine.denoise
+
+    def slow(self: CpuSamplingEngine, task: Any, rules: Any, mean: Any, schedule: Any, *rest: Any) -> Any:
+        time.sleep(0.05 * len(schedule))
+        return at_once(self, task, rules, mean, schedule, *rest)
+
+    policies = controller(deadline=0.5), controller()
+    for policy, steps in zip(policies, ({5}, {20}), strict=True):
+        env = navigation_v0.parallel_env(problem=problem)
+        observations, _ = env.reset(seed=0)
+        policy.reset(env, seed=0)
+        with monkeypatch.context() as patched:
+            patched.setattr(CpuSamplingEngine, "denoise", slow)
+            for _ in range(7):
+                observations = env.step(policy.act(observations, env.state()))[0]
+        assert {loop.num_steps for loop in list(policy.loops)[-2:]} == steps
 
 
 def test_no_loop_waits_for_a_new_coarse_plan(monkeypatch: pytest.MonkeyPatch) -> None:
