@@ -243,6 +243,8 @@ def find_scenario(scenario: ScenarioLike) -> Scenario:
     """The scenario that a name, a YAML file, a ``"package.module:function"`` or a callable stands for."""
     if isinstance(scenario, Scenario):
         return scenario
+    if isinstance(scenario, Problem):
+        raise ValueError("scenario is a Problem; give environments problem=..., and planners the problem itself")
     if is_scenario_file(scenario):
         return Scenario(Path(scenario).stem, partial(_file, scenario))
     if callable(scenario):

@@ -70,6 +70,7 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: Problem(DRIVE, [[0, 0]], [[2, 0]]), r"expected \(1, 4\): px, py, heading, speed"),
         (lambda: navigation_v0.parallel_env(lifelong="yes"), "lifelong is 'yes'; it must be True or False"),
         (lambda: navigation_v0.parallel_env(ray_range=3.0), "these robots have none; give observed_rays"),
+        (lambda: navigation_v0.parallel_env(PROBLEM), "give environments problem=..., and planners the problem itself"),
         (lambda: navigation_v0.parallel_env(max_steps=9), "did you mean 'max_cycles'"),
         (lambda: make_problem("circle", robots=4), "did you mean 'num_robots'"),
         (lambda: make_problem("circle", model="bicycle"), "did you mean 'car'"),
