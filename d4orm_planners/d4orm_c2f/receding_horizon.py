@@ -121,7 +121,9 @@ class D4ormC2F(StatePolicy):
         believed = self._window.problem = self._tracker.problem = self._deviation.problem
         if not self.loops or self._next >= self.config.execute_horizon:
             self._loop(joint)
-        controls = self._plan[min(self._next, len(self._plan) - 1)]
+        if self._next >= len(self._plan):  # those that had to evade others may still move
+            self._plan, self._next = self._window.stop(joint), 0
+        controls = self._plan[self._next]
         if self.config.last_resort:
             controls = self._evading(joint, controls)
         self._next += 1
@@ -135,16 +137,16 @@ class D4ormC2F(StatePolicy):
 
     def _evading(self, joint: JointState, controls: FloatArray) -> FloatArray:
         """The controls ``(K, m)``, changed for robots that might come to touch something: these brake, or evade."""
-        problem, arrived = self._deviation.problem, self._arrived
-        gap, now = GAP * problem.margin, min(self._next, len(self._plan) - 1)
-        touching = self._window.touching(joint, arrived, self._plan[now:], gap)
+        gap = GAP * self._deviation.problem.margin
+        touching = self._window.touching(joint, self._arrived, self._plan[self._next :], gap)
         speed_slack = self._deviation.speed_slack
         if not touching.any() and not speed_slack:
             return controls
         if touching.any():
-            # A late loop may still be reading the plan.
-            self._plan = self._plan.copy()
-            self._plan[now:, touching] = self._window.stop(joint)[: len(self._plan) - now, touching]
+            # A new array, for a late loop may still be reading the plan; and long enough for the whole stop.
+            stop, end = self._window.stop(joint), len(self._plan)
+            self._plan = np.pad(self._plan, ((0, max(self._next + len(stop) - end, 0)), (0, 0), (0, 0)))
+            self._plan[self._next :, touching] = stop[:, touching]
         # In the last resort they brake as their own limits allow, not as they are believed to.
         braking = track_velocities(self.problem, joint.states, np.zeros_like(joint.goals))
         controls = np.where(touching[:, None], braking, controls)

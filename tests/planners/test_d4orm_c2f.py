@@ -237,6 +237,21 @@ def test_a_loop_that_is_late_goes_on_with_the_last_plan(monkeypatch: pytest.Monk
     assert_verified(problem, executed)
 
 
+def test_robots_rest_once_the_last_plan_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every loop is late from step 5 on; much later two robots are set in motion, and stop for good."""
+    problem = circle(2).replace(horizon=120)
+    env, policy = navigation_v0.parallel_env(problem=problem), controller(deadline=60.0)
+    observations, _ = env.reset(seed=0)
+    policy.reset(env, seed=0)
+    for step in range(100):
+        if step == 5:
+            monkeypatch.setattr(Background, "run", lambda *_: None)
+        if step == 60:
+            env.set_state([[-0.6, 0, -0.6, 0.3], [0.6, 0, 0.6, 0]])
+        observations = env.step(policy.act(observations, env.state()))[0]
+    assert np.abs(split_state(problem, env.state()).states[:, 2:]).max() < 1e-3
+
+
 def test_loops_with_a_deadline_make_as_many_steps_as_there_is_time_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """A step takes 50 ms: of 20, 10 and 5 only the last are done within half a second, and without a deadline all."""
     problem, at_once = circle(4), CpuSamplingEngine.denoise

@@ -506,9 +506,7 @@ main()
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
 
 
-@pytest.mark.parametrize(
-    "options", [("--port", "70000"), ("--host", "203.0.113.1"), ("--host", "\xe4" * 70), ("--host", "")]
-)
+@pytest.mark.parametrize("options", [("--port", "70000"), ("--host", "203.0.113.1"), ("--host", "\xe4" * 70)])
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # viser leaves a loop open
 def test_an_address_where_one_cannot_listen_is_said(d4orm, options: tuple[str, str]) -> None:
     pytest.importorskip("viser")
