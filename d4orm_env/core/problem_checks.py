@@ -121,7 +121,7 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
 def checked_goal_poses(
     team: Team, heading: ArrayLike | None, tolerance: ArrayLike, hitches: ArrayLike | None
 ) -> dict[str, FloatArray]:
-    """What a problem asks of poses at goals, by its attributes' names."""
+    """Headings and hitch angles that a problem asks for at goals, by its attributes' names."""
     headings = _goal_headings(team, heading)
     tolerances = frozen_per_robot(tolerance, "goal_heading_tolerance", team.num_robots)
     # What float32 does not resolve, or what allows any heading.

@@ -27,7 +27,7 @@ SIDE, NEAREST, FURTHEST = 10.0, 5.0, 6.0
 SPACING = 6
 """Least distance of two of its starts, in robots' radii."""
 RESTARTS, CANDIDATES = 20, 1000
-"""How often all of its starts are drawn, and points for each."""
+"""Number of times that all of its starts are drawn, and points for each."""
 
 
 def circle(settings: Settings, *, diameter: float = 5.0) -> Problem:

@@ -51,32 +51,37 @@ def verify_curves(
     shapes = ConvexBodies.of(team) if team.shapes else None
     pairs, obstacles = make_watches(problem.world, robots, radius, shapes)
     watches = [pairs, *obstacles]
+    grid = np.arange(steps)[:, None] * sub_steps + np.arange(sub_steps + 1)
 
-    def robots_at(samples: Indices) -> tuple[Floats, Floats]:
+    def poses(samples: Indices) -> tuple[Floats, Floats]:
         times = samples.ravel().astype(np.float64) * (dt / sub_steps)
         path = position(times).reshape(*samples.shape, len(radius), problem.dimension)
         return path, heading(times).reshape(*samples.shape, len(radius))
 
-    violations = _not_arrived(problem, position, duration)
-    towed = None
+    violations, towed = _not_arrived(problem, position, duration), None
     if len(trailers.robot):
-        *towed, hitches = trailers.tow(*robots_at(np.arange(steps * sub_steps + 1)))
+        *towed, hitches = trailers.tow(*poses(np.arange(steps * sub_steps + 1)))
         violations += trailers.violations(hitches, dt / sub_steps)
     size = max(1, MAX_NUMBERS // ((2 * sub_steps + 1) * len(radius) * problem.dimension))
     for first in range(0, steps, size):
-        samples = np.arange(first, min(first + size, steps))[:, None] * sub_steps + np.arange(sub_steps + 1)
-        path, turn = robots_at(samples) if towed is None else (part[samples] for part in towed)
-        travel = norm(path - path[:, :1]).max(axis=1)
-        if shapes is not None:
-            travel = shapes.stretch * (travel + shapes.outer * np.abs(turn - turn[:, :1]).max(axis=1))
+        samples = grid[first : first + size]
+        path, turn = poses(samples) if towed is None else (part[samples] for part in towed)
         for watch in watches:
-            watch.observe(Stretch(path, travel, first * dt, dt, turn))
+            watch.observe(Stretch(path, _travel(path, turn, shapes), first * dt, dt, turn))
     violations += [violation for watch in watches for violation in watch.violations()]
     nearest = min((watch.minimum for watch in obstacles), default=np.inf)
     unknown = np.full(len(radius), np.nan)
     return VerificationReport(
         pairs.minimum, nearest, unknown, unknown, True, sorted(violations, key=lambda violation: violation.time)
     )
+
+
+def _travel(path: Floats, turn: Floats, shapes: ConvexBodies | None) -> Floats:
+    """``(T, B)`` by how much gaps may change within each step [m]."""
+    travel = norm(path - path[:, :1]).max(axis=1)
+    if shapes is None:
+        return travel
+    return shapes.stretch * (travel + shapes.outer * np.abs(turn - turn[:, :1]).max(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

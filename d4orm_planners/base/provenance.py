@@ -1,4 +1,4 @@
-"""Where results come from: the machine and versions, provenance of plans, and fingerprints of users' objects, by which
+"""Provenance of results: the machine and versions, provenance of plans, and fingerprints of users' objects, by which
 a store of trials distinguishes instances and functions.
 """
 

@@ -1,4 +1,4 @@
-"""How a benchmark measures: its settings, in full and for a first look, and a stopwatch whose readings are samples."""
+"""Measuring of a benchmark: its settings, in full and for a first look, and a stopwatch whose readings are samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a search for one robot's path asks of its own motion and of all others', compiled with numba.
+"""Reservations: a robot's own motion and those of all others, as a search for its path asks for them, by numba.
 
 Nodes of a roadmap are free of others in safe intervals. On a straight line the robot meets somebody or nobody, and
 where a longer one is free it takes the place of a path. Turns take steps.
