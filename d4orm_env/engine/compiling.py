@@ -35,6 +35,14 @@ class _PartLibrary(JITCodeLibrary):
     it is called, at every level of calls.
     """
 
+    def _optimize_functions(self, ll_module: Any) -> None:
+        # The kernel's optimisation will do the rest.
+        ll_module.data_layout = self._codegen._data_layout
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                manager, builder = self._codegen._function_pass_manager(opt=1)
+                manager.run(function, builder)
+
     def _optimize_final_module(self) -> None:
         pass
 
