@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable
 from functools import lru_cache
 from queue import SimpleQueue
-from threading import Thread
+from threading import Thread, local
 from typing import TypeAlias
 
 import numpy as np
@@ -26,6 +26,14 @@ def available_cores() -> int:
     if not wanted.isdigit() or int(wanted) < 1:
         raise ValueError(f"D4ORM_NUM_THREADS is {wanted!r}; it must be a positive whole number")
     return int(wanted)
+
+
+_calling = local()
+
+
+def keep_to_one_core() -> None:
+    """Let the calling thread do by itself, from now on, what it would share with others."""
+    _calling.alone = True
 
 
 Task: TypeAlias = tuple[Callable[[IntArray], None], IntArray, SimpleQueue[BaseException | None]]
@@ -66,7 +74,7 @@ class Threads:
 
     def over(self, count: int, work: Callable[[IntArray], None]) -> None:
         """Call ``work(array([first, last]))`` on parts that together make up ``range(count)``, and wait for all."""
-        parts = min(self.num_threads, count)
+        parts = 1 if getattr(_calling, "alone", False) else min(self.num_threads, count)
         if parts <= 1:
             work(np.array((0, count)))
             return

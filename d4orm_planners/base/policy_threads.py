@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from functools import wraps
 from typing import Any, Generic, TypeVar
 
+from d4orm_env.engine.threads import keep_to_one_core
+
 Result = TypeVar("Result")
 
 ATTRIBUTE = "_driving"
@@ -76,11 +78,12 @@ class Background(Generic[Result]):
     """A job at a time in a thread of its own.
 
     Args:
-        yielding: Whether other threads go first, where threads have priorities of their own.
+        yielding: Whether it leaves other cores, and their threads, to others, which go first where threads have
+            priorities of their own.
     """
 
     def __init__(self, yielding: bool = False) -> None:
-        self._initializer = _yield_to_others if yielding and sys.platform == "linux" else None
+        self._initializer = _yield_to_others if yielding else None
         self._pool: ThreadPoolExecutor | None = None
         self._job: Future[Result] | None = None
 
@@ -132,7 +135,10 @@ class Background(Generic[Result]):
 
 
 def _yield_to_others() -> None:
-    """Lower the priority of the calling thread; on Linux that is what a thread's number stands for here."""
+    """Keep the calling thread to one core, and lower its priority: on Linux its number stands for that here."""
+    keep_to_one_core()
+    if sys.platform != "linux":
+        return
     thread = threading.get_native_id()
     # Where all of the process yields more than that, only root could take some of it back.
     os.setpriority(os.PRIO_PROCESS, thread, max(10, os.getpriority(os.PRIO_PROCESS, thread)))

@@ -30,7 +30,6 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     visible_subgoals,
 )
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
-from d4orm_planners.engine.sampling_types import SamplingEngine
 from d4orm_planners.mapf.planner import relay_paths
 from d4orm_planners.tracking.steering import straight_drives
 
@@ -42,7 +41,6 @@ class CoarsePlanTracker:
     """Leads a team through an episode.
 
     Args:
-        refiner: Engine of refinements.
         background: Thread that they are made in, if not between control loops.
         replanning: Thread that plans anew where loops have a deadline.
         lifelong: Whether robots that arrive get new goals.
@@ -66,7 +64,6 @@ class CoarsePlanTracker:
         problem: Problem,
         config: D4ormC2FConfig,
         seed: int,
-        refiner: SamplingEngine,
         background: Background[CoarsePlan],
         replanning: Background[CoarsePlan],
         lifelong: bool,
@@ -74,7 +71,7 @@ class CoarsePlanTracker:
     ) -> None:
         self.problem, self._config, self._seed, self._lifelong = problem, config, seed, lifelong
         self._astray = config.replan_distance * problem.stride
-        self._refiner, self._background, self._replanning = refiner, background, replanning
+        self._background, self._replanning = background, replanning
         self._late: tuple[JointState, BoolArray] | None = None
         self._planning = CoarsePlanning(config, seed, None if lifelong else last_step)
 
@@ -259,7 +256,7 @@ class CoarsePlanTracker:
     def _refined(self, guidance: CoarsePlan, index: int, seed: int) -> CoarsePlan:
         """The guidance, improved from a waypoint on if that succeeds (line 4)."""
         left, controls = rest_of(guidance, index, self._config.coarse_factor)
-        search = SolveRun(self._planning.planner, left, seed, controls, self._refiner)
+        search = SolveRun(self._planning.planner, left, seed, controls)
         search.advance()
         done = guidance.problem.horizon - left.horizon
         before, after = guidance.states[: done + 1], search.best.trajectory

@@ -72,8 +72,6 @@ class D4ormC2F(StatePolicy):
     def __init__(self, config: D4ormC2FConfig | None = None) -> None:
         self.config = config or D4ormC2FConfig()
         self._engine = get_sampling_engine(self.config.engine)
-        # On one thread the refinement leaves the other cores, and their threads, to the control loop.
-        self._refiner = get_sampling_engine(self.config.engine, 1 if self.config.refine == "background" else None)
         self._refinement: Background[CoarsePlan] = Background(yielding=True)
         self._replanning: Background[CoarsePlan] = Background(yielding=True)
         self._control: Background[Prediction] = Background()
@@ -108,7 +106,7 @@ class D4ormC2F(StatePolicy):
         begin = time.perf_counter()
         last_step = env.unwrapped.max_cycles
         self._tracker = CoarsePlanTracker(
-            self.problem, self.config, seed, self._refiner, self._refinement, self._replanning, lifelong, last_step
+            self.problem, self.config, seed, self._refinement, self._replanning, lifelong, last_step
         )
         self._tracker.begin(joint, self._arrived)
         self._deviation = Deviation(self.problem, self._engine, self.config, docks=not lifelong)

@@ -19,6 +19,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Delay, Intruder, Push
 from d4orm_env.dynamics.robot_model import ACCELERATION
+from d4orm_env.engine.threads import Threads
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.scenarios import make_problem
 from d4orm_env.verify import verify
@@ -414,6 +415,14 @@ def test_refinement_yields_to_the_control_loop_and_takes_no_priority(
         background.start(lambda: None)
         background.forget()
     assert asked == [refining]
+
+
+def test_work_that_yields_leaves_other_cores_to_the_control_loop() -> None:
+    for yielding, expected in ((False, [[0, 2], [2, 4]]), (True, [[0, 4]])):
+        background, parts = Background[None](yielding=yielding), []
+        background.start(lambda parts=parts: Threads(2).over(4, lambda part: parts.append(part.tolist())))
+        background.forget()
+        assert sorted(parts) == expected
 
 
 def replanned(
