@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from examples.common import mean_text, plt, save_figure, save_table, solved_columns, study_trials, trials_parser
-from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
+from examples.studies import FIRST_SEED
 
 from d4orm_env.disturbances import (
     Bias,
@@ -72,7 +72,6 @@ def studies(scenarios: tuple[str, ...], policies: dict[str, dict[str, Any]], see
         policies=policies,
         scenarios=scenarios,
         num_robots=ROBOTS,
-        scenario_settings=AS_IN_THE_PAPER,
         seeds=range(FIRST_SEED, FIRST_SEED + seeds),
         disturbances={NOTHING: [[]], **{name: [[one]] for name, one in DISTURBANCES.items()}},
     )
@@ -209,7 +208,6 @@ def ablations(scenarios: Sequence[str], disturbances: Sequence[str], seeds: int)
                 scenarios=scenarios,
                 num_robots=ROBOTS,
                 seeds=range(FIRST_SEED, FIRST_SEED + seeds),
-                scenario_settings=AS_IN_THE_PAPER,
                 disturbances={name: [[] if name == NOTHING else [DISTURBANCES[name]]]},
             )
         )
