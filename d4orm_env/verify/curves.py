@@ -10,6 +10,7 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.verify.contact import MAX_NUMBERS, Indices, Stretch
+from d4orm_env.verify.docking import HEADING_DOUBT, heading_errors, heading_note
 from d4orm_env.verify.footprints import ConvexBodies, make_watches
 from d4orm_env.verify.geometry import Floats, norm
 from d4orm_env.verify.report import VerificationReport, Violation
@@ -33,7 +34,8 @@ def verify_curves(
     """Judge curves: do all robots end at their goals, and touch nothing at any time?
 
     As :func:`d4orm_env.verify.verify` judges controls, known to ``CHORD_ERROR`` of the radius for each robot. Trailers
-    are towed, from their hitch angles at the start. Of control limits it says nothing, nor when robots arrive.
+    are towed, from their hitch angles at the start. At the end positions, headings and hitch angles must be those of
+    the goals, however fast a robot comes there. Of control limits it says nothing, nor when robots arrive.
 
     Args:
         problem: The team and its world; its dynamics do not count.
@@ -58,10 +60,12 @@ def verify_curves(
         path = position(times).reshape(*samples.shape, len(radius), problem.dimension)
         return path, heading(times).reshape(*samples.shape, len(radius))
 
-    violations, towed = _not_arrived(problem, position, duration), None
+    (end,), last = (rows(np.array([duration])) for rows in (position, heading))
+    violations, towed = [], None
     if len(trailers.robot):
         *towed, hitches = trailers.tow(*poses(np.arange(steps * sub_steps + 1)))
-        violations += trailers.violations(hitches, dt / sub_steps)
+        violations, last = list(trailers.violations(hitches, dt / sub_steps)), towed[1][-1:]
+    violations += _not_arrived(problem, end, heading_errors(problem, last)[0], duration)
     size = max(1, MAX_NUMBERS // ((2 * sub_steps + 1) * len(radius) * problem.dimension))
     for first in range(0, steps, size):
         samples = grid[first : first + size]
@@ -141,12 +145,15 @@ class _Trailers:
             yield Violation("hitch limit", (int(self.robot[each]),), float(over[:, each].argmax()) * dt, detail)
 
 
-def _not_arrived(problem: Problem, position: Callable[[Floats], Floats], duration: float) -> list[Violation]:
-    distance = norm(position(np.array([duration]))[0] - problem.goal.astype(np.float64))
+def _not_arrived(problem: Problem, end: Floats, missed: Floats, duration: float) -> list[Violation]:
+    distance = norm(end - problem.goal.astype(np.float64))
+    away = distance > problem.goal_radius * (1 + CHORD_ERROR)
+    away |= missed > problem.goal_heading_tolerance + HEADING_DOUBT
     return [
         Violation(
             "not arrived", (robot,), duration,
-            f"{distance[robot]:.4g} m from its goal (goal radius {problem.goal_radius:g} m) at the end",
+            f"{distance[robot]:.4g} m from its goal (goal radius {problem.goal_radius:g} m) at the end"
+            f"{heading_note(problem, robot, missed[robot])}",
         )
-        for robot in np.flatnonzero(distance > problem.goal_radius * (1 + CHORD_ERROR)).tolist()
+        for robot in np.flatnonzero(away).tolist()
     ]  # fmt: skip

@@ -108,23 +108,23 @@ def _docks(problem: Problem, motion: TeamMotion, ends: Floats, distance: Floats)
     goal_speed = problem.goal_speed + SPEED_ALLOWANCE * motion.max_speed
     slow = (motion.pace <= goal_speed - speed_doubt) | (motion.pace == 0)
     possible = (distance <= problem.goal_radius + doubt) & (motion.pace <= goal_speed + speed_doubt)
-    missed = heading_errors(problem, motion)
+    missed = heading_errors(problem, motion.end_headings)
     tolerance = problem.goal_heading_tolerance.astype(np.float64)
     certain = (distance <= problem.goal_radius - doubt) & slow & (missed <= tolerance - HEADING_DOUBT)
     return possible & (missed <= tolerance + HEADING_DOUBT), certain
 
 
-def heading_errors(problem: Problem, motion: TeamMotion) -> Floats:
-    """``(H, K)`` angle to the goal heading after each step, or that of a trailer to its hitch angle if it is larger
-    [rad]; minus infinity without one.
+def heading_errors(problem: Problem, headings: Floats) -> Floats:
+    """``(H, K)`` angle from headings ``(H, F)`` of all bodies to the goal heading, or that of a trailer to its hitch
+    angle if it is larger [rad]; minus infinity without one.
     """
     wanted = problem.goal_heading.astype(np.float64)
     if np.isnan(wanted).all():
         return np.full((1, len(wanted)), -np.inf)
-    missed = _angle_between(motion.end_headings[:, : len(wanted)], wanted)
+    missed = _angle_between(headings[:, : len(wanted)], wanted)
     for robot in np.flatnonzero(~np.isnan(problem.goal_hitches).all(axis=1)).tolist():
         own = [number for number, body in enumerate(problem.team.bodies) if body.robot == robot]
-        hitches = -np.diff(motion.end_headings[:, own], axis=1)
+        hitches = -np.diff(headings[:, own], axis=1)
         errors = _angle_between(hitches, problem.goal_hitches[robot, : len(own) - 1].astype(np.float64))
         missed[:, robot] = np.maximum(missed[:, robot], errors.max(axis=1))
     return missed
@@ -136,15 +136,21 @@ def _angle_between(angles: Floats, wanted: Floats) -> Floats:
     return np.where(np.isnan(wanted), -np.inf, 2 * np.pi * np.abs(turns - np.round(turns)))
 
 
+def heading_note(problem: Problem, robot: int, missed: float) -> str:
+    """Say by how much a robot misses its goal heading, if it has one, for the details of a violation."""
+    if not np.isfinite(missed):
+        return ""
+    bent = "" if np.isnan(problem.goal_hitches[robot]).all() else " or a hitch angle"
+    tolerance = problem.goal_heading_tolerance[robot]
+    return f", {missed:.4g} rad from its goal heading{bent} (tolerance {tolerance:g} rad)"
+
+
 def _failure(problem: Problem, motion: TeamMotion, robot: int, distance: Floats, unsure: list[int]) -> Iterator[str]:
-    pace, missed = motion.pace[:, robot], heading_errors(problem, motion)[-1, robot]
+    pace, missed = motion.pace[:, robot], heading_errors(problem, motion.end_headings)[-1, robot]
     yield f"{distance[-1]:.4g} m from its goal (goal radius {problem.goal_radius:g} m) at the horizon"
     if np.isfinite(problem.goal_speed[robot]):
         yield f", at {pace[-1]:.4g} m/s (goal speed {problem.goal_speed[robot]:g} m/s)"
-    if np.isfinite(missed):
-        tolerance = problem.goal_heading_tolerance[robot]
-        bent = "" if np.isnan(problem.goal_hitches[robot]).all() else " or a hitch angle"
-        yield f", {missed:.4g} rad from its goal heading{bent} (tolerance {tolerance:g} rad)"
+    yield heading_note(problem, robot, missed)
     if unsure:
         yield (
             f", unless it docks at {unsure[0] * problem.dt:.3f} s, {distance[unsure[0] - 1]:.8g} m from its goal at "

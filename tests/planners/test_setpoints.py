@@ -238,6 +238,22 @@ def test_a_trailer_that_is_pushed_aside_is_told() -> None:
 
 
 @pytest.mark.parametrize(
+    ("heading", "tolerance", "missed"), [(0.0, 0.05, None), (0.0, 0.04, "0.0409"), (0.2, 0.05, "0.2")]
+)
+def test_curves_end_at_goal_headings_and_hitch_angles(heading: float, tolerance: float, missed: str | None) -> None:
+    """A trailer of 0.5 m at an angle of 0.3, drawn by 1 m in a straight line, ends at 0.0409: tan(phi / 2) over e^2."""
+    team = Team(("car_with_1_trailer",), footprint=Train(Box(0.5, 0.25), [Box(0.3, 0.25)]))
+    problem = Problem(
+        team, [[0, 0, 0, 0.3]], [[1, 0]], goal_heading=heading, goal_heading_tolerance=tolerance, goal_hitches=[[0.0]]
+    )
+    line = make_interp_spline([0, 2], [[[0, 0]], [[1, 0]]], k=1)
+    report = verify_curves(problem, line, 2.0, np.ones(1), lambda times: np.zeros((len(times), 1)))
+    details = [violation.detail for violation in report.violations]
+    expected = f"{missed} rad from its goal heading or a hitch angle (tolerance {tolerance:g} rad)"
+    assert [detail.partition(" at the end, ")[2] for detail in details] == ([] if missed is None else [expected])
+
+
+@pytest.mark.parametrize(
     ("model", "own", "goal", "heading", "peak"),
     [
         ("unicycle2", {"max_turn_acceleration": 0.3}, [0, 0.3], 3.14, "turn_acceleration"),
