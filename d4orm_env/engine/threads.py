@@ -18,22 +18,29 @@ import numpy as np
 from d4orm_env.core.arrays import IntArray
 
 
-def available_cores() -> int:
-    """Cores this process may use; ``D4ORM_NUM_THREADS`` overrides it."""
-    wanted = os.environ.get("D4ORM_NUM_THREADS")
-    if wanted is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if not wanted.isdigit() or int(wanted) < 1:
-        raise ValueError(f"D4ORM_NUM_THREADS is {wanted!r}; it must be a positive whole number")
-    return int(wanted)
-
-
 _calling = local()
 
 
 def keep_to_one_core() -> None:
     """Let the calling thread do by itself, from now on, what it would share with others."""
     _calling.alone = True
+
+
+def keeps_to_one_core() -> bool:
+    """Check whether the calling thread does."""
+    return getattr(_calling, "alone", False)
+
+
+def available_cores() -> int:
+    """Cores the calling thread may use; ``D4ORM_NUM_THREADS`` overrides what the process may."""
+    if keeps_to_one_core():
+        return 1
+    wanted = os.environ.get("D4ORM_NUM_THREADS")
+    if wanted is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not wanted.isdigit() or int(wanted) < 1:
+        raise ValueError(f"D4ORM_NUM_THREADS is {wanted!r}; it must be a positive whole number")
+    return int(wanted)
 
 
 Task: TypeAlias = tuple[Callable[[IntArray], None], IntArray, SimpleQueue[BaseException | None]]
@@ -74,7 +81,7 @@ class Threads:
 
     def over(self, count: int, work: Callable[[IntArray], None]) -> None:
         """Call ``work(array([first, last]))`` on parts that together make up ``range(count)``, and wait for all."""
-        parts = 1 if getattr(_calling, "alone", False) else min(self.num_threads, count)
+        parts = 1 if keeps_to_one_core() else min(self.num_threads, count)
         if parts <= 1:
             work(np.array((0, count)))
             return

@@ -18,8 +18,9 @@ from d4orm_planners.base.settings import Count
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
+from d4orm_planners.mapf.replanning import is_compiled
 from d4orm_planners.mapf.roadmap import fill_costs, lay_roadmap
-from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout, drive_moves, is_compiled
+from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout, drive_moves
 
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""

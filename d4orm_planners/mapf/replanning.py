@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import Floats, IntArray, Ints, Whole
+from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled, inlined
 from d4orm_planners.mapf.beam import sink
@@ -20,8 +22,10 @@ from d4orm_planners.mapf.reservations import (
     interval_at,
     meeting,
     steps_to_turn,
+    straighten,
 )
 from d4orm_planners.mapf.roadmap import Roadmap, RobotArrays
+from d4orm_planners.tracking.timed_path import timed_kernel
 
 
 @register_jitable(nogil=True, **OPTIONS)
@@ -256,3 +260,11 @@ def find_path(roadmap: Roadmap, bodies: RobotArrays, reservations: Reservations,
         if entry == -1:
             return np.empty((0, 3), np.int64)
         tree = _with_room(tree, len(tree.costs))
+
+
+def is_compiled(problem: Problem) -> bool:
+    """Check whether all that a team like this in a world like this needs has been compiled in this process."""
+    open_world = not problem.world.num_obstacles
+    return all(timed_kernel(model).signatures for model in set(problem.team.models)) and any(
+        (signature[2] is types.none) == open_world for signature in straighten.signatures
+    )

@@ -8,12 +8,12 @@ from itertools import product
 from typing import TypeAlias
 
 import numpy as np
-from numba import types
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
+from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.paths.spaces import make_space
 from d4orm_planners.mapf.lacam import TeamOnRoadmap
 from d4orm_planners.mapf.near_neighbours import sort_into_cells
@@ -23,7 +23,7 @@ from d4orm_planners.mapf.replanning import find_path
 from d4orm_planners.mapf.reservations import Reservations, Trip, make_reservations, straighten, turn_on_the_spot
 from d4orm_planners.mapf.roadmap import WALL_SLACK, Roadmap
 from d4orm_planners.tracking.path_drives import Corners, drive_routes
-from d4orm_planners.tracking.timed_path import drive_by_clock, timed_kernel
+from d4orm_planners.tracking.timed_path import drive_by_clock
 
 FIRST_CUT = 0.2
 """Most by which corners are cut on first routes, in radii of the largest robot, as all lengths below."""
@@ -122,6 +122,7 @@ class Replanning:
         self.turns_on_the_spot = [(turn * counts_turns, facing) for turn, facing in turns]
         rooms = [problem.world.clearance(ends[:, : problem.dimension]) for ends in positions]
         self.own_room = np.minimum(*rooms) - TOUCH * self.size
+        self.threads = Threads(min(2, available_cores()))
         self.alone = self.bodies.costs[np.arange(problem.num_robots), roadmap.starts] / self.strides
 
     def replan(
@@ -220,17 +221,16 @@ class Replanning:
             others = others._replace(need=np.where(minded, others.need, 0.0))
         reservations = make_reservations(self.roadmap, self.bodies, others, robot, latest, self.dwell is None)
         close, usual = None, min(TOUCH * self.size, float(self.own_room[robot] - self.bodies.safety_distance[robot]))
-        for cruise, cut in SPEED_PROFILES:
-            drive = None
-            for drive in self.drives(reservations, robot, latest, cruise * haste, cut):
+        for path, cut in self.paths(reservations, robot, latest, haste):
+            if not len(path):  # and hardly one for a slower robot
+                break
+            for drive in self.drives(robot, path, cut, others.positions.shape[1] - 1):
                 room = self.room_at_walls(others, robot, drive, latest)
                 if room > usual:
                     self.take(driven, occupancy, robot, drive)
                     return True
                 if close is None and room > self.problem.rounding:
                     close = drive
-            if drive is None:  # no path, and hardly one for a slower robot
-                break
         if close is not None:
             self.take(driven, occupancy, robot, close)
         return close is not None
@@ -242,22 +242,43 @@ class Replanning:
             positions[self.leaves(drive[2]) :] = FAR
         occupancy.put(robot, positions)
 
-    def drives(self, reservations: Reservations, robot: int, latest: int, cruise: float, cut: float) -> Iterator[Drive]:
-        """Rollouts of a robot along its path, if it has one, in one of the :data:`SPEED_PROFILES`."""
-        roadmap, bodies, steps = self.roadmap, self.bodies, reservations.others.positions.shape[1] - 1
+    def paths(
+        self, reservations: Reservations, robot: int, latest: int, haste: float
+    ) -> Iterator[tuple[IntArray, float]]:
+        """A robot's path in each of the :data:`SPEED_PROFILES`, and by how much it cuts corners."""
+        # Two are looked for side by side, because the second one is often needed.
+        found: dict[int, IntArray] = {}
+
+        def look(part: IntArray) -> None:
+            for each in range(number + part[0], number + part[1]):
+                found[each] = self.path(reservations, robot, latest, SPEED_PROFILES[each][0] * haste)
+
+        for number, (_, cut) in enumerate(SPEED_PROFILES):
+            if number not in found:
+                self.threads.over(self.threads.num_threads, look)
+            yield found[number], cut
+
+    def path(self, reservations: Reservations, robot: int, latest: int, cruise: float) -> IntArray:
+        """``(n, 3)`` int64 nodes of a robot's path at a share of its speed, and when it sets out for and comes to each;
+        none where there is no path.
+        """
+        roadmap, bodies = self.roadmap, self.bodies
         dwell, (turn, facing) = -1 if self.dwell is None else self.dwell, self.turns_on_the_spot[robot]
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
             trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell, turn, facing)
             path = find_path(roadmap, bodies, reservations, robot, trip)
             if len(path):
-                break
-        else:
-            return
-        safety_distance = bodies.safety_distance[robot] * (1 + WALL_SLACK * 2 / 3)
-        left = straighten(roadmap, bodies, self.space, reservations.others, robot, safety_distance, trip, path)
-        nodes, departs, arrives = path[:left].T
-        stops = Corners(roadmap.nodes[nodes], np.array([0, left]), departs.astype(float), arrives.astype(float))
+                safety_distance = bodies.safety_distance[robot] * (1 + WALL_SLACK * 2 / 3)
+                left = straighten(roadmap, bodies, self.space, reservations.others, robot, safety_distance, trip, path)
+                return path[:left]
+        return path
+
+    def drives(self, robot: int, path: IntArray, cut: float, steps: int) -> Iterator[Drive]:
+        """Rollouts of a robot along a path, in so many steps."""
+        nodes, departs, arrives = path.T
+        ends = np.array([0, len(path)])
+        stops = Corners(self.roadmap.nodes[nodes], ends, departs.astype(float), arrives.astype(float))
         route = make_routes(self.problem, stops, [robot], cut * self.size)[0]
         # As soon as it can, or else by the clock of its path.
         for backs_up, hurrying in product(self.backing[robot], (True, False)):
@@ -276,11 +297,3 @@ class Replanning:
             return np.inf
         room = self.problem.world.clearance(positions[1 : arrival + 1, : self.problem.dimension])
         return float(room.min() - self.bodies.safety_distance[robot])
-
-
-def is_compiled(problem: Problem) -> bool:
-    """Check whether all that a team like this in a world like this needs has been compiled in this process."""
-    open_world = not problem.world.num_obstacles
-    return all(timed_kernel(model).signatures for model in set(problem.team.models)) and any(
-        (signature[2] is types.none) == open_world for signature in straighten.signatures
-    )

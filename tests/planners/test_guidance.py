@@ -15,6 +15,7 @@ from planner_support import walled_in_problem
 
 from d4orm_env import Problem, Team, World, make_problem, verify
 from d4orm_env.dynamics.models import MODELS
+from d4orm_env.engine.threads import Threads
 from d4orm_env.footprints import Box, Disc
 from d4orm_planners import make_planner
 from d4orm_planners.engine.sampling_types import get_sampling_engine
@@ -361,6 +362,17 @@ def test_paths_one_by_one_displace_those_in_the_way() -> None:
     assert isinstance(driven, TeamRollout)
     assert driven.cost(problem.horizon)[0] == 0
     assert verify(problem, driven.until(problem.horizon)).ok
+
+
+def test_paths_are_the_same_on_any_number_of_threads() -> None:
+    problem, driven = corridor_with_bay(right=1.0), []
+    for threads in (1, 2):
+        replanning = Replanning(problem, lay_roadmap(problem))
+        replanning.threads = Threads(threads)
+        team = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+        assert team is not None
+        driven.append(team.controls)
+    np.testing.assert_array_equal(*driven)
 
 
 @pytest.mark.parametrize(("room", "planned"), [(2.0, True), (0.5, False), (-np.inf, False)])
