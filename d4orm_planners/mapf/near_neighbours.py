@@ -111,10 +111,12 @@ def near_lines(
                         continue
                     if squared_gap(cells.points, point, tails, q, heads, q) < distance * distance:
                         if count < items.shape[0]:
-                            items[count] = point
+                            place = count
+                            while place > first[q] and items[place - 1] > point:
+                                items[place] = items[place - 1]
+                                place -= 1
+                            items[place] = point
                         count += 1
-        if count <= items.shape[0]:
-            items[first[q] : count].sort()
     first[tails.shape[0]] = count
     return count
 

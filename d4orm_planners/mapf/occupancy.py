@@ -158,18 +158,30 @@ def find_near_boxes(
     return count
 
 
+@compiled
+def _enclosed(
+    positions: Floats, first: Whole, last: Whole
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Lowest and highest corner of a box around some positions ``(S, 3)``, ``last`` not among them."""
+    low_x, low_y, low_z = positions[first, 0], positions[first, 1], positions[first, 2]
+    high_x, high_y, high_z = low_x, low_y, low_z
+    for i in range(first + 1, last):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
+        high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
+    return (low_x, low_y, low_z), (high_x, high_y, high_z)
+
+
 @cached_kernel(variant="meetings", **OPTIONS)
 def find_meetings(others: Others, positions: Floats, met: BoolArray) -> None:
     """Find the robots that positions ``(S + 1, 3)`` are too near to, after the start; ``met`` ``(K,)`` is output."""
     met[:], near = False, np.empty(others.need.shape[0] + 1, np.int64)
     for block in range((positions.shape[0] - 1) // BLOCK + 1):
         first, last = max(block * BLOCK, 1), min((block + 1) * BLOCK, positions.shape[0])
-        x, y, z = positions[first:last, 0], positions[first:last, 1], positions[first:last, 2]
         if first == last:
             break
-        for number in range(
-            find_near_boxes(others, block, (x.min(), y.min(), z.min()), (x.max(), y.max(), z.max()), near)
-        ):
+        low, high = _enclosed(positions, first, last)
+        for number in range(find_near_boxes(others, block, low, high, near)):
             i = near[number]
             for step in range(first, last):
                 other = others.positions[i, step]
@@ -201,10 +213,10 @@ def _range_of(low: float, width: float, size: int, lowest: float, highest: float
 @register_jitable(nogil=True, **OPTIONS)
 def sort_boxes(others: Others, points: Floats, half: float, num_blocks: int) -> Buckets:
     """Sort the boxes in so many blocks, for lines between some of these points that are no longer than ``2 half``."""
-    x, y = points[:, 0].min(), points[:, 1].min()
+    (x, y, _), (high_x, high_y, _) = _enclosed(points, np.int64(0), points.shape[0])
     spread = half * WIDER + others.need.max()
     width = 2 * spread
-    size = (int((points[:, 0].max() - x) / width) + 1, int((points[:, 1].max() - y) / width) + 1)
+    size = (int((high_x - x) / width) + 1, int((high_y - y) / width) + 1)
     boxes, count = others.boxes, size[0] * size[1]
     first, items = np.zeros(num_blocks * count + 1, np.int64), np.empty(0, np.int32)
     # First they are counted, then entered from the end of each cell's part.

@@ -53,8 +53,8 @@ def _mixed(a: np.uint64, b: np.uint64) -> float:
 
 @compiled
 def _rank_options(
-    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, depth: int, k: Whole, at: Whole, pushed: bool,
-    seed: int,
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, depth: Whole, k: Whole, at: Whole,
+    pushed: bool | np.bool_, seed: int,
 ) -> None:  # fmt: skip
     """Sort the edges that a robot may take, the best first, with staying among them unless it is pushed."""
     options, worth, count = scratch.options[depth], scratch.worth, 0
@@ -82,11 +82,11 @@ def _rank_options(
 
 @compiled
 def _blocking_robot(
-    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: int
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, k: Whole, e: Whole, depth: Whole
 ) -> Whole:
     """The first robot that has to yield before ``k`` takes an edge; -1 for none, -2 where that cannot be."""
     nodes, head, at = roadmap.nodes, np.int64(roadmap.heads[e]), positions[k]
-    found = -1
+    found: Whole = np.int64(-1)
     for number in range(roadmap.near_first[e], roadmap.near_first[e + 1]):
         u = np.int64(roadmap.near[number])
         if bodies.docks and u == bodies.goals[k] and u != at:
@@ -94,7 +94,7 @@ def _blocking_robot(
                 return -2  # It would arrive in passing.
             if head == u and not scratch.may_dock[k]:
                 return -2
-        i = scratch.who[u]
+        i = np.int64(scratch.who[u])
         if i < 0 or i == k:
             continue
         if passes_too_near(roadmap, bodies, k, at, head, i, u, roadmap.gaps[number]):
@@ -113,7 +113,7 @@ def _blocking_robot(
 
 @compiled
 def _push(
-    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, depth: int, k: Whole,
+    roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, depth: Whole, k: Whole,
     seed: int,
 ) -> None:  # fmt: skip
     """Have a robot look for an edge, for those before it to get past unless it is the first."""
@@ -123,7 +123,7 @@ def _push(
 
 
 @compiled
-def _next_edge(roadmap: Roadmap, scratch: PibtWorkspace, positions: IntArray, depth: int, forced: Whole) -> Whole:
+def _next_edge(roadmap: Roadmap, scratch: PibtWorkspace, positions: IntArray, depth: Whole, forced: Whole) -> Whole:
     """The next edge that a robot tries; :data:`NOTHING` if it stays. The first must go to node ``forced``, if any."""
     anywhere = depth > 0 or forced < 0
     while True:
@@ -138,14 +138,14 @@ def _next_edge(roadmap: Roadmap, scratch: PibtWorkspace, positions: IntArray, de
 @compiled
 def _move(
     roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, positions: IntArray, root: Whole, forced: Whole,
-    seed: int, count: int,
-) -> int:  # fmt: skip
+    seed: int, count: Whole,
+) -> Whole:  # fmt: skip
     """Let a robot move, and before it those that are in its way; how many moves there are then.
 
     ``forced`` is the node that it must go to, -1 for where it likes, ``count`` the moves so far; ``positions`` is
     changed. See :func:`step_team`.
     """
-    depth = 0
+    depth: Whole = np.int64(0)  # literals would compile what they are passed to once more
     _push(roadmap, bodies, scratch, positions, depth, root, seed)
     while depth >= 0:
         k, e = scratch.robots[depth], scratch.edges[depth]
@@ -175,7 +175,7 @@ def _move(
 def step_team(
     roadmap: Roadmap, bodies: RobotArrays, scratch: PibtWorkspace, order: IntArray, robots: IntArray, targets: IntArray,
     seed: int, positions: IntArray,
-) -> int:  # fmt: skip
+) -> Whole:  # fmt: skip
     """Let the whole team move.
 
     Args:
@@ -191,7 +191,7 @@ def step_team(
     Returns:
         The number of moves; -1 where a robot could not go where it must.
     """
-    count = 0
+    count: Whole = np.int64(0)
     scratch.state[:] = FREE
     scratch.who[:] = -1
     for k in range(positions.shape[0]):
@@ -211,5 +211,5 @@ def step_team(
     for number in range(order.shape[0]):
         k = order[number]
         if scratch.state[k] == FREE:
-            count = _move(roadmap, bodies, scratch, positions, k, -1, seed, count)
+            count = _move(roadmap, bodies, scratch, positions, k, np.int64(-1), seed, count)
     return count

@@ -121,7 +121,9 @@ def measure_gaps(
     """Measure the distances of nodes from edges: ``gaps`` is output, all others as in :class:`Roadmap`."""
     for e in range(tails.shape[0]):
         for number in range(near_first[e], near_first[e + 1]):
-            gaps[number] = np.sqrt(squared_gap(nodes, near[number], nodes, tails[e], nodes, heads[e]))
+            # Of the type that numbers have elsewhere, or it would be compiled once more.
+            node, tail, head = np.int64(near[number]), np.int64(tails[e]), np.int64(heads[e])
+            gaps[number] = np.sqrt(squared_gap(nodes, node, nodes, tail, nodes, head))
 
 
 ROUNDING = 2.0**-27
@@ -186,7 +188,7 @@ def closed(roadmap: Roadmap, bodies: RobotArrays, arrived: Ints, k: Whole, tail:
             if u != head and u != tail and roadmap.gaps[number] < bodies.goal_radius + bodies.slack / 2:
                 return True
         elif arrived[u] >= 0:
-            i = arrived[u]
+            i = np.int64(arrived[u])
             if i != k and passes_too_near(roadmap, bodies, k, tail, head, i, u, roadmap.gaps[number]):
                 return True
     return False

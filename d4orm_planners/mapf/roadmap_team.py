@@ -187,7 +187,8 @@ class Replanning:
                 idle += patience // HOPELESS
                 continue
             others = occupancy.around(self.separation(robot, KEEP))._replace(need=self.separation(robot, TOUCH))
-            find_meetings(others, driven.positions[: self.leaves(int(driven.arrivals[robot])), robot], met)
+            last = self.leaves(int(driven.arrivals[robot]))
+            find_meetings(others, np.ascontiguousarray(driven.positions[:last, robot]), met)
             displaced = settled & met
             occupancy.put(displaced, FAR)
             settled &= ~displaced
