@@ -91,8 +91,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
             average, in steps of the fastest at full speed.
         patience: Steps without progress towards the goals after which the guidance is planned anew too.
         deadline: Seconds that a control loop may take. Loops that would take longer make a half or a quarter of
-            ``num_steps``; one that does all the same is left behind, and the last plan goes on. ``None`` waits for
-            every loop.
+            ``num_steps``; one that does all the same is left behind, and the last plan goes on. What is planned anew
+            is beside the loops, on one core. ``None`` waits for every loop, and for plans.
         control_noise_std: Gaussian noise that the controller adds to its controls, in their units.
 
     Raises:
