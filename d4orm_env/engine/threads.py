@@ -17,7 +17,6 @@ import numpy as np
 
 from d4orm_env.core.arrays import IntArray
 
-
 _calling = local()
 
 
