@@ -60,6 +60,14 @@ def _detached(value: Any) -> Any:
     return value
 
 
+def numbers_of(value: ArrayLike, what: str) -> FloatArray:
+    """:func:`as_float32` of what a user gave; the error says ``what`` is wanted, as ``"goal must be numbers"``."""
+    try:
+        return as_float32(value)
+    except ValueError as error:
+        raise ValueError(f"{what}, not {short_repr(value)}; {error}") from error
+
+
 def frozen_array(
     value: ArrayLike,
     name: str,
@@ -75,11 +83,8 @@ def frozen_array(
     Raises:
         ValueError: If it cannot be read, has another shape, or holds a value that is not finite or beyond ``largest``.
     """
-    try:
-        # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
-        array = as_float32(value) + np.float32(0)
-    except ValueError as error:
-        raise ValueError(f"{name} must be an array of numbers, not {short_repr(value)}; {error}") from error
+    # Adding zero makes -0.0 a plain zero, so that equal problems have equal bits.
+    array = numbers_of(value, f"{name} must be an array of numbers") + np.float32(0)
     if array.size == 0 and (0 in shape or None in shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(want is not None and want != have for want, have in zip(shape, array.shape)):
@@ -106,12 +111,15 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
     elif np.shape(value) != (num_robots,):
         raise ValueError(f"{name} has shape {np.shape(value)}; expected one number, or ({num_robots},)")
     array = frozen_array(value, name, (num_robots,))
-    outside = (array < np.float32(SMALLEST)) | (array > LARGEST)
-    for wrong, wanted in ((array <= 0, "positive"), (outside, f"from {SMALLEST:g} to {LARGEST:g}")):
-        if wrong.any():
-            robot = int(np.argmax(wrong))
-            raise ValueError(f"{name} of robot_{robot} is {array[robot]:g}; it must be {wanted}")
+    refuse_robots(array <= 0, name, array, "positive")
+    refuse_robots((array < np.float32(SMALLEST)) | (array > LARGEST), name, array, f"from {SMALLEST:g} to {LARGEST:g}")
     return array
+
+
+def refuse_robots(wrong: BoolArray, name: str, values: FloatArray, wanted: str, unit: str = "") -> None:
+    """Refuse ``values`` ``(K,)``, a number of a unit for each robot, where they are ``wrong`` ``(K,)``."""
+    for robot in np.flatnonzero(wrong)[:1]:
+        raise ValueError(f"{name} of robot_{robot} is {values[robot]:g}{unit}; it must be {wanted}")
 
 
 @dataclass(frozen=True, eq=False, init=False)

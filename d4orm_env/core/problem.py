@@ -287,15 +287,9 @@ class Problem(Frozen):
         """
         index = list(robots)
         team = self.team.select(index)
-        return self._unchecked(
-            team=team,
-            start=self.start[index, : team.state_size],
-            goal=self.goal[index],
-            goal_speed=self.goal_speed[index],
-            goal_heading=self.goal_heading[index],
-            goal_heading_tolerance=self.goal_heading_tolerance[index],
-            goal_hitches=self.goal_hitches[index],
-        )
+        names = ("goal", "goal_speed", "goal_heading", "goal_heading_tolerance", "goal_hitches")
+        goals = {name: getattr(self, name)[index] for name in names}
+        return self._unchecked(team=team, start=self.start[index, : team.state_size], **goals)
 
     def _unchecked(self, **changes: object) -> Problem:
         copy: Problem = object.__new__(Problem)

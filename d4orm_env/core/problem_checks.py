@@ -15,9 +15,10 @@ from d4orm_env.core.arrays import (
     SMALLEST,
     FloatArray,
     Floats,
-    as_float32,
     frozen_per_robot,
+    numbers_of,
     positive_number,
+    refuse_robots,
     short_repr,
     whole_number,
 )
@@ -94,13 +95,10 @@ def check_physics(problem: Problem) -> list[str]:
     check_turning(team, problem.dt, problem.goal_radius)
     at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, problem.goal_heading)
     goals = np.column_stack([problem.goal, at_goals]).astype(np.float64)
-    faults = [
-        check_positions(team, problem.world, what, positions, problem.margin, poses)
-        for what, positions, poses in (
-            ("start", starts, team.body_poses(problem.start) if team.shapes else None), ("goal", problem.goal, goals)
-        )
-    ]  # fmt: skip
-    return [fault for fault in faults if fault]
+    bodies = team.body_poses(problem.start) if team.shapes else None
+    fault = check_positions(team, problem.world, "start", starts, problem.margin, bodies)
+    other = check_positions(team, problem.world, "goal", problem.goal, problem.margin, goals)
+    return [text for text in (fault, other) if text]
 
 
 def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
@@ -109,12 +107,8 @@ def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
         first_order = np.array([model.first_order for model in team.robot_models])
         return np.where(first_order, np.float32(np.inf), team.max_acceleration * np.float32(dt))
     speeds = _one_or_each(given, "goal_speed", team.num_robots)
-    wrong = ~((speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf)))
-    if wrong.any():
-        robot = int(np.argmax(wrong))
-        raise ValueError(
-            f"goal_speed of robot_{robot} is {speeds[robot]:g}; it must be from 0 to {LARGEST:g}, or inf for no limit"
-        )
+    right = (speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf))
+    refuse_robots(~right, "goal_speed", speeds, f"from 0 to {LARGEST:g}, or inf for no limit")
     return speeds
 
 
@@ -125,19 +119,15 @@ def checked_goal_poses(
     headings = _goal_headings(team, heading)
     tolerances = frozen_per_robot(tolerance, "goal_heading_tolerance", team.num_robots)
     # What float32 does not resolve, or what allows any heading.
-    for robot in np.flatnonzero((tolerances < LEAST_TOLERANCE) | (tolerances > np.float32(np.pi)))[:1].tolist():
-        value = f"goal_heading_tolerance of robot_{robot} is {tolerances[robot]:g} rad"
-        raise ValueError(f"{value}; it must be from {LEAST_TOLERANCE:g} to pi")
+    wrong = (tolerances < LEAST_TOLERANCE) | (tolerances > np.float32(np.pi))
+    refuse_robots(wrong, "goal_heading_tolerance", tolerances, f"from {LEAST_TOLERANCE:g} to pi", " rad")
     angles = _goal_hitches(team, hitches, headings)
     return {"goal_heading": headings, "goal_heading_tolerance": tolerances, "goal_hitches": angles}
 
 
 def _one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
     """``(K,)`` numbers, given as one for all robots or one each."""
-    try:
-        values = as_float32(given)
-    except ValueError as error:
-        raise ValueError(f"{name} must be a number or one per robot, not {short_repr(given)}; {error}") from error
+    values = numbers_of(given, f"{name} must be a number or one per robot")
     values = np.repeat(values, num_robots) if values.ndim == 0 else values
     if values.shape != (num_robots,):
         raise ValueError(f"{name} has shape {values.shape}; expected one number, or ({num_robots},){note}")
@@ -148,16 +138,11 @@ def _goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
     """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
     headings = _one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
     for robot in np.flatnonzero(~np.isnan(headings)).tolist():
+        where = f"goal_heading of robot_{robot} is {headings[robot]:g}"
         if team.robot_models[robot].heading_index is None:
-            raise ValueError(
-                f"goal_heading of robot_{robot} is {headings[robot]:g}, and a {team.models[robot]} has no heading; "
-                f"give NaN"
-            )
+            raise ValueError(f"{where}, and a {team.models[robot]} has no heading; give NaN")
         if not abs(headings[robot]) <= np.float32(2 * np.pi):
-            raise ValueError(
-                f"goal_heading of robot_{robot} is {headings[robot]:g} rad; it must be at most 2 pi in magnitude, so "
-                f"give radians, without whole turns"
-            )
+            raise ValueError(f"{where} rad; it must be at most 2 pi in magnitude, so give radians, without whole turns")
     return headings
 
 
@@ -166,10 +151,7 @@ def _goal_hitches(team: Team, given: ArrayLike | None, headings: FloatArray) -> 
     hitches = np.full((team.num_robots, MOST_TRAILERS), np.nan, np.float32)
     if given is None:
         return hitches
-    try:
-        values = as_float32(given)
-    except ValueError as error:
-        raise ValueError(f"goal_hitches must be numbers, a row per robot, not {short_repr(given)}; {error}") from error
+    values = numbers_of(given, "goal_hitches must be numbers, a row per robot")
     if values.ndim != 2 or values.shape[0] != team.num_robots or values.shape[1] > MOST_TRAILERS:
         raise ValueError(
             f"goal_hitches has shape {values.shape}; expected ({team.num_robots}, trailers), NaN for any and for none"
@@ -244,21 +226,16 @@ def check_turning(team: Team, dt: float, goal_radius: float) -> None:
     """Refuse a time step in which one step of RK4 does not follow a robot that turns as fast as it may."""
     team_limits, most = team.limits, INTEGRATION_ERROR * goal_radius
     for robot, model in enumerate(team.robot_models):
-        if model.heading_index is None:
-            continue
         speed = float(team_limits[robot, SPEED])
         angle = model.turn_rate(team_limits[robot]) * dt
+        where = f"robot_{robot} may turn by {angle:.3g} rad in a step of {dt:g} s"
         if angle > MAX_ANGLE:
-            raise ValueError(
-                f"robot_{robot} may turn by {angle:.3g} rad in a step of {dt:g} s, more than {MOST_TURNS} turns; use a "
-                f"smaller dt or {_turning_limits(model)}"
-            )
+            raise ValueError(f"{where}, more than {MOST_TURNS} turns; use a smaller dt or {_turning_limits(model)}")
         error = speed * dt * angle**4 / 2880
         if error > most:
             raise ValueError(
-                f"robot_{robot} may turn by {angle:.3g} rad in a step of {dt:g} s, and at {speed:g} m/s one "
-                f"step of RK4 may then be {error:.2g} m off (most: {most:.2g} m, by goal_radius); use a smaller dt, "
-                f"{_turning_limits(model)} or max_speed"
+                f"{where}, and at {speed:g} m/s one step of RK4 may then be {error:.2g} m off (most: {most:.2g} m, by "
+                f"goal_radius); use a smaller dt, {_turning_limits(model)} or max_speed"
             )
 
 
@@ -271,9 +248,8 @@ def check_positions(
     ``poses`` are ``(F, d + 1)``, or without the trailers ``(K, d + 1)``. Returned is what is nearest within the margin,
     for an error or a warning: the empty string if nothing is.
     """
-    radius = team.radius.astype(np.float64)
+    radius, shaped = team.radius.astype(np.float64), bool(team.shapes)
     gaps = world.clearance(positions) - radius
-    shaped = bool(team.shapes)
     if poses is None:
         poses = np.column_stack([positions.astype(np.float64), np.full(len(positions), np.nan)])
     bodies = numbers_by_robot(team.bodies[: len(poses)], team.num_robots) if shaped else []

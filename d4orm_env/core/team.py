@@ -71,9 +71,8 @@ class Team(Frozen):
             raise ValueError("a team needs at least one robot; models is empty")
         if len({get_model(name).dimension for name in models}) > 1:
             raise ValueError(f"models {sorted(set(models))} mix 2D and 3D robots; a team moves in one dimension")
-        self._set(models=tuple(models))
-        for name, value in zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True):
-            self._set(**{name: frozen_per_robot(value, name, len(models))})
+        limits = zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True)
+        self._set(models=tuple(models), **{name: frozen_per_robot(value, name, len(models)) for name, value in limits})
         self._set(own_limits=self._complete_own_limits(own_limits))
         self._set_footprints(radius, footprint)
 
@@ -95,20 +94,19 @@ class Team(Frozen):
                 "Box(0.5, 0.25), or one for all"
             )
         for robot, footprint in enumerate(footprints):
+            where = f"footprint of robot_{robot}"
             if not isinstance(footprint, Footprint):
-                raise ValueError(
-                    f"footprint of robot_{robot} is {short_repr(footprint)}; give one such as Box(0.5, 0.25)"
-                )
+                raise ValueError(f"{where} is {short_repr(footprint)}; give one such as Box(0.5, 0.25)")
             if footprint.dimension != self.dimension and not isinstance(footprint, Disc):
                 raise ValueError(
-                    f"footprint of robot_{robot}, {footprint}, lies in {footprint.dimension} dimensions and the team "
-                    f"moves in {self.dimension}; choose another"
+                    f"{where}, {footprint}, lies in {footprint.dimension} dimensions and the team moves in "
+                    f"{self.dimension}; choose another"
                 )
             pulled = len(footprint.trailers) if isinstance(footprint, Train) else 0
             if pulled != trailers[robot]:
                 raise ValueError(
-                    f"footprint of robot_{robot} has {pulled} trailers, and a {self.models[robot]} pulls "
-                    f"{trailers[robot]}; give such as Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
+                    f"{where} has {pulled} trailers, and a {self.models[robot]} pulls {trailers[robot]}; give such as "
+                    "Train(Box(0.5, 0.25), [Box(0.3, 0.25)])"
                 )
         outer = [self._outer_radius(robot, footprint) for robot, footprint in enumerate(footprints)]
         radii = frozen_per_robot(outer, "radius", count)
@@ -280,16 +278,14 @@ class Team(Frozen):
             ValueError: If a number is no robot's.
         """
         index = [whole_number(robot, "robot", 0, self.num_robots - 1) for robot in robots]
-        models = self.robot_models
-        limits = {limit.name for robot in index for limit in models[robot].own_limits}
+        standard = {name: getattr(self, name)[index] for name in STANDARD_LIMITS}
+        own = {limit.name for robot in index for limit in self.robot_models[robot].own_limits}
         return Team(
             tuple(self.models[robot] for robot in index),
             None if self.shapes else self.radius[index],
-            self.max_speed[index],
-            self.max_acceleration[index],
-            self.max_turn_rate[index],
-            {name: values[index] for name, values in self.own_limits.items() if name in limits},
-            [self.shapes[robot] for robot in index] if self.shapes else None,
+            **standard,
+            own_limits={name: values[index] for name, values in self.own_limits.items() if name in own},
+            footprint=[self.shapes[robot] for robot in index] if self.shapes else None,
         )
 
 

@@ -47,15 +47,9 @@ class Physics:
     surface_density: float = 100.0
 
     def __post_init__(self) -> None:
-        for attribute in fields(self):
-            name = attribute.name
-            value = positive_number(
-                getattr(self, name),
-                f"Physics {name}",
-                zero_allowed=name in _ALLOWED_ZERO,
-                least=1e-4,
-                most=_MOST.get(name, 1e3),
-            )
+        for name in [attribute.name for attribute in fields(self)]:
+            zero, most = name in _ALLOWED_ZERO, _MOST.get(name, 1e3)
+            value = positive_number(getattr(self, name), f"Physics {name}", zero_allowed=zero, least=1e-4, most=most)
             object.__setattr__(self, name, value)
 
 
@@ -195,11 +189,9 @@ def _add_surroundings(spec: mujoco.MjSpec, world: World, top: float, physics: Ph
             **solid(physics),
         )
     for number, corners in enumerate(world.shapes.triangles.reshape(-1, 3, 2).astype(np.float64)):
-        prism = [[*corner, height] for corner in corners.tolist() for height in (0.0, top)]
+        prism = np.ravel([[*corner, height] for corner in corners.tolist() for height in (0.0, top)])
         # A shell, because a sliver has no volume to speak of; what never moves needs no inertia.
-        spec.add_mesh(
-            name=f"prism_{number}", uservert=np.ravel(prism), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        )
+        spec.add_mesh(name=f"prism_{number}", uservert=prism, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         ground.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"prism_{number}", rgba=grey, **solid(physics))
 
 

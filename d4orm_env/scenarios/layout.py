@@ -16,7 +16,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import MAX_HORIZON, check_positions
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
-from d4orm_env.scenarios.settings import LARGEST, OBSTACLES, STARTS_AND_GOALS, Settings, bounded
+from d4orm_env.scenarios.settings import LARGEST, OBSTACLES, STARTS_AND_GOALS, Settings, bounded, require_scale
 
 MIN_HORIZON = 100
 HORIZON_SLACK = 1.6
@@ -63,28 +63,22 @@ def build(settings: Settings, layout: Layout) -> Problem:
     team, horizon = settings.team, settings.horizon
     if settings.height is not None:
         layout = _lifted(layout, settings.height)
-    _require_scale(settings, layout.travel)
-    positions = np.vstack([layout.starts, layout.goals])
+    require_scale(settings, layout.travel)
     world = _with_bounds(settings, layout.world, layout.area)
     _require_inside(settings, world, layout.starts, layout.goals)
     if layout.area is not None:
-        world = with_random_obstacles(settings, world, positions, layout.area)
+        world = with_random_obstacles(settings, world, np.vstack([layout.starts, layout.goals]), layout.area)
     _require_margin(settings, world, layout.starts, layout.goals)
+    shared = ("dt", "margin", "goal_radius", "goal_speed", "goal_heading", "goal_heading_tolerance", "arrival")
     return Problem(
         team=team,
         start=_start_states(team, layout.starts, layout.goals),
         goal=layout.goals,
         world=world,
-        dt=settings.dt,
         horizon=default_horizon(team, settings.dt, layout.travel) if horizon is None else horizon,
-        margin=settings.margin,
-        goal_radius=settings.goal_radius,
-        goal_speed=settings.goal_speed,
-        goal_heading=settings.goal_heading,
-        goal_heading_tolerance=settings.goal_heading_tolerance,
         name=settings.scenario,
-        arrival=settings.arrival,
         collision_penalty=settings.collision_penalty,
+        **{name: getattr(settings, name) for name in shared},
     )
 
 
@@ -141,28 +135,13 @@ def in_space(points: ArrayLike, dimension: int) -> Floats:
     return planar if dimension == 2 else np.hstack([planar, np.zeros((len(planar), 1))])
 
 
-def _require_scale(settings: Settings, travel: float) -> None:
-    """Refuse a step in which all robots pass the whole scenario, or a goal radius as large: numbers in other units."""
-    stride = float(settings.team.max_speed.min()) * settings.dt
-    for what, length in (
-        (f"dt is {settings.dt:g} s, in which the slowest robot may move by {stride:g} m", stride),
-        (f"goal_radius is {settings.goal_radius:g} m", settings.goal_radius),
-    ):
-        if length > travel:
-            raise ValueError(
-                f"{what}, farther than the {travel:.3g} m that scenario {settings.scenario!r} is made for; give metres "
-                "and seconds"
-            )
-
-
 def _require_margin(settings: Settings, world: World, starts: Floats, goals: Floats) -> None:
     """Check that the surfaces of robots and obstacles are more than the margin apart, at the start and at the goal.
 
     The problem would have no solution that keeps the margin.
     """
     for what, positions in (("start", starts), ("goal", goals)):
-        fault = check_positions(settings.team, world, what, as_float32(positions), settings.margin)
-        if fault:
+        if fault := check_positions(settings.team, world, what, as_float32(positions), settings.margin):
             raise ValueError(
                 f"scenario {settings.scenario!r}: {fault}; make the scenario larger, or the radius or margin smaller"
             )
@@ -221,8 +200,7 @@ def scatter(settings: Settings, size: float) -> tuple[Floats, Floats]:
     starts, goals = np.empty((0, dimension)), np.empty((0, dimension))
     for robot in range(count if needed <= size else 0):
         starts = _with_another(random, area, starts, settings.spacing)
-        own = (starts[robot:], settings.goal_radius)
-        goals = _with_another(random, area, goals, settings.spacing, own)
+        goals = _with_another(random, area, goals, settings.spacing, (starts[robot:], settings.goal_radius))
         if min(len(starts), len(goals)) == robot:
             break
     if min(len(starts), len(goals)) < count:
@@ -279,17 +257,15 @@ def round_up(value: float) -> str:
 
 
 def _with_another(
-    random: np.random.Generator,
-    area: PlacementArea,
-    points: Floats,
-    spacing: float,
-    avoid: tuple[Floats, float] | None = None,
+    random: np.random.Generator, area: PlacementArea, points: Floats, spacing: float, *others: tuple[Floats, float]
 ) -> Floats:
-    """``points`` and a random one further than ``spacing`` from each, or just ``points`` if there is no room."""
+    """``points`` and a random one further than ``spacing`` from each, or just ``points`` if there is no room.
+
+    It keeps a distance of their own from each of ``others`` too.
+    """
 
     def is_free(candidates: Floats) -> BoolArray:
-        free = _gaps(candidates, points, spacing) > 0
-        return free if avoid is None else free & (_gaps(candidates, *avoid) > 0)
+        return np.all([_gaps(candidates, *kept) > 0 for kept in ((points, spacing), *others)], axis=0)
 
     position = _first(random, area, is_free)
     return points if position is None else np.vstack([points, position])

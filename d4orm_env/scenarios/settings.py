@@ -132,6 +132,20 @@ def require_space(settings: Settings) -> None:
         )
 
 
+def require_scale(settings: Settings, travel: float) -> None:
+    """Refuse a step in which all robots pass the whole scenario, or a goal radius as large: numbers in other units."""
+    stride = float(settings.team.max_speed.min()) * settings.dt
+    for what, length in (
+        (f"dt is {settings.dt:g} s, in which the slowest robot may move by {stride:g} m", stride),
+        (f"goal_radius is {settings.goal_radius:g} m", settings.goal_radius),
+    ):
+        if length > travel:
+            raise ValueError(
+                f"{what}, farther than the {travel:.3g} m that scenario {settings.scenario!r} is made for; give metres "
+                "and seconds"
+            )
+
+
 def grid_size(value: object, name: str) -> tuple[int, int]:
     """Columns and rows from what was given for them: two whole numbers, and not too many squares."""
     if not isinstance(value, tuple | list) or len(value) != 2:

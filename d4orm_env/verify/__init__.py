@@ -20,8 +20,8 @@ from d4orm_env.core import portable
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
-from d4orm_env.verify.footprints import ConvexBodies, make_watches
-from d4orm_env.verify.geometry import Floats, norm
+from d4orm_env.verify.footprints import make_watches
+from d4orm_env.verify.geometry import ConvexBodies, Floats, norm
 from d4orm_env.verify.motion import TeamMotion
 from d4orm_env.verify.report import VerificationReport, Violation
 

@@ -11,12 +11,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from d4orm_env.verify.geometry import Floats, closest_approach, norm
+from d4orm_env.verify.geometry import Floats, Indices, closest_approach, norm
 from d4orm_env.verify.report import Violation
-
-Indices = NDArray[np.intp]
 
 _ROUNDING = 2.0**-30
 """Rounding of distances, as a share of how far any robot gets."""

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from d4orm_env.verify.contact import Indices, StaticDiscs, Watch, side_names
+from d4orm_env.verify.contact import StaticDiscs, Watch, side_names
 from d4orm_env.verify.geometry import (
     Floats,
+    Indices,
     box_approach,
     box_distance,
     closest_approach,

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, as_float32, positive_number, short_repr
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, numbers_of, positive_number, short_repr
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
@@ -215,10 +215,7 @@ class Controller:
     def _completed(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """``(K, n)`` measured states where they are known, the reference's elsewhere, and ``(K,)`` where."""
         reference = self._joint.states
-        try:
-            measured = as_float32(states)
-        except ValueError as error:
-            raise ValueError(f"states must be an array of numbers, not {short_repr(states)}; {error}") from error
+        measured = numbers_of(states, "states must be an array of numbers")
         if measured.shape != reference.shape:
             raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
         known: BoolArray = np.all(np.isfinite(measured), axis=1)

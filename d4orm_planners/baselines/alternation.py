@@ -40,16 +40,11 @@ class Method(NamedTuple):
     tolerance: float  #: Largest violation, and change of a position, at which it ends, in SI units
 
 
-class Guess(NamedTuple):
-    """Samples of a motion at steps 1 to T, each ``(T, d)``: positions [m], velocities [m/s], accelerations [m/s^2]."""
+class MotionSamples(NamedTuple):
+    """Samples at steps 1 to T, each ``(T, d)``: positions [m], velocities [m/s], accelerations [m/s^2].
 
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-
-
-class Targets(NamedTuple):
-    """Sums over all constraints that directions and lengths make of a :class:`Guess`, each ``(T, d)``."""
+    They are those of a motion, or, as targets of one, sums over all constraints that directions and lengths make of it.
+    """
 
     position: Floats
     velocity: Floats
@@ -75,7 +70,7 @@ def alternate(
     goal: Floats,
     fixed: int,
     motion: Floats,
-    guess: Guess,
+    guess: MotionSamples,
 ) -> float:
     """Alternate until no constraint is violated and no position changes, to the tolerance, or as often as may be.
 
@@ -87,16 +82,17 @@ def alternate(
         goal: ``(d,)`` [m].
         fixed: Number of first coefficients that are given.
         motion: ``(n+1, d)`` coefficients; the given ones are read and the others written.
-        guess: :class:`Guess` to begin with, and the motion's samples in the end.
+        guess: Samples to begin with, and the motion's in the end.
 
     Returns:
         The largest violation that is left, in SI units.
     """
     (steps, size), d = method.position.shape, len(goal)
-    targets = Targets(np.empty((steps, d)), np.empty((steps, d)), np.empty((steps, d)))
+    targets = MotionSamples(np.empty((steps, d)), np.empty((steps, d)), np.empty((steps, d)))
     multiplier, right, matrix = np.zeros((size, d)), np.empty((size, d)), np.empty((size, size))
     active = np.zeros(len(bodies.radius) + len(bodies.boxes), np.bool_)
-    rows = _activate(method, bodies, robot, guess, active) + 1  # the bounds always are
+    _activate(method, bodies, robot, guess, active)
+    rows = np.count_nonzero(active) + 1  # the bounds always are
     bends = 1.0 if limits[1] < math.inf else 0.0
     squares = rows * method.squares[0] + method.squares[1] + bends * method.squares[2]
     violation, penalty = _project(method, bodies, robot, limits, active, motion[0], guess, targets), method.penalty
@@ -119,31 +115,27 @@ def alternate(
 
 
 @compiled
-def _activate(method: Method, bodies: Neighbourhood, robot: Whole, guess: Guess, active: BoolArray) -> int:
-    """Mark the bodies near the guess, whose constraints are active; returns their number."""
-    robots, d, count = len(bodies.radius), bodies.paths.shape[2], 0
+def _activate(method: Method, bodies: Neighbourhood, robot: Whole, guess: MotionSamples, active: BoolArray) -> None:
+    """Mark the bodies near the guess, whose constraints are active."""
     for body in range(len(active)):
         if body == robot:
             continue
         for step in range(len(guess.position)):
-            square = 0.0
-            if body < robots:
-                safety_distance = bodies.radius[robot] + bodies.radius[body] + bodies.margin
-                for axis in range(d):
-                    gap = guess.position[step, axis] - bodies.paths[body, step, axis]
-                    square += gap * gap
-            else:
-                box = bodies.boxes[body - robots]
-                safety_distance = bodies.radius[robot] + box[2 * d] + bodies.margin
-                for axis in range(d):
-                    x = guess.position[step, axis]
-                    gap = max(box[axis] - x, x - box[d + axis], 0.0)
-                    square += gap * gap
-            if square < (safety_distance + method.lookout) * (safety_distance + method.lookout):
+            low, high, radius = _box(bodies, body, step)
+            near = bodies.radius[robot] + radius + bodies.margin + method.lookout
+            if _square_gap(guess.position[step], low, high) < near * near:
                 active[body] = True
-                count += 1
                 break
-    return count
+
+
+@compiled
+def _box(bodies: Neighbourhood, body: int, step: int) -> tuple[Floats, Floats, float]:
+    """Lower and upper corner ``(d,)`` of the box that a body is at a step, a robot's a point, and radius about it."""
+    d = bodies.paths.shape[2]
+    if body < len(bodies.radius):
+        return bodies.paths[body, step], bodies.paths[body, step], bodies.radius[body]
+    box = bodies.boxes[body - len(bodies.radius)]
+    return box[:d], box[d : 2 * d], box[2 * d]
 
 
 @compiled
@@ -154,38 +146,30 @@ def _project(
     limits: Floats,
     active: BoolArray,
     here: Floats,
-    guess: Guess,
-    targets: Targets,
+    guess: MotionSamples,
+    targets: MotionSamples,
 ) -> float:
     """Sum the nearest samples that limits and the bodies ``active`` ``(K + B,)`` allow into ``targets``.
 
     The robot is at ``here`` ``(d,)`` now; all else is as of :func:`alternate`. Returns the largest violation.
     """
-    robots, (steps, d), radius = len(bodies.radius), guess.position.shape, bodies.radius[robot]
+    radius = bodies.radius[robot]
     worst = _stay_within(bodies.bounds, radius, limits, guess, targets)
     for body in range(len(active)):
         if not active[body]:
             continue
-        if body < robots:
-            safety_distance = radius + bodies.radius[body] + bodies.margin
-            before = _gap(here, bodies.paths[body, 0], bodies.paths[body, 0])
-        else:
-            box = bodies.boxes[body - robots]
-            safety_distance = radius + box[2 * d] + bodies.margin
-            before = _gap(here, box[:d], box[d : 2 * d])
-        for step in range(steps):
+        low, high, own = _box(bodies, body, 0)
+        safety_distance, before = radius + own + bodies.margin, math.sqrt(_square_gap(here, low, high))
+        for step in range(len(guess.position)):
             least = safety_distance + (1.0 - method.barrier) * max(before - safety_distance, 0.0)
-            if body < robots:
-                centre = bodies.paths[body, step]
-                before = _push(guess.position[step], centre, centre, least, targets.position[step])
-            else:
-                before = _push(guess.position[step], box[:d], box[d : 2 * d], least, targets.position[step])
+            low, high, own = _box(bodies, body, step)
+            before = _push(guess.position[step], low, high, least, targets.position[step])
             worst = max(worst, safety_distance - before)
     return worst
 
 
 @compiled
-def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, targets: Targets) -> float:
+def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: MotionSamples, targets: MotionSamples) -> float:
     """Write the targets of the bounds and of the limits of speed and acceleration; return the largest violation."""
     (steps, d), worst = guess.position.shape, 0.0
     for step in range(steps):
@@ -200,13 +184,13 @@ def _stay_within(bounds: Floats, radius: float, limits: Floats, guess: Guess, ta
 
 
 @compiled
-def _gap(position: Floats, low: Floats, high: Floats) -> float:
-    """Distance of a position from a box, zero within."""
+def _square_gap(position: Floats, low: Floats, high: Floats) -> float:
+    """Square of the distance of a position from a box, zero within."""
     square = 0.0
     for axis in range(len(position)):
         gap = max(low[axis] - position[axis], position[axis] - high[axis], 0.0)
         square += gap * gap
-    return math.sqrt(square)
+    return square
 
 
 @compiled
@@ -216,7 +200,7 @@ def _push(position: Floats, low: Floats, high: Floats, least: float, target: Flo
     Returns:
         How far ``position`` is from the box, negative within.
     """
-    distance = _gap(position, low, high)
+    distance = math.sqrt(_square_gap(position, low, high))
     if distance > 0.0:
         factor = max(least / distance, 1.0)
         for axis in range(len(position)):
@@ -260,7 +244,7 @@ def _raise_multiplier(squares: Floats, motion: Floats, right: Floats, penalty: f
 
 
 @compiled
-def _accumulate(method: Method, targets: Targets, bends: float, right: Floats) -> None:
+def _accumulate(method: Method, targets: MotionSamples, bends: float, right: Floats) -> None:
     """Add up the targets' share of the coefficients: ``F^T`` of them, into ``right`` ``(n+1, d)``."""
     (steps, size), d = method.position.shape, right.shape[1]
     for i in range(size):
@@ -298,7 +282,7 @@ def _solve(matrix: Floats, right: Floats, fixed: int, motion: Floats) -> None:
 
 
 @compiled
-def _sample(method: Method, motion: Floats, guess: Guess) -> float:
+def _sample(method: Method, motion: Floats, guess: MotionSamples) -> float:
     """Make the guess the samples of a motion; return the largest change of a position along an axis [m]."""
     (steps, size), d, change = method.position.shape, motion.shape[1], 0.0
     for step in range(steps):

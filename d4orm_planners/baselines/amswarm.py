@@ -22,7 +22,7 @@ from d4orm_env.engine.types import Engine
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig, State
 from d4orm_planners.base.settings import Count, NotNegative, Number, Positive, Share, Steps
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.baselines.alternation import Guess, Method, Neighbourhood, alternate
+from d4orm_planners.baselines.alternation import Method, MotionSamples, Neighbourhood, alternate
 from d4orm_planners.tracking.steering import present_velocities, track_velocities
 
 
@@ -83,13 +83,13 @@ class Swarm:
         predicted = np.where(absorbed[:, None, None], positions[:, None], self._guesses.position)
         bodies = Neighbourhood(predicted, self._radius, problem.margin + self._clearance, self._boxes, self._bounds)
         begins = first_coefficients(config.degree, duration, positions, velocities, self._accelerations)
-        guesses = Guess(predicted + moved, self._guesses.velocity.copy(), self._guesses.acceleration.copy())
+        guesses = MotionSamples(predicted + moved, self._guesses.velocity.copy(), self._guesses.acceleration.copy())
         for robot in np.flatnonzero(~absorbed):
             if should_stop():
                 return False
             motion, fixed = self._motions[robot], self._fixed[robot]
             motion[:fixed] = begins[:fixed, robot]
-            own = Guess(*(samples[robot] for samples in guesses))
+            own = MotionSamples(*(samples[robot] for samples in guesses))
             violation = alternate(method, bodies, robot, self._limits[robot], self._goals[robot], fixed, motion, own)
             self.violation = max(self.violation, violation)
         self._first = guesses.position[:, 0], guesses.velocity[:, 0]
@@ -103,7 +103,7 @@ class Swarm:
         mean = (positions - states[:, : self._problem.dimension]) / self._problem.dt
         return np.where(self._fixed[:, None] > 1, velocities, mean).astype(np.float32)
 
-    def _warm_start(self) -> Guess:
+    def _warm_start(self) -> MotionSamples:
         """All robots straight to their goals, as fast as allowed."""
         problem = self._problem
         positions = problem.start[:, None, : problem.dimension].astype(np.float64)
@@ -112,7 +112,7 @@ class Swarm:
         times = problem.dt * np.arange(1, self._config.lookahead + 1)[None, :, None]
         share = np.minimum(self._limits[:, 0, None, None] * times / np.maximum(distance, problem.goal_radius), 1.0)
         still = np.zeros((problem.num_robots, self._config.lookahead, problem.dimension))
-        return Guess(positions + share * ahead, still, still)
+        return MotionSamples(positions + share * ahead, still, still)
 
 
 def sample_basis(degree: int, steps: int, dt: float) -> Floats:
@@ -192,11 +192,11 @@ def _shortened(vectors: Floats, most: Floats) -> Floats:
     return vectors * np.minimum(most / length, 1.0)[:, None]
 
 
-def _one_step_on(guess: Guess, dt: float) -> Guess:
+def _one_step_on(guess: MotionSamples, dt: float) -> MotionSamples:
     """The same motions seen from the next step, at their last velocity in the end; each ``(K, T, d)``."""
     position, velocity, acceleration = (np.concatenate([part[:, 1:], part[:, -1:]], axis=1) for part in guess)
     position[:, -1] += dt * velocity[:, -1]
-    return Guess(position, velocity, acceleration)
+    return MotionSamples(position, velocity, acceleration)
 
 
 @dataclass(frozen=True, kw_only=True)

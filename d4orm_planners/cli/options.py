@@ -11,21 +11,18 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import wraps
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-from d4orm_env import render, scenarios
+from d4orm_env import scenarios
 from d4orm_env.core.files import parse_yaml
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.planner_registry import list_policies
-from d4orm_planners.cli.outputs import check_target
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
-    from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 
 T = TypeVar("T")
 N = TypeVar("N", int, float)
@@ -164,27 +161,6 @@ class ProblemOptions:
         return scenarios.make_problem(
             self.scenario, self.num_robots, self.seed, num_obstacles=self.num_obstacles, **own
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class PictureOptions:
-    """Options on pictures, and on how much to say."""
-
-    picture: Annotated[Path | None, typer.Option(help="Picture to write: .png, .svg or .pdf.")] = None
-    animation: Annotated[Path | None, typer.Option(help="Animation to write: .gif or .mp4.")] = None
-    quiet: Quiet = False
-
-    def check_pictures(self) -> None:
-        """Raise ``ValueError`` if they cannot be written."""
-        check_target(self.picture, (".png", ".svg", ".pdf"))
-        check_target(self.animation, (".gif", ".mp4"))
-
-    def draw(self, problem: Problem, trajectory: Trajectory, events: DisturbanceEvents | None = None) -> None:
-        """Write the pictures that were asked for."""
-        if self.picture is not None:
-            render.save_picture(problem, trajectory, self.picture, events=events)
-        if self.animation is not None:
-            render.save_animation(problem, trajectory, self.animation, events=events)
 
 
 def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Output of commands: where files go, tables, and lines of progress."""
+"""Output of commands: where files go, pictures, tables, and lines of progress."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -15,13 +16,16 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Te
 from rich.table import Table
 from rich.text import Text
 
+from d4orm_env import render
 from d4orm_env.core.files import target_of
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_planners.base.display import one_line
 from d4orm_planners.base.plan import IterationRecord
+from d4orm_planners.cli.options import Quiet
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
+    from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
     from d4orm_planners.base.episode import Episode
     from d4orm_planners.base.plan import Plan
 
@@ -63,6 +67,27 @@ def check_target(path: Path | None, suffixes: tuple[str, ...]) -> None:
     if path.suffix not in suffixes:
         raise ValueError(f"output file {str(path)!r} must end in {' or '.join(suffixes)}")
     check_writable(target_of(path).parent)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions:
+    """Options on pictures, and on how much to say."""
+
+    picture: Annotated[Path | None, typer.Option(help="Picture to write: .png, .svg or .pdf.")] = None
+    animation: Annotated[Path | None, typer.Option(help="Animation to write: .gif or .mp4.")] = None
+    quiet: Quiet = False
+
+    def check_pictures(self) -> None:
+        """Raise ``ValueError`` if they cannot be written."""
+        check_target(self.picture, (".png", ".svg", ".pdf"))
+        check_target(self.animation, (".gif", ".mp4"))
+
+    def draw(self, problem: Problem, trajectory: Trajectory, events: DisturbanceEvents | None = None) -> None:
+        """Write the pictures that were asked for."""
+        if self.picture is not None:
+            render.save_picture(problem, trajectory, self.picture, events=events)
+        if self.animation is not None:
+            render.save_animation(problem, trajectory, self.animation, events=events)
 
 
 def episode_rows(episode: Episode) -> list[tuple[str, str]]:

@@ -14,7 +14,6 @@ from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
 from d4orm_planners.cli.options import (
     Engine,
-    PictureOptions,
     ProblemOptions,
     Settings,
     TimeLimit,
@@ -23,6 +22,7 @@ from d4orm_planners.cli.options import (
     takes,
 )
 from d4orm_planners.cli.outputs import (
+    PictureOptions,
     check_target,
     output_folder,
     print_plan,

@@ -30,7 +30,6 @@ from d4orm_planners.cli.options import (
     NoiseLevel,
     ObservationOptions,
     Physics,
-    PictureOptions,
     ProblemOptions,
     Seed,
     names,
@@ -40,6 +39,7 @@ from d4orm_planners.cli.options import (
     takes,
 )
 from d4orm_planners.cli.outputs import (
+    PictureOptions,
     check_target,
     episode_rows,
     output_folder,

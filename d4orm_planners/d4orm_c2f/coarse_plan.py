@@ -245,8 +245,7 @@ class CoarsePlanning:
         left = (last - joint.steps) // self._config.coarse_factor
         if 0 < left < coarse.horizon and not chosen.failed.any() and not chosen.trajectory.arrived[left].all():
             # It would come too late. Plans that come too late are none, if there are others.
-            in_time = coarse.with_state(coarse.start, coarse.goal, horizon=left)
-            hurried, other = _discs_first(search, in_time)
+            hurried, other = _discs_first(search, coarse.with_state(coarse.start, coarse.goal, horizon=left))
             if not hurried.failed.any():
                 return other
         return guidance
@@ -268,9 +267,8 @@ class CoarsePlanning:
             chosen = search.current if accepted else search.best
         plan = chosen.trajectory
         path = interpolate(plan.positions, self._config.coarse_factor)
-        return chosen, CoarsePlan(
-            problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered
-        )
+        guidance = CoarsePlan(problem=coarse, controls=plan.controls, states=plan.states, path=path, ordered=ordered)
+        return chosen, guidance
 
 
 def _discs_first(
@@ -282,8 +280,7 @@ def _discs_first(
     """
     team = coarse.team
     if team.shapes and covered_by_discs(coarse):
-        discs = coarse.with_state(coarse.start, coarse.goal, team=team.replace(radius=team.radius))
-        chosen, plan = search(discs)
+        chosen, plan = search(coarse.with_state(coarse.start, coarse.goal, team=team.replace(radius=team.radius)))
         if not chosen.failed.any():
             return chosen, plan
     return search(coarse)

@@ -136,10 +136,8 @@ class NodePool(ABC):
     def _iteration(self, best: Candidate) -> Iteration:
         steps = max(node.search.denoising_steps for node in self._nodes)
         excluded = sum(node.excluded for node in self._nodes)
-        faults: Counter[str] = Counter()
-        for node in self._nodes:
-            faults += node.inbox.dropped
-            faults["false claim"] += node.inbox.false_claims
+        faults = sum((node.inbox.dropped for node in self._nodes), Counter[str]())
+        faults["false claim"] = sum(node.inbox.false_claims for node in self._nodes)
         new = faults - self._reported
         records = self._new_records()
         notes = self._notes + [record.note for record in records if record.note]
@@ -222,7 +220,9 @@ class AsyncNodePool(NodePool):
         while True:
             ended = not any(job.running for job in self._jobs)
             heard |= {report.node for report in self._observer.receive(GLANCE)}
-            self._lose_dead()
+            for job in self._jobs:
+                if job.error is not None and job.node in self.alive:
+                    self._lose_failed(job)
             now = time.perf_counter()
             first = now if heard and first is None else first
             left = time_left()
@@ -239,11 +239,10 @@ class AsyncNodePool(NodePool):
     def _run(self, improve: bool) -> None:
         """Start idle nodes: at first all, later those that stopped at what proved to be no solution here."""
         self._evaluator.solution_ends = not improve
-        running = [job for job in self._jobs if job.running]
-        failed = [job for job in self._jobs if job.error is not None]
-        self._seconds += sum(job.seconds for job in self._jobs if job not in running + failed)
-        idle = [node for node in self.alive if node not in {job.node for job in running + failed}]
-        if not running:
+        kept = [job for job in self._jobs if job.running or job.error is not None]
+        self._seconds += sum(job.seconds for job in self._jobs if job not in kept)
+        idle = [node for node in self.alive if node not in {job.node for job in kept}]
+        if not any(job.running for job in kept):
             self._evaluator.stop.clear()
 
         def run(node: Node) -> None:
@@ -251,14 +250,9 @@ class AsyncNodePool(NodePool):
                 pass
 
         begun = [ThreadJob(node, run) for node in idle]
-        self._jobs = [*running, *failed, *begun]
+        self._jobs = [*kept, *begun]
         for job in begun:
             job.start()
-
-    def _lose_dead(self) -> None:
-        for job in self._jobs:
-            if job.error is not None and job.node in self.alive:
-                self._lose_failed(job)
 
 
 class NetworkNodePool(SyncNodePool):

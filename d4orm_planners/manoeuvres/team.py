@@ -109,8 +109,7 @@ class TeamMotions:
         Threads(available_cores()).over(problem.num_robots, prepare)
         if len(robots) < problem.num_robots:
             return None
-        everybody = [robots[number] for number in range(problem.num_robots)]
-        team = cls(scene, everybody, should_stop)
+        team = cls(scene, [robots[number] for number in range(problem.num_robots)], should_stop)
         return None if any(motion is None for motion in team.alone) else team
 
     @property
@@ -136,7 +135,7 @@ class TeamMotions:
     def leave_out(self, robots: Iterable[int]) -> None:
         """Forget the motions of some robots."""
         for robot in robots:
-            self._drop(robot)
+            self._take(robot, None)
 
     def odds(self, random: np.random.Generator) -> Odds:
         """See :meth:`LowLevelPlanner.odds`: robots without a motion are late, or else those that are slower."""
@@ -157,14 +156,13 @@ class TeamMotions:
     def replan(self, groups: list[IntArray], random: np.random.Generator, temperature: float) -> None:
         """See :meth:`LowLevelPlanner.replan`; those still to be planned wait at their starts for a while, or not."""
         for group in groups:
-            before, cost = self.motions.copy(), self.cost
-            order = group.tolist()
+            before, cost, order = self.motions.copy(), self.cost, group.tolist()
             if random.random() < 0.5:
                 order.sort(key=lambda robot: before[robot] is not None)
             longest = max((own.steps for own in self.alone if own is not None), default=0)
             held = {robot: int(longest * random.random() ** 2) * int(random.integers(2)) for robot in order}
             for robot in order:
-                self._drop(robot)
+                self._take(robot, None)
             self._plan_in_turn(order, held)
             if self.cost > cost:
                 for robot, motion in enumerate(before):
@@ -174,27 +172,22 @@ class TeamMotions:
         for position, robot in enumerate(order):
             if self.should_stop():
                 return
-            others = [other for other, motion in enumerate(self.motions) if motion is not None and other != robot]
+            others = [other for other in range(len(self.motions)) if other != robot]
             later = {other: held.get(other, 0) for other in order[position + 1 :]}
             self._take(robot, self._find(robot, self._traffic(others, later)))
 
-    def _drop(self, robot: int) -> None:
-        self.motions[robot] = None
-        self._poses[robot] = self.robots[robot].start
-
     def _take(self, robot: int, motion: Motion | None) -> None:
-        self._drop(robot)
+        self.motions[robot] = motion
+        self._poses[robot] = self.robots[robot].start
         if motion is not None:
-            self.motions[robot] = motion
             self._poses[robot, : motion.steps + 1] = motion.poses
             self._poses[robot, motion.steps :] = motion.poses[-1]
 
     def _traffic(self, others: Iterable[int], held: dict[int, int]) -> Traffic:
         last, gone = np.full(len(self.robots), -1), np.full(len(self.robots), NEVER)
         for other in others:
-            motion = self.motions[other]
-            assert motion is not None
-            last[other] = motion.steps
+            if (motion := self.motions[other]) is not None:
+                last[other] = motion.steps
         for other, steps in held.items():
             if steps > 0:
                 last[other], gone[other] = 0, steps
@@ -266,10 +259,9 @@ def compile_manoeuvres() -> None:
     """Compile the search, if it is not yet: it is the same for all models."""
     if find_motion.signatures:
         return
-    start = [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
     world = World(boxes=[[0.5, 0.8, 0.6, 1.2]])
     team = Team(("unicycle",) * 2, footprint=Box(0.4, 0.2))
-    problem = Problem(team, start, [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
+    problem = Problem(team, [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]], [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
     motions = TeamMotions.prepared(problem, lambda: False)
     assert motions is not None
     motions.plan_all()

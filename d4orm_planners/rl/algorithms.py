@@ -1,12 +1,11 @@
 """The algorithms of Stable-Baselines3 that are used here, with the settings that suit many robots at once.
 
-Their buffers hand out the steps in which a robot acted, and no others. Their policies become networks of this package.
+Their policies become networks of this package.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
-from functools import cached_property
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -15,15 +14,15 @@ import stable_baselines3
 import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from d4orm_env.envs.features import Features
+from d4orm_planners.rl.masked_buffers import MaskedReplayBuffer, MaskedRolloutBuffer
 from d4orm_planners.rl.network import FORMAT, KINDS, SUM_SCALE, Header, Network
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv
 from d4orm_planners.rl.task_mixture import MixedVecEnv
@@ -32,71 +31,6 @@ START_COUNT = 1e6
 """Observations that a trained network's normalisation counts for: what it knows is not forgotten."""
 WIDTHS = (64, 32)
 """Widths of the layers that neighbours go through, and of those of obstacles."""
-
-
-class _MaskedBuffer(BaseBuffer):
-    """Keeps in which steps :attr:`RobotVecEnv.acted` was true, and hands out only those.
-
-    Set :attr:`source`, and :attr:`random`, by which steps are drawn, before the first step.
-    """
-
-    source: RobotVecEnv | MixedVecEnv
-    random: np.random.Generator
-
-    @cached_property
-    def acted(self) -> np.ndarray:
-        """``(T, B)`` which robots acted in which steps."""
-        return np.zeros((self.buffer_size, self.n_envs), np.bool_)
-
-    def add(self, *args: object, **kwargs: object) -> None:
-        self.acted[self.pos] = self.source.acted
-        super().add(*args, **kwargs)
-
-
-class MaskedRolloutBuffer(_MaskedBuffer, RolloutBuffer):
-    """A rollout buffer without the steps in which a robot did nothing."""
-
-    def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
-        assert self.full
-        if not self.generator_ready:
-            for name in ("observations", "actions", "values", "log_probs", "advantages", "returns"):
-                self.__dict__[name] = self.swap_and_flatten(self.__dict__[name])
-            self.generator_ready = True
-        indices = self.random.permutation(np.flatnonzero(self.acted.swapaxes(0, 1)))
-        size = batch_size or len(indices)
-        # The rest that does not fill a batch is left out: the next epoch shuffles anew.
-        for begin in range(0, max(len(indices) - size + 1, 1), size):
-            yield self._get_samples(indices[begin : begin + size])
-
-
-class MaskedReplayBuffer(_MaskedBuffer, ReplayBuffer):
-    """A replay buffer likewise."""
-
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        rows, slots = self._acted_steps(batch_inds)
-        rewards = self._normalize_reward(self.rewards[rows, slots].reshape(-1, 1), env)
-        dones = (self.dones[rows, slots] * (1 - self.timeouts[rows, slots])).reshape(-1, 1)
-        return ReplayBufferSamples(
-            self._seen(self.observations[rows, slots], env),
-            self.to_torch(self.actions[rows, slots]),
-            self._seen(self.next_observations[rows, slots], env),
-            self.to_torch(dones),
-            self.to_torch(rewards),
-        )
-
-    def _seen(self, observations: np.ndarray, env: VecNormalize | None) -> torch.Tensor:
-        normalized = self._normalize_obs(observations, env)
-        assert isinstance(normalized, np.ndarray)
-        return self.to_torch(normalized)
-
-    def _acted_steps(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return as many steps as there are rows, drawn again until a robot acted in them."""
-        slots = self.random.integers(0, self.n_envs, len(rows))
-        last = self.buffer_size if self.full else self.pos
-        while (idle := ~self.acted[rows, slots]).any():
-            rows[idle] = self.random.integers(0, last, int(idle.sum()))
-            slots[idle] = self.random.integers(0, self.n_envs, int(idle.sum()))
-        return rows, slots
 
 
 class _Set(nn.Module):

@@ -24,10 +24,9 @@ from scipy.interpolate import BPoly, PPoly
 from d4orm_env.core.arrays import Floats, positive_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.lazy import LazyModule
-from d4orm_env.core.problem import Problem
 from d4orm_env.verify import VerificationReport
 from d4orm_planners.tracking.ros_messages import write_bag
-from d4orm_planners.tracking.smoothing import SmoothMotion, verify_motion
+from d4orm_planners.tracking.smoothing import SmoothMotion, least_overhead, verify_motion
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -83,8 +82,7 @@ class Setpoints:
         """
         times, robots = self.heading.shape
         index = {"time": np.repeat(self.time, robots), "robot": np.tile(np.arange(robots), times)}
-        columns = {name: values.ravel() for name, values in self.columns().items()}
-        return pd.DataFrame(index | columns)
+        return pd.DataFrame(index | {name: values.ravel() for name, values in self.columns().items()})
 
     def columns(self) -> dict[str, Floats]:
         """``(T, K)`` each: ``x``, ``y``, in space ``z``, their derivatives ``v``, ``a`` and ``j``, and ``heading``."""
@@ -109,16 +107,10 @@ def sample_motion(motion: SmoothMotion, rate: float) -> Setpoints:
             f"{MAX_SAMPLES / robots / motion.duration:.3g}"
         )
     time = np.arange(count) / rate
+    position, velocity, acceleration, jerk = (motion.position(time, order) for order in range(4))
+    heading = motion.heading(time)
     return Setpoints(
-        time=time,
-        position=motion.position(time),
-        velocity=motion.position(time, 1),
-        acceleration=motion.position(time, 2),
-        jerk=motion.position(time, 3),
-        heading=motion.heading(time),
-        stretch=motion.stretch,
-        deviation=motion.deviation,
-        report=motion.report,
+        time, position, velocity, acceleration, jerk, heading, motion.stretch, motion.deviation, motion.report
     )
 
 
@@ -136,18 +128,11 @@ def fit_polynomials(motion: SmoothMotion, height: float) -> tuple[Floats, Floats
     Raises:
         ValueError: If the motion is too long for as many: robots would touch, or not end at their goals.
     """
-    wanted = CLOSE * float(motion.problem.team.radius.min())
     for count in range(1, MOST_PIECES + 1):
         curves, deviation = _pieces(motion, count)
-        if deviation <= wanted:
+        if deviation <= CLOSE * float(motion.problem.team.radius.min()):
             break
-
-    def position(times: Floats, derivative: int = 0) -> Floats:
-        return np.asarray(curves(times, nu=derivative)[..., :-1])
-
-    def heading(times: Floats, derivative: int = 0) -> Floats:
-        return np.asarray(curves(times, nu=derivative)[..., -1])
-
+    position, heading = PPoly(curves.c[..., :-1], curves.x), PPoly(curves.c[..., -1], curves.x)
     report = verify_motion(motion.problem, position, heading, motion.duration, count * CHECKS + 1)
     if not report.ok:
         raise ValueError(
@@ -292,7 +277,7 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         motion.deviation,
         motion.report.min_separation,
         motion.report.min_clearance,
-        _least_overhead(motion.problem, setpoints.position),
+        least_overhead(motion.problem, setpoints.position),
         (float(heights.min()), float(heights.max())),
         pieces,
     )
@@ -300,25 +285,12 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
 
 def _refuse_others(folder: Path, names: list[str]) -> None:
     """Refuse a folder with robots' files that would not be replaced: drones would fly another plan beside this one."""
-    if names[0].startswith("robot_"):
-        others = sorted(path.name for path in folder.glob("robot_*.csv") if path.name not in names)
-        if others:
-            raise ValueError(
-                f"{folder} has {others[0]} of another team, and this one has {len(names)} robots; delete these, "
-                "or name another folder"
-            )
-
-
-def _least_overhead(problem: Problem, positions: Floats) -> float:
-    """See :attr:`ExportReport.min_overhead`; ``positions`` are ``(T, K, d)`` [m]."""
-    least, radius = np.inf, problem.team.radius.astype(np.float64)
-    if problem.dimension == 2:
-        return least
-    for robot in range(1, problem.num_robots):
-        gaps = np.abs(positions[:, :robot] - positions[:, robot, None])
-        overlaps = np.hypot(gaps[..., 0], gaps[..., 1]) <= radius[:robot] + radius[robot] + problem.margin
-        least = min(least, float(gaps[..., 2][overlaps].min(initial=np.inf)))
-    return least
+    others = sorted(path.name for path in folder.glob("robot_*.csv") if path.name not in names)
+    if others and names[0].startswith("robot_"):
+        raise ValueError(
+            f"{folder} has {others[0]} of another team, and this one has {len(names)} robots; delete these, or name "
+            "another folder"
+        )
 
 
 def _write_table(path: Path, header: list[str], values: Floats) -> None:

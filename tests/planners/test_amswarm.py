@@ -15,7 +15,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.baselines.alternation import Guess, Neighbourhood, alternate
+from d4orm_planners.baselines.alternation import MotionSamples, Neighbourhood, alternate
 from d4orm_planners.baselines.amswarm import AMSwarmConfig, first_coefficients, make_method, sample_basis
 
 # The polynomials.
@@ -49,7 +49,7 @@ def test_the_first_coefficients_are_the_present_state() -> None:
 
 
 def plainly(
-    config: AMSwarmConfig, dt: float, bodies: Neighbourhood, limits: Any, goal: Any, begin: Any, guess: Guess
+    config: AMSwarmConfig, dt: float, bodies: Neighbourhood, limits: Any, goal: Any, begin: Any, guess: MotionSamples
 ) -> Any:
     """The coefficients of robot 0 among discs, with all constraints as rows of one matrix, one axis at a time."""
     basis = sample_basis(config.degree, config.lookahead, dt)
@@ -96,7 +96,7 @@ def test_the_alternation_is_the_publications() -> None:
         np.stack([others, others]), np.array([0.2, 0.3]), 0.05, boxes, np.full((2, 2), np.inf) * [[-1], [1]]
     )
     begin = first_coefficients(config.degree, 12 * dt, np.zeros(2), np.array([0.5, 0.1]), np.array([0.1, 0.0]))
-    guess = Guess(np.linspace([0.1, 0.02], [2.0, 0.2], 12), np.full((12, 2), 0.8), np.full((12, 2), 0.01))
+    guess = MotionSamples(np.linspace([0.1, 0.02], [2.0, 0.2], 12), np.full((12, 2), 0.8), np.full((12, 2), 0.01))
     expected = plainly(config, dt, bodies, limits, goal, begin, guess)
     motion = np.zeros((config.degree + 1, 2))
     motion[:3] = begin

@@ -17,7 +17,8 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_planner
-from d4orm_planners.baselines.mmd.motions import PathSurroundings, drive_motions, guide
+from d4orm_planners.baselines.mmd.constraint_tree import Constraint, count_conflicts, first_conflict
+from d4orm_planners.baselines.mmd.motions import PathSurroundings, guide
 from d4orm_planners.baselines.mmd.path_frame import (
     FEATURES,
     MODES,
@@ -27,13 +28,14 @@ from d4orm_planners.baselines.mmd.path_frame import (
     sine_table,
     world_space,
 )
-from d4orm_planners.baselines.mmd.planner import Constraint, MMDConfig, Planning, count_conflicts, first_conflict
+from d4orm_planners.baselines.mmd.planner import MMDConfig, Planning
 from d4orm_planners.baselines.mmd.prior import (
     CLIP,
     LEVELS,
     SIZE,
     Denoiser,
     condition,
+    drive_motions,
     kept_signal,
     level_features,
     load_prior,

@@ -107,7 +107,7 @@ def test_controls_of_a_differential_drive_are_not_turned() -> None:
 
 sb3 = pytest.importorskip("stable_baselines3")
 from d4orm_env.envs.rewards import TrainingReward  # noqa: E402
-from d4orm_planners.rl.algorithms import MaskedReplayBuffer, MaskedRolloutBuffer  # noqa: E402
+from d4orm_planners.rl.masked_buffers import MaskedReplayBuffer, MaskedRolloutBuffer  # noqa: E402
 from d4orm_planners.rl.robot_vec_env import RobotVecEnv  # noqa: E402
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from numba.extending import register_jitable
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
-from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import Model, TimeStep
@@ -257,7 +256,7 @@ def _motion_follower(model: Model) -> Callable[..., int]:
 def motion_kernel(
     name: str,
 ) -> Kernel[[ProblemArrays, int, PathFrame, Floats, Floats, Space, Floats, FloatArray, TrackedMotions], None]:
-    """The compiled drives of a robot of the model with this name; see :func:`drive_motions`."""
+    """The compiled drives of a robot of the model with this name, which fill :class:`TrackedMotions`."""
     model = MODELS[name]
     follow, n, d = _motion_follower(model), model.state_size, model.dimension
 
@@ -283,38 +282,3 @@ def motion_kernel(
             driven.clearances[b] = least
 
     return drive_motion
-
-
-def drive_motions(
-    problem: Problem,
-    robot: int,
-    frame: PathFrame,
-    sines: Floats,
-    deviation: Floats,
-    space: Space,
-    durations: Floats,
-    motions: FloatArray,
-) -> TrackedMotions:
-    """Drive a robot along each of some motions, as if it were alone: by the clock, and then straight to its goal.
-
-    Args:
-        problem: The team.
-        robot: The robot's number.
-        frame: Its path.
-        sines: ``(POINTS + 1, MODES)``.
-        deviation: ``(2 MODES,)`` of the modes.
-        space: The world, of :func:`~d4orm_planners.baselines.mmd.path_frame.world_space`.
-        durations: ``(B,)`` how long the motions take [s].
-        motions: ``(B, 2 MODES)`` float32 whitened modes.
-    """
-    count, horizon = len(motions), problem.horizon
-    driven = TrackedMotions(
-        np.zeros((count, horizon, problem.control_size), np.float32),
-        np.empty((count, horizon + 1, problem.state_size), np.float32),
-        np.empty((count, horizon + 1, 3)),
-        np.empty(count, np.int64),
-        np.empty(count),
-    )
-    kernel = motion_kernel(problem.team.models[robot])
-    kernel(problem.arrays, robot, frame, sines, deviation, space, durations, motions, driven)
-    return driven

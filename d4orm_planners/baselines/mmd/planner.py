@@ -5,20 +5,27 @@ The search decides which robot plans again, and under which constraints.
 
 from __future__ import annotations
 
-from bisect import insort
-from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.paths.spaces import Space
 from d4orm_planners.base.planner import Iteration, Planner, PlannerConfig
 from d4orm_planners.base.settings import Count, NotNegative, Number, Samples, ShareOrNone, Steps
 from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.baselines.mmd.constraint_tree import (
+    Constraint,
+    RobotMotion,
+    Tree,
+    TreeNode,
+    count_conflicts,
+    first_conflict,
+)
 from d4orm_planners.baselines.mmd.motions import PathSurroundings, guide, motion_kernel
 from d4orm_planners.baselines.mmd.path_frame import PathFrame, make_frame, world_space
 from d4orm_planners.baselines.mmd.prior import Batch, Denoiser
@@ -71,92 +78,6 @@ class MMDConfig(PlannerConfig):
         super().__post_init__()
         if self.slowest < self.quickest:
             raise ValueError(f"slowest is {self.slowest:g}; it must be at least quickest, which is {self.quickest:g}")
-
-
-def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> IntArray:
-    """``(B, 2)`` numbers of other robots that each of some paths conflicts with, and of steps at which it does.
-
-    Args:
-        positions: ``(B, T, 3)`` the paths [m].
-        others: ``(S, T, 3)`` where the others are [m].
-        distances: ``(S,)`` to keep from each [m].
-    """
-    steps = _too_near(positions[:, None] - others, distances[:, None]).sum(axis=2)
-    return np.stack([(steps > 0).sum(axis=1), steps.sum(axis=1)], axis=1)
-
-
-def first_conflict(positions: Floats, distances: Floats) -> tuple[int, int, tuple[int, int]]:
-    """Number of pairs in conflict, and the step and the robots of the earliest conflict; robots are -1 for none.
-
-    Args:
-        positions: ``(K, T, 3)`` [m].
-        distances: ``(K, K)`` to keep [m].
-    """
-    one, other = np.tril_indices(len(positions), -1)
-    near = _too_near(positions[one] - positions[other], distances[one, other, None])
-    if not near.any():
-        return 0, positions.shape[1], (-1, -1)
-    step = int(near.any(axis=0).argmax())
-    pair = int(near[:, step].argmax())
-    return int(near.any(axis=1).sum()), step, (int(one[pair]), int(other[pair]))
-
-
-def _too_near(gaps: Floats, distances: Floats) -> BoolArray:
-    """Check which gaps ``(..., 3)`` are no longer than the distances to keep [m]."""
-    return gaps[..., 0] ** 2 + gaps[..., 1] ** 2 + gaps[..., 2] ** 2 <= distances**2
-
-
-class Constraint(NamedTuple):
-    """A sphere that one robot's centre has to be out of for some steps."""
-
-    sphere: tuple[float, float, float, float]  #: Centre and radius [m]
-    span: tuple[int, int]  #: First and last step
-
-
-@dataclass(frozen=True, eq=False)
-class RobotMotion:
-    """Motion of one robot in a node of the tree."""
-
-    motions: FloatArray  #: ``(B, SIZE)`` all that were denoised with it, which the next ones begin with
-    controls: FloatArray  #: ``(H, m)``
-    positions: Floats  #: ``(H+1, 3)`` [m]
-    cost: int  #: Steps until it arrives
-    fails: bool  #: Whether it comes too near to an obstacle or does not arrive
-
-
-@dataclass(frozen=True, order=True)
-class TreeNode:
-    """A node of the tree; the one to be expanded next is the least."""
-
-    conflicts: int  #: Pairs in conflict, and robots that fail by themselves
-    cost: int  #: Sum of the robots' steps until arrival
-    number: int  #: Of the node, counted as they are made
-    motions: tuple[RobotMotion, ...] = field(compare=False)  #: Of the robots
-    constraints: tuple[tuple[Constraint, ...], ...] = field(compare=False)  #: Of each robot
-    pair: tuple[int, int] = field(compare=False)  #: Two robots in conflict, or -1
-    step: int = field(compare=False)  #: Of their conflict
-
-    @property
-    def controls(self) -> FloatArray:
-        """``(H, K, m)``."""
-        return np.stack([motion.controls for motion in self.motions], axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Tree:
-    """The state of the search: nodes that are not expanded yet, best first, and how many were made."""
-
-    frames: tuple[PathFrame, ...]
-    space: Space
-    nodes: tuple[TreeNode, ...]
-    made: int
-
-    def with_nodes(self, added: list[TreeNode]) -> Tree:
-        """The tree with its best node expanded to these."""
-        nodes = list(self.nodes[1:])
-        for node in added:
-            insort(nodes, node)
-        return replace(self, nodes=tuple(nodes), made=self.made + len(added))
 
 
 class Planning:

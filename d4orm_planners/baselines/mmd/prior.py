@@ -20,7 +20,8 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS
 from d4orm_env.engine.sample_noise import draw_normals, draw_uniforms
-from d4orm_planners.baselines.mmd.motions import PathSurroundings, TrackedMotions, drive_motions, guide
+from d4orm_env.paths.spaces import Space
+from d4orm_planners.baselines.mmd.motions import PathSurroundings, TrackedMotions, guide, motion_kernel
 from d4orm_planners.baselines.mmd.path_frame import FEATURES, MODES, PathFrame, sine_table
 
 if TYPE_CHECKING:
@@ -153,6 +154,41 @@ def predict(
         for j in range(size):
             value = signal[0] * noisy[b, j] + signal[1] * clean[b, j]
             clean[b, j] = min(max(value, -CLIP), CLIP)
+
+
+def drive_motions(
+    problem: Problem,
+    robot: int,
+    frame: PathFrame,
+    sines: Floats,
+    deviation: Floats,
+    space: Space,
+    durations: Floats,
+    motions: FloatArray,
+) -> TrackedMotions:
+    """Drive a robot along each of some motions, as if it were alone: by the clock, and then straight to its goal.
+
+    Args:
+        problem: The team.
+        robot: The robot's number.
+        frame: Its path.
+        sines: ``(POINTS + 1, MODES)``.
+        deviation: ``(2 MODES,)`` of the modes.
+        space: The world, of :func:`~d4orm_planners.baselines.mmd.path_frame.world_space`.
+        durations: ``(B,)`` how long the motions take [s].
+        motions: ``(B, 2 MODES)`` float32 whitened modes.
+    """
+    count, horizon = len(motions), problem.horizon
+    driven = TrackedMotions(
+        np.zeros((count, horizon, problem.control_size), np.float32),
+        np.empty((count, horizon + 1, problem.state_size), np.float32),
+        np.empty((count, horizon + 1, 3)),
+        np.empty(count, np.int64),
+        np.empty(count),
+    )
+    kernel = motion_kernel(problem.team.models[robot])
+    kernel(problem.arrays, robot, frame, sines, deviation, space, durations, motions, driven)
+    return driven
 
 
 @dataclass(frozen=True)
