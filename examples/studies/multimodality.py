@@ -1,7 +1,7 @@
 """Kinds of solution that a planner finds: two robots swap positions around an obstacle (the paper's appendix A).
 
     python -m examples.studies multimodality --seeds 500
-    python -m examples.studies multimodality --team 8 --seeds 50
+    python -m examples.studies multimodality --team 8 --seeds 500
 
 One solve per planner and seed. A plan's class is the signs of three winding angles: of robot 0 about the obstacle, of
 robot 1 about the obstacle, and of robot 1 about robot 0. Every combination of signs can be had. Six of the eight say in
@@ -13,8 +13,8 @@ robot goes round.
 With ``--team`` a whole team swaps positions on a circle, the appendix's harder problem: robots meet pairwise, and pass
 each other on one side or the other. A plan's class is the sign of the angle that each robot sweeps around each other
 one, 28 signs with eight robots. The table has how many seeds were solved, how many classes the solutions are of, and
-ten of them drawn at random, which does not grow with the seeds (rarefaction); how many pairs of solutions are of the
-same class, and how far apart two are (root mean square distance of the robots' positions over time, mean over all
+a hundred of them drawn at random, which does not grow with the seeds (rarefaction); how many pairs of solutions are of
+the same class, and how far apart two are (root mean square distance of the robots' positions over time, mean over all
 pairs). Slow plans differ more, so the last two rows have plans of equal travel times only. The plot has all solutions
 along the directions in which they differ most.
 """
@@ -45,7 +45,7 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "ipopt": ("ipopt", {}),
 }
 
-COMPARED, DRAWN = ("d4orm, preset paper", "ipopt"), 10
+COMPARED, DRAWN = ("d4orm, preset paper", "ipopt"), 100
 """Planners that the paper compares, and how many plans are drawn of each."""
 
 CLASSES: dict[Signature, tuple[str, str]] = {
@@ -199,7 +199,7 @@ def row_of(label: str, plans: Sequence[Row], trials: int) -> dict[str, Any]:
         "planner": label,
         "solved": f"{len(plans)} of {trials}",
         "classes": len(set(classes)),
-        f"classes of {DRAWN} plans": f"{rarefied(classes, DRAWN):.2f}" if len(plans) >= DRAWN else "-",
+        f"classes of {DRAWN} plans": f"{rarefied(classes, DRAWN):.1f}" if len(plans) >= DRAWN else "-",
         "pairs of one class": f"{same / len(pairs):.0%}" if pairs else "-",
         "distance [m]": mean_text(apart),
         "travel time [s]": mean_text(times),
