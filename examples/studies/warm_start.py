@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from examples.common import grouped, mean_text, save_table, study_parser, study_rows
-from examples.studies import AS_IN_THE_PAPER
 
 from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_planners import make_planner, make_policy, run_episode
@@ -54,9 +53,9 @@ def measure(planners: Sequence[str], cases: Sequence[tuple[str, int]], seeds: in
         for scenario, num_robots in cases:
             team = f"{scenario}, {num_robots} robots"
             for guess in GUESSES:  # both are compiled before anything is timed
-                run(make_problem(scenario, num_robots, 0, **AS_IN_THE_PAPER), 0, guess)
+                run(make_problem(scenario, num_robots, 0), 0, guess)
             for seed in range(seeds):
-                problem = make_problem(scenario, num_robots, seed, **AS_IN_THE_PAPER)
+                problem = make_problem(scenario, num_robots, seed)
                 rows += [
                     {"planner": planner, "team": team, "from": guess or "nothing", "seed": seed}
                     | run(problem, seed, guess)
