@@ -48,9 +48,8 @@ def verify_curves(
     steps = max(1, int(np.ceil(duration / problem.dt)))
     dt = duration / steps
     sub_steps = max(1, int(np.ceil(dt * np.sqrt(bend / (8 * CHORD_ERROR * radius))).max()))
-    trailers = _Trailers.of(problem)
+    trailers, shapes = _Trailers.of(problem), ConvexBodies.of(team) if team.shapes else None
     robots = np.concatenate([np.arange(len(radius)), trailers.robot])
-    shapes = ConvexBodies.of(team) if team.shapes else None
     pairs, obstacles = make_watches(problem.world, robots, radius, shapes)
     watches = [pairs, *obstacles]
     grid = np.arange(steps)[:, None] * sub_steps + np.arange(sub_steps + 1)

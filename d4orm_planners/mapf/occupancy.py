@@ -73,14 +73,25 @@ class Occupancy:
 
 
 @compiled
+def _enclosed(
+    positions: Floats, first: Whole, last: Whole
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Lowest and highest corner of a box around some positions ``(S, 3)``, ``last`` not among them."""
+    low_x, low_y, low_z = positions[first, 0], positions[first, 1], positions[first, 2]
+    high_x, high_y, high_z = low_x, low_y, low_z
+    for i in range(first + 1, last):
+        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
+        low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
+        high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
+    return (low_x, low_y, low_z), (high_x, high_y, high_z)
+
+
+@compiled
 def _fill_boxes(path: Floats, boxes: Floats) -> None:
     for block in range(boxes.shape[0]):
-        for axis in range(3):
-            low, high = np.inf, -np.inf
-            for step in range(block * BLOCK, min((block + 1) * BLOCK, path.shape[0])):
-                position = path[step, axis]
-                low, high = min(low, position), max(high, position)
-            boxes[block, axis], boxes[block, axis + 3] = low, high
+        box = boxes[block]
+        low, high = _enclosed(path, np.int64(block * BLOCK), min((block + 1) * BLOCK, path.shape[0]))
+        (box[0], box[1], box[2]), (box[3], box[4], box[5]) = low, high
 
 
 @compiled
@@ -156,20 +167,6 @@ def find_near_boxes(
             & (boxes[i, 5] + need >= low[2])
         )
     return count
-
-
-@compiled
-def _enclosed(
-    positions: Floats, first: Whole, last: Whole
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Lowest and highest corner of a box around some positions ``(S, 3)``, ``last`` not among them."""
-    low_x, low_y, low_z = positions[first, 0], positions[first, 1], positions[first, 2]
-    high_x, high_y, high_z = low_x, low_y, low_z
-    for i in range(first + 1, last):
-        x, y, z = positions[i, 0], positions[i, 1], positions[i, 2]
-        low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
-        high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
-    return (low_x, low_y, low_z), (high_x, high_y, high_z)
 
 
 @cached_kernel(variant="meetings", **OPTIONS)
