@@ -27,15 +27,23 @@ PRIOR_STEPS = 4
 """Number of steps without a disturbance that the mean begins with."""
 SIGNIFICANCE = 3.0
 """Number of standard errors up to which that mean may be noise."""
+MAX_CORRELATION = 0.9
+"""Largest correlation of one disturbance of commands with the one before that is believed."""
+NO_VARIANCE = 1e-12
+"""Variance, in shares of the limits, below which there is none."""
 GAIN_STEP = 0.05
 """Resolution of the shares of the limits that are kept back."""
 
 
+def shares_of_limits(problem: Problem, controls: FloatArray | Floats) -> Floats:
+    """``(K, m)`` controls ``(K, m)`` in shares of the robots' limits."""
+    limits = np.asarray(problem.team.control_limits, np.float64)
+    return np.divide(controls, limits, out=np.zeros_like(limits), where=limits > 0)
+
+
 def effort(problem: Problem, controls: FloatArray | Floats) -> Floats:
     """``(K,)`` norms of controls ``(K, m)`` in shares of the robots' limits."""
-    limits = np.asarray(problem.team.control_limits, np.float64)
-    shares = np.divide(controls, limits, out=np.zeros_like(limits), where=limits > 0)
-    return np.sqrt((shares**2).sum(axis=1))
+    return np.sqrt((shares_of_limits(problem, controls) ** 2).sum(axis=1))
 
 
 class ActuatorGainEstimator:
@@ -45,7 +53,7 @@ class ActuatorGainEstimator:
     some time, such as a bias, takes away from that against its direction; so much is kept back to make up for it, as
     tightened limits of control do in robust predictive control (Chisci, Rossiter, Zappa, Systems with persistent
     disturbances: predictive control with restricted constraints, Automatica 37, 2001). Noise comes to nothing on
-    average: a mean that may be chance is not kept back.
+    average: a mean that may be chance is not kept back, and one of noise that lasts may be chance for longer.
 
     Attributes:
         problem: The robots with the limits of speed, acceleration and turn rate that are believed now.
@@ -56,8 +64,8 @@ class ActuatorGainEstimator:
         self._first = self.problem = problem
         self._most, self._share = np.zeros(problem.num_robots), np.ones(problem.num_robots)
         self._asked = np.zeros(problem.num_robots, int)
-        self._seen, self._added = 0, np.zeros((problem.num_robots, problem.control_size))
-        self._variance = np.zeros_like(self._added)
+        self._seen, (self._added, self._apart) = 0, np.zeros((2, problem.num_robots, problem.control_size))
+        self._variance, self._covariance = np.zeros((2, problem.num_robots))
         self.added = np.zeros((problem.num_robots, problem.control_size), np.float32)
 
     def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> None:
@@ -65,8 +73,9 @@ class ActuatorGainEstimator:
         asked = effort(self._first, commanded)
         most = going & (asked >= AT_LIMIT)
         self._asked += most
-        done = effort(self._first, executed) / np.maximum(asked, AT_LIMIT)
-        self._most[most] = np.maximum(self._most, done)[most]
+        done = effort(self._first, executed) / np.where(most, asked, 1.0)
+        # Also what they do when asked for less: nobody asks a robot for more than it is believed to do.
+        self._most[going] = np.maximum(self._most, done)[going]
         weak = (self._asked >= MIN_FULL_COMMANDS) & (self._most < FULL_GAIN)
         share = np.where(weak, self._most, 1.0)
         # A weak robot does that share of everything, or all that it is asked to up to that share of its limits.
@@ -85,11 +94,15 @@ class ActuatorGainEstimator:
     def _persistent(self, added: Floats) -> FloatArray:
         """``(K, m)`` what is added for some time, now that ``added`` ``(K, m)`` is."""
         rate = max(FORGETTING_RATE, 1 / (PRIOR_STEPS + self._seen))
-        self._variance += rate * ((added - self._added) ** 2 - self._variance)
+        apart = shares_of_limits(self._first, added - self._added)
+        self._variance += rate * ((apart**2).sum(axis=1) - self._variance)
+        self._covariance += rate * ((apart * self._apart).sum(axis=1) - self._covariance)
+        self._apart = apart
         self._added += rate * (added - self._added)
-        # Of a mean that forgets exponentially, of independent values.
-        error = np.sqrt(rate / (2 - rate) * self._variance)
-        significant = effort(self._first, self._added) > SIGNIFICANCE * effort(self._first, error)
+        correlation = (self._covariance / np.maximum(self._variance, NO_VARIANCE)).clip(0, MAX_CORRELATION)
+        # Of a mean that forgets exponentially, of values of which each is like the one before by the correlation.
+        error = np.sqrt(rate / (2 - rate) * self._variance * (1 + correlation) / (1 - correlation))
+        significant = effort(self._first, self._added) > SIGNIFICANCE * error
         return np.where(significant[:, None], self._added, 0.0).astype(np.float32)
 
     def _team(self, share: Floats) -> Team:

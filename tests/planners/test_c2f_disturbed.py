@@ -168,6 +168,32 @@ def test_noise_that_is_added_to_commands_is_not_kept_back(bias: float, believed:
     assert np.mean(shares[50:]) == pytest.approx(believed, abs=0.05 if bias else 0.005)
 
 
+def test_noise_that_lasts_a_second_is_hardly_kept_back() -> None:
+    """Its mean over a second is of the size of a bias, and as often against it."""
+    problem, random, shares = hop_problem(3), np.random.default_rng(0), []
+    actuator_gain, noise = ActuatorGainEstimator(problem), np.zeros((3, 2), np.float32)
+    for _ in range(400):
+        told = random.uniform(-0.3, 0.3, (3, 2)).astype(np.float32)
+        noise = (0.905 * noise + 0.425 * random.normal(0, 0.2, (3, 2))).astype(np.float32)
+        actuator_gain.observe(told, told + noise, ALL)
+        shares.append(actuator_gain.problem.team.max_acceleration / problem.team.max_acceleration)
+    assert np.mean(shares) > 0.97
+
+
+def test_a_robot_that_does_more_than_it_was_believed_to_is_strong_again() -> None:
+    """Though nobody asks it for all that it can do while it is taken for weak."""
+    problem = hop_problem(3)
+    actuator_gain, ahead = ActuatorGainEstimator(problem), np.tile(np.float32([1, 0]), (3, 1))
+    for _ in range(10):
+        actuator_gain.observe(ahead, 0.6 * ahead, ALL)
+    np.testing.assert_allclose(actuator_gain.problem.team.max_acceleration, 0.6, rtol=1e-5)
+    for _ in range(20):
+        actuator_gain.observe(0.6 * ahead, ahead, np.array([True, False, False]))
+    for _ in range(60):
+        actuator_gain.observe(0.6 * ahead, 0.6 * ahead, ALL)
+    np.testing.assert_allclose(actuator_gain.problem.team.max_acceleration, [1, 0.6, 0.6], rtol=1e-5)
+
+
 @pytest.mark.parametrize(("share", "runs"), [(0.0, {0}), (0.1, {4, 5}), (0.3, {7, 8, 9}), (0.7, {10})])
 def test_how_many_commands_may_get_lost_in_a_row_is_found_out(share: float, runs: set[int]) -> None:
     """So many that 0.1, 0.3 to that power are about one in ten thousand; ten at most."""
