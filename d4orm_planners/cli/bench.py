@@ -19,7 +19,9 @@ def bench(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write bench.json and bench.md to.")] = Path(
         "bench"
     ),
-    quick: Annotated[bool, typer.Option("--quick", help="Small sizes and few repetitions, about a minute.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Small sizes and few repetitions on the CPU engine, about a minute.")
+    ] = False,
     num_robots: Annotated[
         str | None, typer.Option("--num-robots", "--robots", "-k", help="Team sizes, as 4,8,16.")
     ] = None,

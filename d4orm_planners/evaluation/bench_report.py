@@ -192,9 +192,11 @@ _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
     }),
     "big loops": _tabulated("Control loops of D4orm-C2F for big teams", {
         "robots": itemgetter("num_robots"),
+        "deadline": itemgetter("deadline"),
         "first coarse plan, s": lambda row: f"{row['start']:.1f}",
         "loop, ms": lambda row: milliseconds(row["loop"]),
         "95%, ms": lambda row: f"{row['loop_95'] * 1e3:.0f}",
+        "late": itemgetter("late"),
         "contacts": itemgetter("contacts"),
     }),
 }  # fmt: skip

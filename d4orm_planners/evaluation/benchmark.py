@@ -35,6 +35,7 @@ from d4orm_planners.evaluation.env_steps import (
 from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, in_turn, measure
 from d4orm_planners.evaluation.probes import (
     BOXES,
+    DEADLINE,
     Where,
     boxed_problem,
     measure_big_loops,
@@ -126,7 +127,9 @@ def _big_team_parts(settings: BenchmarkSettings) -> Iterator[Part]:
         work = partial(measure_improvement, "random", size, settings.big_seeds, settings.improving_limit)
         yield "improvement", f"improving plans of {size} robots", work
     for size in settings.loop_robots:
-        yield "big loops", f"control loops of {size} robots", partial(measure_big_loops, size, settings.loops)
+        for share, what in ((None, ""), (DEADLINE, " with a deadline")):
+            loops = partial(measure_big_loops, size, settings.loops, share)
+            yield "big loops", f"control loops of {size} robots{what}", loops
 
 
 def _denoising_parts(settings: BenchmarkSettings, fast: Set[str]) -> Iterator[Part]:

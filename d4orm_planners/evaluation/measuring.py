@@ -109,6 +109,8 @@ class BenchmarkSettings(CheckedSettings):
 
 
 QUICK: Mapping[str, object] = {
+    "sections": tuple(section for section in SECTIONS if section not in {"robots", "startup"}),
+    "engines": ("cpu",),
     "num_robots": (4, 8),
     "models": ("holonomic2d", "differential_drive"),
     "num_steps": 20,
@@ -136,7 +138,7 @@ QUICK: Mapping[str, object] = {
     "loop_robots": (16,),
     "loops": 10,
 }
-"""Settings of a benchmark of about a minute, for a first look."""
+"""Settings of a benchmark of about a minute, for a first look: nothing that runs in real time or compiles anew."""
 
 
 Measurement: TypeAlias = dict[str, Any]

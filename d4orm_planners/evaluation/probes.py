@@ -61,6 +61,8 @@ print(json.dumps({"imported": imported, "peak": peak()}))
 """
 
 
+DEADLINE = 0.9
+"""Share of a time step within which controllers answer."""
 CONTROLLED = 10
 WARMUP = 10
 """Loops at the beginning that do not count: they may compile."""
@@ -123,7 +125,7 @@ def measure_robots(settings: BenchmarkSettings, mode: Mode) -> Measurement:
     seconds: list[float] = []
     replanned = held = 0
     for seed in range(min(settings.repetitions, 3)):
-        timeout = 0.9 * problem.dt
+        timeout = DEADLINE * problem.dt
         with Controller("d4orm-c2f", mode=mode, reserve=0.0, timeout=timeout, replan_distance=2.0) as controller:
             steps = _driven(problem, controller, seed)
         seconds += [taken for taken, _ in steps[WARMUP:]]
@@ -221,25 +223,33 @@ def measure_improvement(scenario: str, num_robots: int, seeds: int, time_limit: 
     return {**limits, "gained": gained, "gain": Spread.of(gains), "seconds": Spread.of(seconds)}
 
 
-def measure_big_loops(num_robots: int, loops: int) -> Measurement:
-    """Seconds of control loops of D4orm-C2F for a big team on open ground, from where it starts, and contacts."""
+def measure_big_loops(num_robots: int, loops: int, share: float | None) -> Measurement:
+    """Seconds of control loops of D4orm-C2F for a big team on open ground, from where it starts, and contacts.
+
+    With a deadline, which is a ``share`` of the time step, the loops run at their own pace.
+    """
     env = navigation_v0.parallel_env("random", num_robots=num_robots)
-    policy, seconds, contacts = make_policy("d4orm-c2f"), [], 0
+    dt = env.problem.dt
+    policy = make_policy("d4orm-c2f", deadline=None if share is None else share * dt)
+    assert isinstance(policy, D4ormC2F)
+    seconds, contacts = [], 0
     observations, _ = env.reset(seed=0)
-    begin = time.perf_counter()
     policy.reset(env, seed=0)
-    start = time.perf_counter() - begin
     for _ in range(loops + 1):
         begin = time.perf_counter()
         actions = policy.act(observations, env.state())
         seconds.append(time.perf_counter() - begin)
         observations, _, _, _, infos = env.step(actions)
         contacts += sum(info["collided"] for info in infos.values())
+        if share is not None:
+            time.sleep(max(begin + dt - time.perf_counter(), 0.0))
     # The first loop may compile.
     return {
         "num_robots": num_robots,
-        "start": start,
+        "deadline": "none" if share is None else f"{share * dt * 1e3:.0f} ms",
+        "start": policy.coarse_time,
         "loop": Spread.of(seconds[1:]),
         "loop_95": float(np.percentile(seconds[1:], 95)),
+        "late": policy.missed,
         "contacts": contacts,
     }
