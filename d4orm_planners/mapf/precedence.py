@@ -108,13 +108,15 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
     """``(C,)`` radius of the arc that rounds each corner [m]; infinite where there is none, zero for a sharp one."""
     radii = np.full(len(corners), np.inf)
     inner = np.flatnonzero((owner[:-2] == owner[1:-1]) & (owner[1:-1] == owner[2:])) + 1
-    inner = inner[_bends_at(corners, inner).sine > STRAIGHT]
-    radii[inner] = 0.0
+    bends = _bends_at(corners, inner)
+    radii[inner[bends.sine > STRAIGHT]] = 0.0
     # Who turns back does so on the spot.
-    inner = inner[_bends_at(corners, inner).cosine > TURNING_BACK]
+    left = (bends.sine > STRAIGHT) & (bends.cosine > TURNING_BACK)
     turning, size = problem.team.turning_radius.astype(np.float64)[owner], problem.team.largest_radius
     for share in CUTS:
-        bends = _bends_at(corners, inner)
+        inner, bends = inner[left], RouteBends(*(values[left] for values in bends))
+        if not len(inner):
+            break
         most = share * np.maximum(cut * bends.cosine / (1 - bends.cosine), turning[inner])
         radius = np.minimum(most, bends.straight * bends.cosine / bends.sine)
         fits = np.ones(len(inner), bool)
@@ -128,7 +130,7 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
                 fits[alike] = problem.world.is_clear(arcs[alike], distance).all(axis=1)
         rounded = fits & (radius > SHARPEST * size)
         radii[inner[rounded]] = radius[rounded]
-        inner = inner[~fits]
+        left = ~fits
     return radii
 
 
