@@ -17,7 +17,7 @@ from d4orm_env.verify import verify
 from d4orm_planners import make_planner
 from d4orm_planners.base.candidate import conflicts
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.d4orm_d.decoupling import failure_groups, regrouped
+from d4orm_planners.d4orm_d.decoupling import failure_groups, failure_labels, regrouped
 from d4orm_planners.d4orm_d.planner import D4ormD
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.sampling_types import SamplingResult, SamplingTask
@@ -340,6 +340,12 @@ def test_the_joint_run_deforms_who_fails_by_groups_and_raises_penalties() -> Non
     assert all((task.penalties[2:] == 1).all() for task in engine.tasks)
     # As wide as they were until the failure has come back six times.
     assert [float(task.base[0, 0, 0]) for task in engine.tasks] == [5] * 6 + [1] * 2
+
+
+def test_a_failure_is_another_one_in_another_group() -> None:
+    failed = np.array([True, True, False, True, True, True])
+    labels = failure_labels(((0, 1), (2,), (3,), (4, 5)), failed)
+    assert labels.tolist() == [1, 1, 0, -1, 2, 2]
 
 
 @pytest.mark.parametrize("start", ["team", "straight"])
