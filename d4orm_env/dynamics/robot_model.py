@@ -121,16 +121,12 @@ class ModelFunctions(NamedTuple):
     """
 
 
-UNLIMITED = 1e6
-"""Default of a limit that bounds nothing unless it is given: the largest that is allowed."""
-
-
 class Limit(NamedTuple):
     """A limit or measure of its own that a model has, positive.
 
     Attributes:
         name: As in ``Team(own_limits={name: ...})``.
-        default: For robots that are given no other, in SI units; may be :data:`UNLIMITED`.
+        default: For robots that are given no other, in SI units.
         most: Largest value.
     """
 

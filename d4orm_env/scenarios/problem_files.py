@@ -16,7 +16,6 @@ from d4orm_env.core.files import checked_path, naming, read_yaml, replaced_when_
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
-from d4orm_env.dynamics.robot_model import UNLIMITED
 from d4orm_env.footprints import Disc
 from d4orm_env.scenarios.cl_mapf import load_cl_mapf
 from d4orm_env.scenarios.dynobench import load_dynobench
@@ -146,9 +145,10 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     hitches = problem.goal_hitches[robot, : len(model.trailers)]
     if not np.isnan(hitches).all():
         entry["goal_hitches"] = [None if np.isnan(hitch) else _decimals([hitch])[0] for hitch in hitches]
-    own = {limit.name: team.own_limits[limit.name][robot] for limit in model.own_limits}
-    if bounding := {name: value for name, value in own.items() if value != UNLIMITED}:
-        entry["own_limits"] = dict(zip(bounding, _decimals([*bounding.values()]), strict=True))
+    if model.own_limits:
+        names = [limit.name for limit in model.own_limits]
+        values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])
+        entry["own_limits"] = dict(zip(names, values, strict=True))
     return entry
 
 
