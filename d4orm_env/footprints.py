@@ -77,9 +77,16 @@ class Footprint(ABC):
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
             title = f"{name} of {type(self).__name__}"
             if name != "offset":
-                positive_number(value, title, least=SMALLEST, most=LARGEST)
-            elif not (isinstance(value, int | float) and abs(value) <= LARGEST):
+                number = positive_number(value, title, least=SMALLEST, most=LARGEST)
+            elif (
+                isinstance(value, int | float | np.number)
+                and not isinstance(value, bool)
+                and abs(float(value)) <= LARGEST
+            ):
+                number = float(value)
+            else:
                 raise ValueError(f"{title} must be a number of metres, not {short_repr(value)}")
+            object.__setattr__(self, name, number)  # one kind of number in files and comparisons
 
 
 @dataclass(frozen=True)

@@ -134,10 +134,11 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     else:
         entry |= dict(zip(start_fields(model), state[dimension:], strict=True))
     footprint = team.footprint[robot]
-    shape = {"radius": team.radius[[robot]]} if isinstance(footprint, Disc) else {}
-    if not shape:
+    if not isinstance(footprint, Disc):
         entry["footprint"] = described(footprint)
-    for name in (*shape, "max_speed", "max_acceleration", "max_turn_rate"):
+    else:
+        entry["radius"] = footprint.radius if team.shapes else _decimals(team.radius[[robot]])[0]
+    for name in ("max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
     if not np.isnan(problem.goal_heading[robot]):
         for name in ("goal_heading", "goal_heading_tolerance"):

@@ -2,40 +2,36 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
-from numbers import Real
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, numbers_of, positive_number, short_repr
-from d4orm_env.core.portable import NUMPY_OPS
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, positive_number, read_only, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver
+from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver, check_lag
 from d4orm_planners.base.episode import open_env
+from d4orm_planners.base.measured_states import braked, completed, possible, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Policy
-from d4orm_planners.base.policy_threads import Background
-from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round, track_velocities
+from d4orm_planners.base.policy_threads import Background, check_episode
+from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round, track_velocities, weaker
 
 Mode = Literal["nominal", "measured"]
 
 FEEDBACK = 0.25
 """Share of a distance from the reference that controls are to make up for within a step."""
-BEYOND = 4
-"""Distance beyond the state space at which measured numbers are cut off, in sizes of the space."""
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
 
 
 @dataclass(frozen=True, eq=False)
 class ControlSetpoint:
-    """Setpoint of a team until the next step.
+    """Setpoint of a team until the next step; its arrays are read-only.
 
     Attributes:
         position: ``(K, d)`` where robots are to be at the end of the period [m].
@@ -58,12 +54,6 @@ class ControlSetpoint:
 
 IN_TIME = 0.9
 """Share of a step's timeout that is a policy's deadline."""
-
-
-def _seconds(time: object) -> float:
-    if not isinstance(time, Real) or not math.isfinite(time):
-        raise ValueError(f"time is {short_repr(time)}; give the seconds of one clock")
-    return float(time)
 
 
 class Controller:
@@ -112,6 +102,8 @@ class Controller:
         tracker: bool = False,
         **settings: Any,
     ) -> None:
+        if not isinstance(tracker, bool):
+            raise ValueError(f"tracker is {short_repr(tracker)}; it must be True or False")
         if mode not in get_args(Mode):
             raise ValueError(f"mode is {short_repr(mode)}; choose one of {', '.join(get_args(Mode))}")
         self.mode = mode
@@ -122,9 +114,10 @@ class Controller:
             settings = {"deadline": IN_TIME * self.timeout} | settings
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = tracker
-        self._lag, self._leads = lag, mode == "nominal" or tracker
+        self._lag, self._leads = check_lag(lag), mode == "nominal" or tracker
         self._background: Background[Actions] = Background()
         self._env: Any = None
+        self._ending: JointState | None = None  # the reference once the episode is over
 
     def __enter__(self) -> Self:
         return self
@@ -133,7 +126,7 @@ class Controller:
         self.close()
 
     def close(self) -> None:
-        """End the policy's thread as soon as it has answered."""
+        """End the policy's thread as soon as it has answered; a later step would start another."""
         self._background.close()
 
     def begin(self, problem: Problem, states: ArrayLike, time: float = 0.0, seed: int = 0) -> None:
@@ -151,7 +144,7 @@ class Controller:
         check_is_problem(problem)
         self._background.forget()
         try:
-            self._begin(problem, states, _seconds(time), seed)
+            self._begin(problem, states, seconds(time), seed)
         except BaseException:
             self._env = None  # there is no team to step
             raise
@@ -161,10 +154,9 @@ class Controller:
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
-        start = self._possible(self._completed(states)[0])
-        limited = ("max_speed", "max_acceleration", "max_turn_rate")
-        limits = {name: (1 - self.reserve) * getattr(problem.team, name) for name in limited}
-        self._open(problem.with_state(start, problem.goal, team=problem.team.replace(**limits)), seed)
+        start = possible(self.problem, self._bounds, self._completed(states)[0])
+        team = weaker(problem.team, 1 - self.reserve)
+        self._open(problem.with_state(start, problem.goal, team=team), seed)
         self.policy.reset(self._env, seed=seed)
         self._time, self._lead = time - problem.dt, np.zeros_like(problem.goal, np.float64)
         self._setpoint = self._described(self._joint, self._joint.controls, held=False)
@@ -182,15 +174,15 @@ class Controller:
             RuntimeError: Before :meth:`begin`.
             ValueError: If the states have another shape, or the time is before that of the last step.
         """
-        if self._env is None:
-            raise RuntimeError("the controller has no team yet; call begin(problem, states) before step()")
-        passed = (_seconds(time) - self._time) / self.problem.dt
+        measured, known = self._completed(states)
+        dt = self.problem.dt
+        passed = (seconds(time) - self._time) / dt
         if passed <= -SAME_PERIOD:
             raise ValueError(f"time is {time!r} s, before the last step; give times of one clock, in seconds")
-        measured, known = self._completed(states)
         if passed >= SAME_PERIOD:
-            self._time = time
             self._setpoint = self._advance(measured, known)
+            # Periods follow each other, so that frequent calls do not make the reference faster than the clock.
+            self._time = max(self._time + dt, float(time) - SAME_PERIOD * dt)
         return self._setpoint
 
     @property
@@ -200,37 +192,28 @@ class Controller:
 
     @property
     def over(self) -> bool:
-        """True if all robots have arrived, or the problem's horizon is over; robots are then held at rest."""
-        return not self._env.agents
+        """True if all robots have arrived, or the problem's horizon is over; robots then brake and are held at rest."""
+        return not self._opened.agents
+
+    @property
+    def _opened(self) -> Any:
+        if self._env is None:
+            raise RuntimeError("the controller has no team yet; call begin(problem, states) before step()")
+        return self._env
 
     @property
     def _joint(self) -> JointState:
-        return split_state(self.problem, self._env.state())
+        env = self._opened
+        return self._ending or split_state(self.problem, env.state())
 
     def _open(self, problem: Problem, seed: int) -> None:
-        self.problem = problem
+        self.problem, self._ending = problem, None
         self._env = open_env(problem, policy=self.policy)
         self._observations, _ = self._env.reset(seed=seed)
 
     def _completed(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """``(K, n)`` measured states where they are known, the reference's elsewhere, and ``(K,)`` where."""
         reference = self._joint.states
-        measured = numbers_of(states, "states must be an array of numbers")
-        if measured.shape != reference.shape:
-            raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
-        known: BoolArray = np.all(np.isfinite(measured), axis=1)
-        low, high = self._bounds
-        sane = np.clip(measured, low - BEYOND * (high - low), high + BEYOND * (high - low))
-        return np.where(known[:, None], sane, reference), known
-
-    def _possible(self, states: FloatArray) -> FloatArray:
-        """``(K, n)`` states within the robots' limits and the state space."""
-        plausible = np.clip(states, *self._bounds)
-        for model, robots in by_model(self._robots):
-            x, limits = (tuple(rows[robots].T) for rows in (plausible, self.problem.team.limits))
-            limited = model.functions.limit_state(x[: model.state_size], limits, NUMPY_OPS)
-            plausible[robots, : model.state_size] = np.stack(np.broadcast_arrays(*limited), axis=1)
-        return plausible
+        return completed(self.problem, self._bounds, states, reference)
 
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
         at_rest = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
@@ -240,18 +223,20 @@ class Controller:
         if self.mode == "measured":
             seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
             if not self.over:
-                possible = self._possible(seen)
-                self._observations, _ = self._env.set_state(np.where(at_rest[:, None], self._joint.states, possible))
+                states = possible(self.problem, self._bounds, seen)
+                self._observations, _ = self._env.set_state(np.where(at_rest[:, None], self._joint.states, states))
             measured = measured if self.tracker else seen
         before, actions = self._joint, self._actions()
         moving = before.states if self._leads else measured
         brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
-        controls, held = brakes, not self.over and actions is None
-        if not self.over:
+        controls, held, led = brakes, not self.over and actions is None, self._leads or self.over | at_rest
+        if self.over:
+            self._ending = braked(self.problem, before, brakes)
+        else:
             actions = dict(zip(self._env.possible_agents, brakes)) if actions is None else actions
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
-        controls = self._with_feedback(measured, known if self._leads else known & at_rest, controls)
+        controls = self._with_feedback(measured, known & led, controls)
         return self._described(before, self._observer.compensated(controls, self.arrived), held)
 
     def _shift(self, measured: FloatArray, known: BoolArray) -> None:
@@ -269,6 +254,7 @@ class Controller:
         """Return the policy's actions; ``None`` if they do not come in time, or the episode is over."""
         if self.over or self._background.is_busy:  # robots brake at once while an answer is late
             return None
+        check_episode(self.policy, self._env)
         acting = {agent: self._observations[agent] for agent in self._env.agents}
         return self._background.run(partial(self.policy.act, acting, self._env.state()), self.timeout)
 
@@ -291,4 +277,5 @@ class Controller:
                 heading[robots] = joint.states[robots, model.heading_index]
         velocity, position = self._velocities(joint), joint.states[:, : self.problem.dimension] + self._lead
         acceleration = (velocity - self._velocities(before)) / self.problem.dt
-        return ControlSetpoint(position, velocity, acceleration, heading, controls.copy(), joint.arrived.copy(), held)
+        arrays = read_only((position, velocity, acceleration, heading, controls.copy(), joint.arrived.copy()))
+        return ControlSetpoint(*arrays, held)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_planners.tracking.steering import limit_controls
 
@@ -13,6 +13,21 @@ GAIN = 0.1
 """Share of a step's residual that goes into the estimate."""
 MOST = 0.5
 """Largest estimate, as a share of the control's limit: the rest is needed to steer."""
+
+
+def check_lag(lag: ArrayLike) -> ArrayLike:
+    """Return time constants of actuators [s], one or one per robot, as they are.
+
+    Raises:
+        ValueError: If they are no numbers, or one is negative or not finite.
+    """
+    try:
+        constants: Floats = np.asarray(lag, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"lag is {short_repr(lag)}; give one number or one per robot [s]") from None
+    if not (np.isfinite(constants) & (constants >= 0)).all():
+        raise ValueError(f"lag is {short_repr(lag)}; it must be finite and not negative")
+    return lag
 
 
 class DisturbanceObserver:
@@ -36,11 +51,9 @@ class DisturbanceObserver:
     def __init__(self, problem: Problem, lag: ArrayLike = 0.0) -> None:
         self.problem, count, d = problem, problem.num_robots, problem.dimension
         try:
-            constants: Floats = np.broadcast_to(np.asarray(lag, np.float64), (count,))
-        except (TypeError, ValueError):
-            raise ValueError(f"lag must be one number or one per robot ({count}), not {lag!r}") from None
-        if not (np.isfinite(constants) & (constants >= 0)).all():
-            raise ValueError(f"lag is {lag!r}; it must not be negative")
+            constants: Floats = np.broadcast_to(np.asarray(check_lag(lag), np.float64), (count,))
+        except ValueError as error:
+            raise ValueError(f"lag must be one number or one per robot ({count}): {error}") from None
         names = problem.team.models
         columns = {"holonomic2d": range(d, 2 * d), "holonomic3d": range(d, 2 * d), "velocity2d": range(d)}
         self._observed: BoolArray = np.array([name in columns for name in names])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import checked_path, replaced_when_done
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
@@ -211,7 +211,8 @@ class Plan(DisplayMixin):
             ModuleNotFoundError: If the format needs a library that is missing.
             OSError: If the files cannot be written.
         """
-        return exports.export_motion(self._smooth(max_acceleration, max_jerk), format, Path(path), rate, height)
+        folder = checked_path(path, "the folder of an export")
+        return exports.export_motion(self._smooth(max_acceleration, max_jerk), format, folder, rate, height)
 
     def _smooth(self, max_acceleration: ArrayLike | None, max_jerk: ArrayLike | None) -> SmoothMotion:
         limits = smoothing.MotionLimits.of(self.problem, max_acceleration, max_jerk)

@@ -36,6 +36,10 @@ class Driving:
     def __reduce__(self) -> tuple[type[Driving], tuple[()]]:
         return Driving, ()
 
+    def is_for(self, env: Any) -> bool:
+        """Return whether the present episode, if any, is that of this environment."""
+        return self._episode is None or self._episode[1] == id(getattr(env, "unwrapped", env))
+
     @contextmanager
     def turn(self, env: Any = None) -> Iterator[None]:
         """Context in which a thread resets the policy for an environment or, without one, asks it for controls.
@@ -58,6 +62,17 @@ class Driving:
             yield
         finally:
             self._lock.release()
+
+
+def check_episode(policy: Any, env: Any) -> None:
+    """Refuse a policy whose last reset was for another environment.
+
+    Raises:
+        RuntimeError: If so.
+    """
+    driving = vars(policy).get(ATTRIBUTE)
+    if driving is not None and not driving.is_for(env):
+        raise RuntimeError("this policy has begun another episode since; give each controller one of its own")
 
 
 def driven_alone(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -129,9 +144,10 @@ class Background(Generic[Result]):
             job.result()
 
     def close(self) -> None:
-        """End the thread as soon as its job is done."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+        """End the thread as soon as its job is done; another job would start another one."""
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _yield_to_others() -> None:

@@ -9,9 +9,9 @@ import numpy as np
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_env.dynamics.robot_model import ACCELERATION, STANDARD_LIMITS
+from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.tracking.steering import present_velocities, track_velocities
+from d4orm_planners.tracking.steering import present_velocities, track_velocities, weaker
 
 AT_LIMIT = 0.95
 """Share of its limits from which on a command asks a robot for all that it can do."""
@@ -89,7 +89,8 @@ class ActuatorGainEstimator:
         share = np.maximum(share - held_back, MIN_GAIN)
         if (share != self._share).any():
             self._share = share
-            self.problem = self._first.with_state(self._first.start, self._first.goal, team=self._team(share))
+            first = self._first
+            self.problem = first.with_state(first.start, first.goal, team=weaker(first.team, share))
 
     def _persistent(self, added: Floats) -> FloatArray:
         """``(K, m)`` what is added for some time, now that ``added`` ``(K, m)`` is."""
@@ -104,12 +105,6 @@ class ActuatorGainEstimator:
         error = np.sqrt(rate / (2 - rate) * self._variance * (1 + correlation) / (1 - correlation))
         significant = effort(self._first, self._added) > SIGNIFICANCE * error
         return np.where(significant[:, None], self._added, 0.0).astype(np.float32)
-
-    def _team(self, share: Floats) -> Team:
-        """The team that does a share ``(K,)`` of what it was believed to do."""
-        team = self._first.team
-        limits = {name: getattr(team, name) * share.astype(np.float32) for name in STANDARD_LIMITS}
-        return Team(team.models, team.radius, own_limits=team.own_limits, **limits)
 
 
 MAX_LATENCY = 10

@@ -94,6 +94,8 @@ class FleetServer:
     ) -> None:
         if len(names) != problem.num_robots:
             raise ValueError(f"there are {len(names)} names for {problem.num_robots} robots; give one for each")
+        if len(set(names)) < len(names):
+            raise ValueError(f"robots are called {', '.join(names)}; give each a name of its own")
         self.deadline = positive_number(deadline, "deadline", least=problem.dt)
         self._problem, self._controller, self._seed = problem, controller, seed
         unknown = np.full(problem.state_size, np.nan, np.float32)

@@ -243,7 +243,8 @@ def _initial_velocity(problem: Problem) -> Floats:
 
 def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> SmoothMotion:
     """The plan's positions and headings by splines, as they are timed."""
-    moving = np.any(trajectory.positions[1:] != trajectory.positions[:-1], axis=(1, 2))
+    poses = np.concatenate([trajectory.positions, problem.team.headings(trajectory.states)[..., None]], axis=2)
+    moving = np.any(poses[1:] != poses[:-1], axis=(1, 2))
     last = int(np.flatnonzero(moving).max(initial=0)) + 1 + SETTLING
     velocity, no_turn = _initial_velocity(problem), np.zeros(problem.num_robots)
     first = 0 if velocity.any() else -GATHERING

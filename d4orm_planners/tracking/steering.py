@@ -14,8 +14,9 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import Model, ModelFunctions
+from d4orm_env.dynamics.robot_model import STANDARD_LIMITS, Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.paths.shortest_paths import along_paths
@@ -85,6 +86,14 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     controls = _by_rows(problem, problem.control_size, (states, velocities), law)
     # The norm may come out above the limit by a rounding error.
     return np.clip(controls, *problem.team.control_bounds)
+
+
+def weaker(team: Team, share: ArrayLike) -> Team:
+    """The team with a share, one or ``(K,)``, of its limits of speed, acceleration and turn rate, either way."""
+    factor = np.asarray(share, np.float32)
+    either_way = {model.limit_names[own] for model in team.robot_models for _, own in model.lower_limits}
+    own = {name: limit * factor if name in either_way else limit for name, limit in team.own_limits.items()}
+    return team.replace(own_limits=own, **{name: getattr(team, name) * factor for name in STANDARD_LIMITS})
 
 
 def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:

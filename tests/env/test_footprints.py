@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -284,3 +285,23 @@ def test_what_is_no_team_or_no_polygon_is_told() -> None:
         Problem(5, [[0]], [[0]])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="polygons must be a list of polygons, each a list of corners, not 5"):
         World(polygons=5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64, int])
+def test_any_kind_of_number_makes_the_same_footprint(kind: type, tmp_path: Path) -> None:
+    footprint = Box(kind(1), kind(2), kind(1))
+    assert footprint == Box(1.0, 2.0, 1.0)
+    assert repr(footprint) == repr(Box(1.0, 2.0, 1.0))
+    problem = Problem(Team(("unicycle",), footprint=footprint), [[0, 0, 0]], [[5, 0]])
+    save_problem(problem, tmp_path / "box.yaml")
+    assert load_problem(tmp_path / "box.yaml") == problem
+
+
+def test_discs_among_other_footprints_survive_a_file(tmp_path: Path) -> None:
+    footprints = [Disc(1 / 3), Box(0.4, 0.2), Disc(0.1 + 0.2)]
+    team = Team(("velocity2d", "unicycle", "unicycle"), footprint=footprints)
+    problem = Problem(team, [[0, 0, 0], [2, 0, 0], [4, 0, 0]], [[0, 3], [2, 3], [4, 3]])
+    save_problem(problem, tmp_path / "team.yaml")
+    assert load_problem(tmp_path / "team.yaml") == problem
+    with pytest.raises(ValueError, match="offset of Box must be a number of metres, not True"):
+        Box(0.5, 0.2, True)

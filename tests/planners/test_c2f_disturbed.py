@@ -20,6 +20,7 @@ from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.disturbances import Bias, Delay, Dropout, LimitMismatch, Push, Stall, StateDelay
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_env.footprints import Box, Train
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import make_policy, run_episode
 from d4orm_planners.d4orm_c2f.barrier import Barriers, find_nearest, safe_velocities
@@ -192,6 +193,21 @@ def test_a_robot_that_does_more_than_it_was_believed_to_is_strong_again() -> Non
     for _ in range(60):
         actuator_gain.observe(0.6 * ahead, 0.6 * ahead, ALL)
     np.testing.assert_allclose(actuator_gain.problem.team.max_acceleration, [1, 0.6, 0.6], rtol=1e-5)
+
+
+def test_a_robot_taken_for_weak_keeps_its_shape_and_is_weaker_either_way() -> None:
+    footprint = Train(Box(0.5, 0.2), [Box(0.3, 0.2)])
+    first = Team(("car_with_1_trailer",), footprint=footprint, own_limits={"max_reverse_speed": 0.4})
+    problem = Problem(first, [[0, 0, 0, 0]], [[5, 0]])
+    actuator_gain, ahead = ActuatorGainEstimator(problem), np.float32([[1, 0]])
+    for _ in range(10):
+        actuator_gain.observe(ahead, 0.5 * ahead, np.array([True]))
+    team = actuator_gain.problem.team
+    assert team.shapes == (footprint,)
+    assert team.radius == first.radius
+    assert team.max_speed == pytest.approx(0.5 * first.max_speed)
+    assert team.own_limits["max_reverse_speed"] == pytest.approx(0.2)
+    assert team.own_limits["wheelbase"] == first.own_limits["wheelbase"]
 
 
 @pytest.mark.parametrize(("share", "runs"), [(0.0, {0}), (0.1, {4, 5}), (0.3, {7, 8, 9}), (0.7, {10})])

@@ -12,7 +12,7 @@ from env_support import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d4orm_env import Problem, Team, make_problem, navigation_v0
+from d4orm_env import Problem, Team, make_problem, navigation_v0, rollout
 from d4orm_env.disturbances import Bias, ControlNoise, Gain, Lag, StateNoise
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import Controller, make_planner, make_policy, run_episode
@@ -227,8 +227,9 @@ def test_one_setpoint_a_period_and_none_skipped() -> None:
     assert after is not late
     with pytest.raises(ValueError, match=r"time is 99.0 s, before the last step"):
         controller.step(problem.start, 99.0)
-    with pytest.raises(ValueError, match="time is nan"):
-        controller.step(problem.start, float("nan"))
+    for time in (float("nan"), 1.7e18, True, 10**400):  # the second one in nanoseconds
+        with pytest.raises(ValueError, match="give the seconds of one clock"):
+            controller.step(problem.start, time)
 
 
 def test_clocks_may_drift() -> None:
@@ -298,6 +299,125 @@ def test_who_has_arrived_is_brought_back() -> None:
     np.testing.assert_allclose(said.position, states[:, :2], atol=1e-6)
 
 
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "velocity2d"])
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+def test_robots_are_at_rest_soon_after_the_horizon(mode: Any, model: str) -> None:
+    problem = team(model, 2).replace(horizon=30)
+    controller, states, told = Controller("go-to-goal", mode=mode), problem.start, []
+    controller.begin(problem, states)
+    for step in range(90):
+        told.append(controller.step(states, step * problem.dt))
+        states = moved(problem, states, told[-1].control)
+    assert controller.over
+    assert not controller.arrived.any()
+    assert np.linalg.norm(told[29].velocity, axis=1).min() > 0.3, "they were under way"
+    np.testing.assert_allclose(told[-1].velocity, 0, atol=1e-6)
+    np.testing.assert_allclose(told[-1].position, told[45].position, atol=1e-5)
+    np.testing.assert_allclose(states[:, :2], told[-1].position, atol=0.01)
+
+
+def moved(problem: Problem, states: Any, controls: Any) -> Any:
+    """States after a step of robots that do as the model says, and never arrive."""
+    after = []
+    for robot in range(problem.num_robots):
+        alone = problem.select([robot]).replace(start=states[[robot]], goal=problem.goal[[robot]] + 50)
+        held = np.repeat(controls[None, [robot]], problem.horizon, axis=0)
+        after.append(rollout(alone, held, engine="cpu").states[1])
+    return np.concatenate(after)
+
+
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+def test_first_order_robots_stay_at_their_goals(mode: Any) -> None:
+    """Though they arrive at a speed, and where they are is known to a millimetre."""
+    problem, random = team("velocity2d", 2), np.random.default_rng(0)
+    controller, states = Controller("go-to-goal", mode=mode), problem.start
+    controller.begin(problem, states)
+    for step in range(150):
+        control = controller.step(states + random.normal(0, 0.001, states.shape), step * problem.dt).control
+        states = states + problem.dt * control
+    assert controller.arrived.all()
+    assert (np.linalg.norm(states - problem.goal, axis=1) <= problem.goal_radius).all()
+
+
+@pytest.mark.parametrize("period", [0.02, 0.051, 0.06, 0.1])
+def test_frequent_calls_make_the_reference_no_faster(period: float) -> None:
+    problem = team("holonomic2d", 2)
+    controller, states = Controller("go-to-goal"), problem.start
+    controller.begin(problem, states)
+    said = {}
+    for call in range(round(3 / period)):
+        setpoint = controller.step(states, call * period)
+        said[id(setpoint)] = setpoint
+        states = np.hstack([setpoint.position, setpoint.velocity])
+    assert 29 <= len(said) <= 31
+
+
+def test_setpoints_are_not_to_be_written_to() -> None:
+    problem = team("holonomic2d", 2)
+    controller = Controller("go-to-goal")
+    controller.begin(problem, problem.start)
+    setpoint = controller.step(problem.start, 0.0)
+    for name in ("position", "velocity", "acceleration", "heading", "control", "arrived"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(setpoint, name)[:] = 0
+
+
+def test_a_policy_drives_one_team_at_a_time() -> None:
+    problem, policy = team("holonomic2d", 2), make_policy("orca")
+    first, second = Controller(policy), Controller(policy)
+    first.begin(problem, problem.start)
+    first.step(problem.start, 0.0)
+    second.begin(problem, problem.start)
+    second.step(problem.start, 0.0)
+    with pytest.raises(RuntimeError, match="this policy has begun another episode"):
+        first.step(problem.start, 0.1)
+
+
+def test_a_closed_controller_goes_on_when_asked() -> None:
+    problem = team("holonomic2d", 2)
+    controller = Controller("go-to-goal", timeout=60.0)
+    controller.begin(problem, problem.start)
+    controller.step(problem.start, 0.0)
+    controller.close()
+    assert not controller.step(problem.start, 0.1).held
+    controller.close()
+
+
+def test_a_step_that_failed_is_tried_again() -> None:
+    problem, failing = team("holonomic2d", 2), [True]
+
+    def act(observations: Any, _: Any) -> Any:
+        if failing:
+            raise OSError
+        return {agent: [0.5, 0.0] for agent in observations}
+
+    controller = Controller(act)
+    controller.begin(problem, problem.start)
+    with pytest.raises(OSError):  # noqa: PT011 - it is the policy's own
+        controller.step(problem.start, 0.0)
+    failing.clear()
+    assert controller.step(problem.start, 0.0).control.any()
+
+
+def test_whole_turns_of_a_measured_heading_say_nothing() -> None:
+    problem = team("differential_drive", 2)
+    told = []
+    for turns in (0, 3, 100):
+        controller = Controller("go-to-goal", mode="measured")
+        controller.begin(problem, problem.start)
+        states = problem.start + np.array([0, 0, 2 * np.pi * turns, 0])
+        told.append(controller.step(states, 0.0).control)
+    np.testing.assert_allclose(told[1:], [told[0]] * 2, atol=1e-4)
+
+
+def test_the_reserve_is_kept_in_reverse_and_to_the_right_too() -> None:
+    problem = Problem(Team(("unicycle1",), own_limits={"max_reverse_speed": 0.4}), [[0, 0, 0]], [[5, 0]])
+    controller = Controller(lambda observations, _: {agent: [-1, -2] for agent in observations}, reserve=0.5)
+    controller.begin(problem, problem.start)
+    setpoint = controller.step(problem.start, 0.0)
+    assert setpoint.control[0] == pytest.approx([-0.2, -np.pi / 4], rel=1e-3)
+
+
 def test_it_begins_where_robots_are() -> None:
     problem = team("holonomic2d", 3)
     elsewhere = problem.start + np.float32([0.2, 0.1, 0, 0])
@@ -312,7 +432,9 @@ def test_it_begins_where_robots_are() -> None:
     [
         ({"mode": "open"}, "mode is 'open'; choose one of nominal, measured"),
         ({"reserve": 1.0}, "reserve"), ({"timeout": 0}, "timeout"), ({"timeout": -1.0}, "timeout"),
-        ({"policy": "d4orm-c2"}, "d4orm-c2"),
+        ({"policy": "d4orm-c2"}, "d4orm-c2"), ({"tracker": "no"}, "tracker is 'no'; it must be True or False"),
+        ({"lag": -1}, "lag is -1; it must be finite and not negative"), ({"lag": float("nan")}, "lag is nan; it must"),
+        ({"lag": "a"}, "lag is 'a'; give one number or one per robot"),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> None:
@@ -323,15 +445,15 @@ def test_bad_arguments_are_named(arguments: dict[str, Any], message: str) -> Non
 def test_bad_states_and_lags_are_named() -> None:
     problem = team("holonomic2d", 3)
     controller = Controller("go-to-goal")
-    with pytest.raises(RuntimeError, match="call begin"):
-        controller.step(problem.start, 0.0)
+    for ask in (lambda: controller.step(problem.start, 0.0), lambda: controller.over, lambda: controller.arrived):
+        with pytest.raises(RuntimeError, match="call begin"):
+            ask()
     with pytest.raises(ValueError, match=r"states have shape \(2, 4\); expected \(K, n\) = \(3, 4\)"):
         controller.begin(problem, problem.start[:2])
     with pytest.raises(RuntimeError, match=r"call begin\(problem, states\) before step"):
         controller.step(problem.start, 0.0)
-    for lag, message in ((-1, "must not be negative"), ([1, 2], r"one number or one per robot \(3\)")):
-        with pytest.raises(ValueError, match=message):
-            Controller("go-to-goal", lag=lag).begin(problem, problem.start)
+    with pytest.raises(ValueError, match=r"one number or one per robot \(3\)"):
+        Controller("go-to-goal", lag=[1, 2]).begin(problem, problem.start)
 
 
 # The observer, in numbers.

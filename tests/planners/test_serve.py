@@ -382,6 +382,7 @@ def test_strangers_bytes_are_counted(endpoint: str) -> None:
         ("problem: {scenario: circle}\nrobots: [a/b]", "robots is ['a/b']"),
         ("problem: {scenario: circle}\npolicy: nobody", "nobody"),
         ("problem: {scenario: circle}\nrobots: [a, b]", "there are 2 names for 8 robots"),
+        ("problem: {scenario: circle, num_robots: 2}\nrobots: [a, a]", "robots are called a, a; give each a name of"),
         ("problem: {scenario: circle}\ncontroller: {mode: wild}", "mode is 'wild'"),
     ],
 )

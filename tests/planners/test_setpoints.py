@@ -237,6 +237,12 @@ def test_a_trailer_that_is_pushed_aside_is_told() -> None:
     assert report.violations[0].time == pytest.approx(1.03, abs=0.01)
 
 
+def test_a_turn_on_the_spot_at_the_goal_is_part_of_the_motion() -> None:
+    problem = Problem(Team(("unicycle",)), [[0, 0, 0]], [[1.0, 0]], goal_heading=3.0, horizon=200)
+    motion = make_planner().solve(problem, seed=0).sample(100.0)
+    assert motion.heading[-1, 0] == pytest.approx(3.0, abs=float(problem.goal_heading_tolerance[0]))
+
+
 @pytest.mark.parametrize(
     ("heading", "tolerance", "missed"), [(0.0, 0.05, None), (0.0, 0.04, "0.0409"), (0.2, 0.05, "0.2")]
 )
@@ -406,6 +412,11 @@ def test_bad_exports_are_refused_and_leave_nothing(
     with pytest.raises(ValueError, match=message):
         plans["plane"].export(format, tmp_path / "out", **arguments)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_folder_of_an_export_is_a_path(plans: dict[str, Plan]) -> None:
+    with pytest.raises(ValueError, match="the path of the folder of an export must be text or a path, not 3"):
+        plans["plane"].export("csv", 3)  # type: ignore[arg-type]
 
 
 def test_a_folder_with_files_of_more_robots_is_refused(plans: dict[str, Plan], tmp_path: Path) -> None:
