@@ -64,10 +64,14 @@ def main(base: str, arguments: list[str]) -> None:
         tree, out = Path(folder, "base"), Path(folder, "out")
         subprocess.run(["git", "worktree", "add", "--quiet", "--detach", tree, base], cwd=ROOT, check=True)
         try:
-            rounds = [[bench(each, out, arguments) for each in (tree, ROOT)] for _ in range(ROUNDS + 1)][1:]
+            reports: dict[Path, list[dict[str, Any]]] = {tree: [], ROOT: []}
+            for _ in range(ROUNDS + 1):
+                for each in (*reports,):
+                    reports[each].append(bench(each, out, arguments))
+                reports = dict(reversed(reports.items()))  # neither is always the second
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", tree], cwd=ROOT, check=True)
-    lines = slower(*([*reports] for reports in zip(*rounds)))
+    lines = slower(reports[tree][1:], reports[ROOT][1:])
     print("\n".join(lines) or f"no row is slower than {base} by more than {SLOWER - 1:.0%}")
 
 
