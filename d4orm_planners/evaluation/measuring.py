@@ -138,7 +138,7 @@ QUICK: Mapping[str, object] = {
     "loop_robots": (16,),
     "loops": 10,
 }
-"""Settings of a benchmark of about a minute, for a first look: nothing that runs in real time or compiles anew."""
+"""Settings of a benchmark of about a minute, for a first look; starts and controllers take as long by themselves."""
 
 
 Measurement: TypeAlias = dict[str, Any]
