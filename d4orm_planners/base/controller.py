@@ -15,11 +15,19 @@ from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver, check_lag
 from d4orm_planners.base.episode import open_env
-from d4orm_planners.base.measured_states import braked, completed, possible, seconds
+from d4orm_planners.base.measured_states import completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Policy
 from d4orm_planners.base.policy_threads import Background, check_episode
-from d4orm_planners.tracking.steering import by_model, present_velocities, short_way_round, track_velocities, weaker
+from d4orm_planners.tracking.steering import (
+    advanced,
+    by_model,
+    limited_states,
+    present_velocities,
+    short_way_round,
+    track_velocities,
+    weaker,
+)
 
 Mode = Literal["nominal", "measured"]
 
@@ -154,7 +162,7 @@ class Controller:
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
-        start = possible(self.problem, self._bounds, self._completed(states)[0])
+        start = self._possible(self._completed(states)[0])
         team = weaker(problem.team, 1 - self.reserve)
         self._open(problem.with_state(start, problem.goal, team=team), seed)
         self.policy.reset(self._env, seed=seed)
@@ -215,6 +223,10 @@ class Controller:
         reference = self._joint.states
         return completed(self.problem, self._bounds, states, reference)
 
+    def _possible(self, states: FloatArray) -> FloatArray:
+        """``(K, n)`` states within the robots' limits and the state space."""
+        return limited_states(self.problem, np.clip(states, *self._bounds))
+
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
         at_rest = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
         self._observer.observe(measured, known)
@@ -223,7 +235,7 @@ class Controller:
         if self.mode == "measured":
             seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
             if not self.over:
-                states = possible(self.problem, self._bounds, seen)
+                states = self._possible(seen)
                 self._observations, _ = self._env.set_state(np.where(at_rest[:, None], self._joint.states, states))
             measured = measured if self.tracker else seen
         before, actions = self._joint, self._actions()
@@ -231,7 +243,8 @@ class Controller:
         brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
         controls, held, led = brakes, not self.over and actions is None, self._leads or self.over | at_rest
         if self.over:
-            self._ending = braked(self.problem, before, brakes)
+            states = advanced(self.problem, before.states, brakes)
+            self._ending = before._replace(states=states, controls=brakes)
         else:
             actions = dict(zip(self._env.possible_agents, brakes)) if actions is None else actions
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})

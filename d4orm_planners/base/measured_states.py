@@ -1,4 +1,4 @@
-"""Measured times and states, made usable, and the reference of robots that come to rest."""
+"""Measured times and states, made usable."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, numbers_of, short_repr
-from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.winding import MAX_ANGLE
-from d4orm_env.dynamics.robot_model import TimeStep
-from d4orm_env.envs.joint_state import JointState
 from d4orm_planners.tracking.steering import by_model
 
 BEYOND = 4
@@ -59,24 +56,3 @@ def completed(
             whole[robots, index] = np.where(abs(angle) > MAX_ANGLE, np.remainder(angle, 2 * np.pi), angle)
     low, high = bounds
     return np.clip(whole, low - BEYOND * (high - low), high + BEYOND * (high - low)), known
-
-
-def possible(problem: Problem, bounds: Bounds, states: FloatArray) -> FloatArray:
-    """``(K, n)`` states within the robots' limits and the state space."""
-    plausible = np.clip(states, *bounds)
-    for model, robots in by_model(problem):
-        x, limits = (tuple(rows[robots].T) for rows in (plausible, problem.team.limits))
-        limited = model.functions.limit_state(x[: model.state_size], limits, NUMPY_OPS)
-        plausible[robots, : model.state_size] = np.stack(np.broadcast_arrays(*limited), axis=1)
-    return plausible
-
-
-def braked(problem: Problem, joint: JointState, brakes: FloatArray) -> JointState:
-    """The joint state a step later, under controls ``(K, m)`` that brake."""
-    states, h = joint.states.copy(), TimeStep(*problem.arrays.time_step)
-    for model, robots in by_model(problem):
-        x, u, limits = (tuple(rows[robots].T) for rows in (states, brakes, problem.team.limits))
-        moved = model.functions.integrate(x[: model.state_size], u[: model.control_size], limits, h, NUMPY_OPS)
-        limited = model.functions.limit_state(moved, limits, NUMPY_OPS)
-        states[robots, : model.state_size] = np.stack(np.broadcast_arrays(*limited), axis=1)
-    return joint._replace(states=states, controls=brakes)

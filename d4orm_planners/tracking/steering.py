@@ -17,7 +17,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import STANDARD_LIMITS, Model, ModelFunctions
-from d4orm_env.dynamics.transition import TimeStep
+from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.paths.shortest_paths import along_paths
 
@@ -86,6 +86,24 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
     controls = _by_rows(problem, problem.control_size, (states, velocities), law)
     # The norm may come out above the limit by a rounding error.
     return np.clip(controls, *problem.team.control_bounds)
+
+
+def limited_states(problem: Problem, states: FloatArray) -> FloatArray:
+    """``(K, n)`` states within the robots' limits."""
+    return _by_rows(
+        problem, problem.state_size, (states,), lambda model, x, limits: model.limit_state(x, limits, NUMPY_OPS)
+    )
+
+
+def advanced(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
+    """``(K, n)`` states a time step later, of robots that do not dock, under controls ``(K, m)`` within the limits."""
+    h = TimeStep(*problem.arrays.time_step)
+
+    def law(model: ModelFunctions, x: Columns, u: Columns, limits: Columns) -> Columns:
+        moved: Columns = advance(model, x, u, limits, h, NUMPY_OPS)
+        return moved
+
+    return _by_rows(problem, problem.state_size, (states, controls), law)
 
 
 def weaker(team: Team, share: ArrayLike) -> Team:
