@@ -46,11 +46,11 @@ def find_bodies(footprints: Sequence[Footprint], models: Sequence[Model], hitche
     return (*robots, *trailers)
 
 
-def numbers_by_robot(bodies: Sequence[Body], num_robots: int) -> list[list[int]]:
-    """Each robot's bodies by their numbers, the robot itself first."""
+def numbers_by_robot(bodies: Sequence[Body], num_robots: int, some: Iterable[int] | None = None) -> list[list[int]]:
+    """Each robot's bodies, all or ``some``, by their numbers, the robot itself first."""
     numbers: list[list[int]] = [[] for _ in range(num_robots)]
-    for i, body in enumerate(bodies):
-        numbers[body.robot].append(i)
+    for i in range(len(bodies)) if some is None else some:
+        numbers[bodies[i].robot].append(i)
     return numbers
 
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core import problem_checks as checks
 from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array
+from d4orm_env.core.goal_poses import checked_goal_poses, goal_speeds
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_arrays import ProblemArrays, as_arrays, digest_of
 from d4orm_env.core.problem_checks import Arrival
@@ -121,8 +122,8 @@ class Problem(Frozen):
             start=frozen_array(start, "start", (size, team.state_size), largest=LARGEST, columns=team.state_names),
             goal=frozen_array(goal, "goal", (size, team.dimension), largest=LARGEST),
             world=world,
-            goal_speed=checks.goal_speeds(team, numbers["dt"], goal_speed),
-            **checks.checked_goal_poses(team, goal_heading, goal_heading_tolerance, goal_hitches),
+            goal_speed=goal_speeds(team, numbers["dt"], goal_speed),
+            **checked_goal_poses(team, goal_heading, goal_heading_tolerance, goal_hitches),
             name=name,
             arrival=arrival,
         )
@@ -253,7 +254,7 @@ class Problem(Frozen):
 
         What the robots' goals have by default, or in common, another team has too.
         """
-        if np.array_equal(self.goal_speed, checks.goal_speeds(self.team, self.dt, None)):
+        if np.array_equal(self.goal_speed, goal_speeds(self.team, self.dt, None)):
             changes = {"goal_speed": None} | changes
         for name in ("goal_heading", "goal_hitches"):
             if np.isnan(getattr(self, name)).all():

@@ -1,4 +1,4 @@
-"""Checks of a problem: its numbers, its goals' speeds and poses, and its states by the physics.
+"""Checks of a problem: its numbers, and its states by the physics.
 
 Each refusal is a ``ValueError`` that names the robot.
 """
@@ -8,21 +8,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import (
     LARGEST,
     SMALLEST,
     FloatArray,
     Floats,
-    frozen_per_robot,
-    numbers_of,
     positive_number,
-    refuse_robots,
     short_repr,
     whole_number,
 )
 from d4orm_env.core.bodies import least_gap, near_pairs, numbers_by_robot, world_gap
+from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS
 from d4orm_env.core.world import World
@@ -45,10 +42,6 @@ RESOLUTION = 100
 """The goal radius is at least so many times what float32 resolves at the farthest start or goal."""
 STEP_RESOLUTION = 10
 """A robot at its speed limit moves at least so many times that in one step."""
-MOST_TRAILERS = 3
-"""Most trailers of a robot."""
-LEAST_TOLERANCE = 1e-3
-"""Smallest tolerance of a goal heading [rad]."""
 INTEGRATION_ERROR = 2 / 15
 """Most that one step of RK4 may be off where a robot turns at its limits, as a share of the goal radius."""
 
@@ -93,81 +86,11 @@ def check_physics(problem: Problem) -> list[str]:
     team, starts = problem.team, problem.start[:, : problem.dimension]
     check_resolution(team, np.concatenate([starts, problem.goal], axis=1), problem.dt, problem.goal_radius)
     check_turning(team, problem.dt, problem.goal_radius)
-    at_goals = np.where([model.heading_index is None for model in team.robot_models], 0, problem.goal_heading)
-    goals = np.column_stack([problem.goal, at_goals]).astype(np.float64)
-    bodies = team.body_poses(problem.start) if team.shapes else None
-    fault = check_positions(team, problem.world, "start", starts, problem.margin, bodies)
-    other = check_positions(team, problem.world, "goal", problem.goal, problem.margin, goals)
-    return [text for text in (fault, other) if text]
-
-
-def goal_speeds(team: Team, dt: float, given: ArrayLike | None) -> FloatArray:
-    """``(K,)`` speeds at which robots may dock [m/s], given or what each brakes away in a time step ``dt`` [s]."""
-    if given is None:
-        first_order = np.array([model.first_order for model in team.robot_models])
-        return np.where(first_order, np.float32(np.inf), team.max_acceleration * np.float32(dt))
-    speeds = _one_or_each(given, "goal_speed", team.num_robots)
-    right = (speeds >= 0) & ((speeds <= LARGEST) | (speeds == np.inf))
-    refuse_robots(~right, "goal_speed", speeds, f"from 0 to {LARGEST:g}, or inf for no limit")
-    return speeds
-
-
-def checked_goal_poses(
-    team: Team, heading: ArrayLike | None, tolerance: ArrayLike, hitches: ArrayLike | None
-) -> dict[str, FloatArray]:
-    """Headings and hitch angles that a problem asks for at goals, by its attributes' names."""
-    headings = _goal_headings(team, heading)
-    tolerances = frozen_per_robot(tolerance, "goal_heading_tolerance", team.num_robots)
-    # What float32 does not resolve, or what allows any heading.
-    wrong = (tolerances < LEAST_TOLERANCE) | (tolerances > np.float32(np.pi))
-    refuse_robots(wrong, "goal_heading_tolerance", tolerances, f"from {LEAST_TOLERANCE:g} to pi", " rad")
-    angles = _goal_hitches(team, hitches, headings)
-    return {"goal_heading": headings, "goal_heading_tolerance": tolerances, "goal_hitches": angles}
-
-
-def _one_or_each(given: ArrayLike, name: str, num_robots: int, note: str = "") -> FloatArray:
-    """``(K,)`` numbers, given as one for all robots or one each."""
-    values = numbers_of(given, f"{name} must be a number or one per robot")
-    values = np.repeat(values, num_robots) if values.ndim == 0 else values
-    if values.shape != (num_robots,):
-        raise ValueError(f"{name} has shape {values.shape}; expected one number, or ({num_robots},){note}")
-    return values
-
-
-def _goal_headings(team: Team, given: ArrayLike | None) -> FloatArray:
-    """``(K,)`` headings with which robots must arrive [rad], NaN for any."""
-    headings = _one_or_each(np.nan if given is None else given, "goal_heading", team.num_robots, ", NaN for any")
-    for robot in np.flatnonzero(~np.isnan(headings)).tolist():
-        where = f"goal_heading of robot_{robot} is {headings[robot]:g}"
-        if team.robot_models[robot].heading_index is None:
-            raise ValueError(f"{where}, and a {team.models[robot]} has no heading; give NaN")
-        if not abs(headings[robot]) <= np.float32(2 * np.pi):
-            raise ValueError(f"{where} rad; it must be at most 2 pi in magnitude, so give radians, without whole turns")
-    return headings
-
-
-def _goal_hitches(team: Team, given: ArrayLike | None, headings: FloatArray) -> FloatArray:
-    """``(K, 3)`` hitch angles with which trailers must arrive [rad], NaN for any and for those that there are not."""
-    hitches = np.full((team.num_robots, MOST_TRAILERS), np.nan, np.float32)
-    if given is None:
-        return hitches
-    values = numbers_of(given, "goal_hitches must be numbers, a row per robot")
-    if values.ndim != 2 or values.shape[0] != team.num_robots or values.shape[1] > MOST_TRAILERS:
-        raise ValueError(
-            f"goal_hitches has shape {values.shape}; expected ({team.num_robots}, trailers), NaN for any and for none"
-        )
-    hitches[:, : values.shape[1]] = values
-    for robot, number in np.argwhere(~np.isnan(hitches)).tolist():
-        value, trailers = hitches[robot, number], team.robot_models[robot].trailers
-        where = f"goal_hitches of robot_{robot} gives {value:g} rad for trailer {number + 1}"
-        if number >= len(trailers):
-            raise ValueError(f"{where}, and a {team.models[robot]} pulls {len(trailers)}; give NaN")
-        if np.isnan(headings[robot]):
-            raise ValueError(f"{where}, and no goal_heading; give both")
-        most = team.limits[robot, dict(team.robot_models[robot].state_limits)[trailers[number][0]]]
-        if not abs(value) <= most:
-            raise ValueError(f"{where}; it must be at most its largest hitch angle, {most:g}, in magnitude")
-    return hitches
+    found = []
+    for what, positions, states in (("start", starts, problem.start), ("goal", problem.goal, states_at_goals(problem))):
+        poses = team.body_poses(states) if team.shapes else None
+        found.append(check_positions(team, problem.world, what, positions, problem.margin, poses))
+    return [text for text in found if text]
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start", max_angle: float = float(MAX_ANGLE)) -> None:
@@ -244,15 +167,16 @@ def check_positions(
 ) -> str:
     """Refuse starts or goals (``what``) at ``positions`` ``(K, d)`` outside the world, or that touch something.
 
-    Where the heading of a body's pose is NaN [rad], as all are by default, the disc within its footprint counts for it;
-    ``poses`` are ``(F, d + 1)``, or without the trailers ``(K, d + 1)``. Returned is what is nearest within the margin,
-    for an error or a warning: the empty string if nothing is.
+    Where the heading of a body's pose is NaN [rad], as all are by default, the disc within its footprint counts for it,
+    and trailers that are nowhere do not count; ``poses`` are ``(F, d + 1)``, or without the trailers ``(K, d + 1)``.
+    Returned is what is nearest within the margin, for an error or a warning: the empty string if nothing is.
     """
     radius, shaped = team.radius.astype(np.float64), bool(team.shapes)
     gaps = world.clearance(positions) - radius
     if poses is None:
         poses = np.column_stack([positions.astype(np.float64), np.full(len(positions), np.nan)])
-    bodies = numbers_by_robot(team.bodies[: len(poses)], team.num_robots) if shaped else []
+    placed = [i for i, pose in enumerate(poses) if not np.isnan(pose[0])]
+    bodies = numbers_by_robot(team.bodies, team.num_robots, placed) if shaped else []
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
         gaps[robot] = min(world_gap(world, team.bodies[i].footprint, poses[i]) for i in bodies[robot])
     for robot in np.flatnonzero(gaps <= 0):

@@ -20,8 +20,8 @@ import numpy as np
 from d4orm_env.core.arrays import Floats, number_list, short_repr
 from d4orm_env.core.errors import did_you_mean, first_line
 from d4orm_env.core.files import naming, read_yaml
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_checks import MOST_TRAILERS
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World

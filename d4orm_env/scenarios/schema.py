@@ -13,9 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import did_you_mean
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_checks import MOST_TRAILERS, Arrival
+from d4orm_env.core.problem_checks import Arrival
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model

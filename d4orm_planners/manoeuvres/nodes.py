@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
-from d4orm_env.core.problem_checks import MOST_TRAILERS
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.engine.compiling import compiled
 from d4orm_planners.manoeuvres.costs import Costs, Heap, push
 from d4orm_planners.manoeuvres.curves import Curves, curve_of, sweep_curve

@@ -17,7 +17,7 @@ import numpy as np
 
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray
-from d4orm_env.core.problem_checks import MOST_TRAILERS
+from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION
 from d4orm_planners.manoeuvres.first_order_car_moves import first_order_car_moves

@@ -9,6 +9,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.bodies import pair_gap, world_gap
+from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_arrays import ProblemArrays
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
@@ -122,13 +123,10 @@ def distance_kept(problem: Problem, bent: BoolArray) -> float:
 
 def _at_goals(problem: Problem) -> FloatArray:
     """``(K, n)`` states in which robots are at their goals, trailers in line unless hitch angles are asked for."""
-    goals = np.zeros_like(problem.start)
-    goals[:, :2] = problem.goal
+    goals = states_at_goals(problem)
     for robot, model in enumerate(problem.team.robot_models):
-        if model.heading_index is not None:
-            goals[robot, model.heading_index] = problem.goal_heading[robot]
-        for (hitch, _), angle in zip(model.trailers, problem.goal_hitches[robot].tolist(), strict=False):
-            goals[robot, hitch] = 0.0 if np.isnan(angle) else angle
+        hitches = [hitch for hitch, _ in model.trailers]
+        goals[robot, hitches] = np.nan_to_num(goals[robot, hitches])
     return goals
 
 

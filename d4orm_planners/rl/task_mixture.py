@@ -12,8 +12,8 @@ import numpy as np
 
 from d4orm_env.core.arrays import BoolArray
 from d4orm_env.core.files import parse_yaml
+from d4orm_env.core.goal_poses import goal_speeds
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.problem_checks import goal_speeds
 from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.scenarios import make_problem
 from d4orm_env.scenarios.problems import find_scenario, unknown_argument

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 import pytest
 
-from d4orm_env import Problem, Team, load_problem, rollout, save_problem, verify
+from d4orm_env import Problem, Team, World, load_problem, rollout, save_problem, verify
+from d4orm_env.footprints import Box, Train
 from d4orm_planners import make_planner
 
 FIRST = 0.3
@@ -100,3 +101,15 @@ def test_the_functional_environment_agrees() -> None:
     for _ in range(2):
         state = functional.step(problem, state, controls)[0]
     assert state.arrived.tolist() == [True, True]
+
+
+@pytest.mark.parametrize("hitches", [None, [[0.0, np.nan]], [[0.7, 0.0]]])
+def test_a_goal_whose_trailers_stand_in_something_is_refused(hitches: Any) -> None:
+    """Where it says how all stand: in line, the second one would be in the box."""
+    team = Team(("car_with_2_trailers",), footprint=Train(Box(0.4, 0.2), [Box(0.3, 0.2)] * 2))
+    back = -team.limits[0, [column for _, column in team.robot_models[0].trailers]].sum()
+    world = World(boxes=[[back - 0.1, -0.2, back + 0.1, 0.2]])
+    poses = {"world": world, "goal_heading": 0.0, "horizon": 3}
+    Problem(team, [[0, 3, 0, 0, 0]], [[0, 0]], goal_hitches=hitches, **poses)
+    with pytest.raises(ValueError, match=r"goal of robot_0 at \(0, 0\) is .* m inside an obstacle"):
+        Problem(team, [[0, 3, 0, 0, 0]], [[0, 0]], goal_hitches=[[0.0, 0.0]], **poses)
