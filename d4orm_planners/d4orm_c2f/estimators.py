@@ -11,7 +11,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners.tracking.steering import present_velocities, track_velocities, weaker
+from d4orm_planners.tracking.steering import by_model, present_velocities, track_velocities, weaker
 
 AT_LIMIT = 0.95
 """Share of its limits from which on a command asks a robot for all that it can do."""
@@ -41,70 +41,81 @@ def shares_of_limits(problem: Problem, controls: FloatArray | Floats) -> Floats:
     return np.divide(controls, limits, out=np.zeros_like(limits), where=limits > 0)
 
 
+def efforts(problem: Problem, controls: FloatArray | Floats) -> Floats:
+    """``(K, m)`` norms of controls ``(K, m)`` in shares of the limits, over the components that one limit bounds."""
+    squares = shares_of_limits(problem, controls) ** 2
+    for model, robots in by_model(problem):
+        for column in set(model.control_limits):
+            together = np.ix_(robots, [i for i, own in enumerate(model.control_limits) if own == column])
+            squares[together] = squares[together].sum(axis=1, keepdims=True)
+    return np.sqrt(squares)
+
+
 def effort(problem: Problem, controls: FloatArray | Floats) -> Floats:
-    """``(K,)`` norms of controls ``(K, m)`` in shares of the robots' limits."""
-    return np.sqrt((shares_of_limits(problem, controls) ** 2).sum(axis=1))
+    """``(K,)`` sizes of controls ``(K, m)``: one at any of the robots' limits."""
+    most: Floats = efforts(problem, controls).max(axis=1)
+    return most
 
 
 class ActuatorGainEstimator:
     """Estimates the limits of robots that never do as much as they are asked to, or are held back.
 
-    What they do at most of what they are asked to is what they are able to. Something that is added to commands for
-    some time, such as a bias, takes away from that against its direction; so much is kept back to make up for it, as
-    tightened limits of control do in robust predictive control (Chisci, Rossiter, Zappa, Systems with persistent
-    disturbances: predictive control with restricted constraints, Automatica 37, 2001). Noise comes to nothing on
-    average: a mean that may be chance is not kept back, and one of noise that lasts may be chance for longer.
+    What they do at most of what they are asked to is what they are able to. A robot that is weak in one of its controls
+    counts as no faster than that. Something that is added to commands for some time, such as a bias, takes away from
+    that against its direction; so much is kept back to make up for it, as tightened limits of control do in robust
+    predictive control (Chisci, Rossiter, Zappa, Systems with persistent disturbances: predictive control with
+    restricted constraints, Automatica 37, 2001). Noise comes to nothing on average: a mean that may be chance is not
+    kept back, and one of noise that lasts may be chance for longer.
 
     Attributes:
-        problem: The robots with the limits of speed, acceleration and turn rate that are believed now.
+        problem: The robots with the limits that are believed now.
         added: ``(K, m)`` what is added to commands for some time; zero where it may be chance.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._first = self.problem = problem
-        self._most, self._share = np.zeros(problem.num_robots), np.ones(problem.num_robots)
-        self._asked = np.zeros(problem.num_robots, int)
-        self._seen, (self._added, self._apart) = 0, np.zeros((2, problem.num_robots, problem.control_size))
+        shape = problem.num_robots, problem.control_size
+        self._most, self._asked = np.zeros(shape), np.zeros(shape, int)
+        self._share = self._control_share = np.ones(shape)
+        self._seen, (self._added, self._apart) = np.zeros(problem.num_robots), np.zeros((2, *shape))
         self._variance, self._covariance = np.zeros((2, problem.num_robots))
-        self.added = np.zeros((problem.num_robots, problem.control_size), np.float32)
+        self.added = np.zeros(shape, np.float32)
 
     def observe(self, commanded: FloatArray, executed: FloatArray, going: BoolArray) -> None:
         """Compare commands ``(K, m)`` with what those ``going`` ``(K,)`` executed of them."""
-        asked = effort(self._first, commanded)
-        most = going & (asked >= AT_LIMIT)
+        asked = efforts(self._first, commanded)
+        most = going[:, None] & (asked >= AT_LIMIT)
         self._asked += most
-        done = effort(self._first, executed) / np.where(most, asked, 1.0)
+        done = efforts(self._first, executed) / np.where(most, asked, 1.0)
         # Also what they do when asked for less: nobody asks a robot for more than it is believed to do.
         self._most[going] = np.maximum(self._most, done)[going]
         weak = (self._asked >= MIN_FULL_COMMANDS) & (self._most < FULL_GAIN)
         share = np.where(weak, self._most, 1.0)
         # A weak robot does that share of everything, or all that it is asked to up to that share of its limits.
         capped = np.where(weak, share / np.maximum(np.maximum(asked, share), 1e-9), 1.0)
-        scaled, cut = (np.asarray(executed, np.float64) - factor[:, None] * commanded for factor in (share, capped))
-        nearer = effort(self._first, cut) < effort(self._first, scaled)
-        added = np.where(nearer[:, None], cut, scaled) * going[:, None]
-        self._seen += 1
-        self.added = self._persistent(added)
-        held_back = GAIN_STEP * np.floor(effort(self._first, self.added) / GAIN_STEP)
-        share = np.maximum(share - held_back, MIN_GAIN)
-        if (share != self._share).any():
-            self._share = share
-            first = self._first
-            self.problem = first.with_state(first.start, first.goal, team=weaker(first.team, share))
+        scaled, cut = (np.asarray(executed, np.float64) - factor * commanded for factor in (share, capped))
+        self._persist(np.where(efforts(self._first, cut) < efforts(self._first, scaled), cut, scaled), going)
+        held_back = GAIN_STEP * np.floor(efforts(self._first, self.added) / GAIN_STEP)
+        share, control_share = (np.maximum(part, MIN_GAIN) for part in (share, share - held_back))
+        if (control_share != self._control_share).any() or (share != self._share).any():
+            self._share, self._control_share = share, control_share
+            team = weaker(self._first.team, share.min(axis=1), control_share)
+            self.problem = self._first.with_state(self._first.start, self._first.goal, team=team)
 
-    def _persistent(self, added: Floats) -> FloatArray:
-        """``(K, m)`` what is added for some time, now that ``added`` ``(K, m)`` is."""
-        rate = max(FORGETTING_RATE, 1 / (PRIOR_STEPS + self._seen))
-        apart = shares_of_limits(self._first, added - self._added)
-        self._variance += rate * ((apart**2).sum(axis=1) - self._variance)
-        self._covariance += rate * ((apart * self._apart).sum(axis=1) - self._covariance)
-        self._apart = apart
-        self._added += rate * (added - self._added)
+    def _persist(self, added: Floats, going: BoolArray) -> None:
+        """Note what is ``added`` ``(K, m)`` now to commands of those ``going`` ``(K,)``."""
+        self._seen += going
+        rate = np.maximum(FORGETTING_RATE, 1 / (PRIOR_STEPS + self._seen))
+        apart, new = shares_of_limits(self._first, added - self._added), rate * going
+        self._variance += new * ((apart**2).sum(axis=1) - self._variance)
+        self._covariance += new * ((apart * self._apart).sum(axis=1) - self._covariance)
+        self._apart[going] = apart[going]
+        self._added += new[:, None] * (added - self._added)
         correlation = (self._covariance / np.maximum(self._variance, NO_VARIANCE)).clip(0, MAX_CORRELATION)
         # Of a mean that forgets exponentially, of values of which each is like the one before by the correlation.
         error = np.sqrt(rate / (2 - rate) * self._variance * (1 + correlation) / (1 - correlation))
         significant = effort(self._first, self._added) > SIGNIFICANCE * error
-        return np.where(significant[:, None], self._added, 0.0).astype(np.float32)
+        self.added = np.where(significant[:, None], self._added, 0.0).astype(np.float32)
 
 
 MAX_LATENCY = 10

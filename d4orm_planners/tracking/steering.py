@@ -16,7 +16,7 @@ from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import STANDARD_LIMITS, Model, ModelFunctions
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, STANDARD_LIMITS, Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.paths.shortest_paths import along_paths
@@ -106,12 +106,21 @@ def advanced(problem: Problem, states: FloatArray, controls: FloatArray) -> Floa
     return _by_rows(problem, problem.state_size, (states, controls), law)
 
 
-def weaker(team: Team, share: ArrayLike) -> Team:
-    """The team with a share, one or ``(K,)``, of its limits of speed, acceleration and turn rate, either way."""
-    factor = np.asarray(share, np.float32)
-    either_way = {model.limit_names[own] for model in team.robot_models for _, own in model.lower_limits}
-    own = {name: limit * factor if name in either_way else limit for name, limit in team.own_limits.items()}
-    return team.replace(own_limits=own, **{name: getattr(team, name) * factor for name in STANDARD_LIMITS})
+def weaker(team: Team, share: ArrayLike, control_share: Floats | None = None) -> Team:
+    """The team with a share, one or ``(K,)``, of its limits of speed, acceleration and turn rate, either way; of those
+    that bound its controls, whatever they are, a share ``(K, m)`` of their own where it is given.
+    """
+    factors, own = np.ones_like(team.limits), {name: values.copy() for name, values in team.own_limits.items()}
+    factors[:, :OWN_LIMITS] = np.reshape(share, (-1, 1))
+    for robot, model in enumerate(team.robot_models):
+        if control_share is not None:
+            factors[robot, list(model.control_limits)] = control_share[robot, : model.control_size]
+        for column, backwards in model.lower_limits:
+            factors[robot, backwards] = factors[robot, column]
+        for column, limit in enumerate(model.own_limits, OWN_LIMITS):
+            own[limit.name][robot] *= factors[robot, column]
+    standard = {name: getattr(team, name) * factors[:, column] for column, name in enumerate(STANDARD_LIMITS)}
+    return team.replace(own_limits=own, **standard)
 
 
 def limit_controls(problem: Problem, controls: FloatArray) -> FloatArray:

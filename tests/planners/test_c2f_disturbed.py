@@ -38,7 +38,7 @@ from d4orm_planners.d4orm_c2f.estimators import (
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.sampling_types import get_sampling_engine
-from d4orm_planners.tracking.steering import NEAR_VIA, drives, track_velocities
+from d4orm_planners.tracking.steering import NEAR_VIA, drives, limit_controls, track_velocities
 
 ALL = np.ones(3, bool)
 
@@ -124,14 +124,45 @@ def test_robots_that_do_less_than_asked_are_believed_to_be_weaker(share: float, 
         np.testing.assert_allclose(believed, share, rtol=1e-5)
 
 
-def test_what_is_added_to_commands_is_kept_back() -> None:
+@pytest.mark.parametrize("lost", [0.0, 0.4])
+def test_what_is_added_to_commands_is_kept_back(lost: float) -> None:
+    """Of what bounds the commands, not of the speed, and as much when some of them get lost."""
     problem, random = hop_problem(3), np.random.default_rng(0)
     actuator_gain = ActuatorGainEstimator(problem)
     for _ in range(60):
         told = random.uniform(-0.5, 0.5, (3, 2)).astype(np.float32)
-        actuator_gain.observe(told, told + np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32), ALL)
+        executed = told + np.array([[0, 0], [0.12, 0], [0, -0.22]], np.float32)
+        actuator_gain.observe(told, executed, random.uniform(size=3) >= lost)
     np.testing.assert_allclose(actuator_gain.problem.team.max_acceleration, [1, 0.9, 0.8], rtol=1e-5)
-    np.testing.assert_allclose(actuator_gain.added, [[0, 0], [0.12, 0], [0, -0.22]], atol=0.005)
+    np.testing.assert_array_equal(actuator_gain.problem.team.max_speed, problem.team.max_speed)
+    np.testing.assert_allclose(actuator_gain.added, [[0, 0], [0.12, 0], [0, -0.22]], atol=0.01)
+
+
+def test_each_control_has_limits_of_its_own() -> None:
+    """A robot that is weak in one of them is believed to be weak in that one, and no faster than it."""
+    team = Team(("unicycle2",), own_limits={"max_reverse_speed": 0.5})
+    problem = Problem(team, [[0, 0, 0, 0, 0]], [[5, 0]])
+    actuator_gain, most = ActuatorGainEstimator(problem), team.control_limits
+    for step in range(20):
+        told = most * np.float32([[1, 0.9 if step % 2 else 0]])
+        actuator_gain.observe(told, told * np.float32([0.6, 1]), np.array([True]))
+    believed = actuator_gain.problem.team
+    assert believed.control_limits[0] == pytest.approx(most[0] * [0.6, 1.0])
+    assert believed.max_speed == pytest.approx(0.6 * team.max_speed)
+    assert believed.own_limits["max_reverse_speed"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", "unicycle", "car"])
+def test_robots_weak_in_all_that_they_do_are_recognised(model: str) -> None:
+    """Also those that are asked for the most of two controls at once, each of which has a limit of its own."""
+    problem, random = make_problem("circle", num_robots=3, model=model), np.random.default_rng(0)
+    actuator_gain, most = ActuatorGainEstimator(problem), problem.team.control_limits
+    for _ in range(30):
+        told = limit_controls(problem, most * random.choice([-1, 1], (3, 2)).astype(np.float32))
+        actuator_gain.observe(told, np.float32(0.8) * told, ALL)
+    believed = actuator_gain.problem.team
+    np.testing.assert_allclose(believed.control_limits, 0.8 * most, rtol=1e-5)
+    np.testing.assert_allclose(believed.max_speed, 0.8 * problem.team.max_speed, rtol=1e-5)
 
 
 def test_commands_make_up_for_what_is_added_to_them() -> None:
