@@ -27,7 +27,15 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
-from d4orm_env.footprints import Box, Disc, Footprint, Train
+from d4orm_env.scenarios.dynobench_types import (
+    DYNAMICS,
+    MODELS,
+    checked_types,
+    footprint_of,
+    limits_of,
+    model_name,
+    symmetric,
+)
 
 DT = 0.1
 """Time step of all their models in the plane [s]."""
@@ -37,45 +45,6 @@ SLOWEST = 10
 """A problem's duration, in times that its robots would need straight to their goals."""
 LEAST_STEPS = 300
 
-_UNICYCLE1: dict[str, Any] = {
-    "dynamics": "unicycle1", "min_vel": -0.5, "max_vel": 0.5, "min_angular_vel": -0.5, "max_angular_vel": 0.5,
-    "shape": "box", "size": (0.5, 0.25), "radius": 0.4,
-}  # fmt: skip
-_INTEGRATOR1: dict[str, Any] = {"dynamics": "integrator1_2d", "max_vel": 0.5, "shape": "sphere", "radius": 0.1}
-_INTEGRATOR2: dict[str, Any] = {
-    "dynamics": "integrator2_2d", "max_vel": 0.5, "max_acc": 2.0, "shape": "sphere", "radius": 0.1,
-}  # fmt: skip
-_UNICYCLE2: dict[str, Any] = _UNICYCLE1 | {"dynamics": "unicycle2", "max_acc_abs": 0.25, "max_angular_acc": 0.25}
-_CAR1: dict[str, Any] = {
-    "dynamics": "car_with_trailers", "num_trailers": 1, "min_vel": -0.1, "max_vel": 0.5, "max_steering_abs": 1.047198,
-    "l": 0.25, "hitch_lengths": (0.5,), "shape": "box", "size": (0.5, 0.25), "size_trailer": (0.3, 0.25),
-}  # fmt: skip
-_SPHERE = _UNICYCLE1 | {"shape": "sphere", "min_angular_vel": -2.0, "max_angular_vel": 2.0}
-
-MODELS: dict[str, dict[str, Any]] = {
-    "unicycle1_v0": _UNICYCLE1,
-    "unicycle1_sphere_v0": _UNICYCLE1 | {"shape": "sphere"},
-    "unicycle_first_order": _UNICYCLE1,
-    "unicycle_first_order_0": _UNICYCLE1,
-    "unicycle_first_order_0_sphere": _SPHERE,
-    "unicycle2_v0": _UNICYCLE2,
-    "unicycle_second_order_0": _UNICYCLE2,
-    "car1_v0": _CAR1,
-    "car_first_order_with_1_trailers_0": _CAR1,
-    "integrator1_2d_v0": _INTEGRATOR1,
-    "single_integrator": _INTEGRATOR1,
-    "single_integrator_0": _INTEGRATOR1,
-    "integrator2_2d_v0": _INTEGRATOR2,
-    "double_integrator_0": _INTEGRATOR2,
-    "integrator2_3d_v0": _INTEGRATOR2 | {"dynamics": "integrator2_3d"},
-}
-"""Robot types and their parameters, as in dynobench's ``models`` and db-CBS's ``robots.cpp``."""
-
-DYNAMICS = {
-    "unicycle1": "unicycle1", "unicycle2": "unicycle2", "integrator1_2d": "velocity2d", "integrator2_2d": "holonomic2d",
-    "integrator2_3d": "holonomic3d", "car_with_trailers": "car_with_1_trailer",
-}  # fmt: skip
-"""Their dynamics and our models."""
 KEYS = ("min", "max", "obstacles")
 """Keys of their environments that are read. One that looks like one of these is an error, all others are left."""
 
@@ -85,7 +54,8 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
 
     Args:
         path: Its YAML file, with ``environment`` and ``robots``.
-        models: Parameters of robot types by name, which add to :data:`MODELS` or replace them; each as in one of
+        models: Parameters of robot types by name, which add to those known
+            (:data:`~d4orm_env.scenarios.dynobench_types.MODELS`) or replace them; each as in one of
             dynobench's model files, such as ``{"dynamics": "integrator2_2d", "max_vel": 0.5, "max_acc": 2.0, "shape":
             "sphere", "radius": 0.1}``.
 
@@ -94,10 +64,11 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
         (``arrival="stay"``), and no margin is asked for.
 
     Raises:
-        ValueError: If the file cannot be read or is no such problem, or a type is unknown; the message names the file,
+        ValueError: If ``models`` are not as they should be; if the file cannot be read or is no such problem, a type is
+            unknown, or a robot must not be at rest at its goal, which is not planned for; the message names the file,
             and all types that are unknown.
     """
-    known = MODELS | {name: dict(given) for name, given in (models or {}).items()}
+    known = MODELS | checked_types({} if models is None else models)
     with naming(path):
         try:
             return _problem(read_yaml(path), known, path)
@@ -115,16 +86,20 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
         if name not in KEYS and (meant := did_you_mean(name, KEYS)):
             raise ValueError(f"environment has the key {short_repr(name)}{meant}")
     types = [robot["type"] for robot in robots]
-    _check_types(types, models)
-    parameters = [_symmetric(models[name]) | models[name] for name in types]
-    names = tuple(map(_model, parameters))
+    if unknown := [name for name in dict.fromkeys(types) if name not in models]:
+        raise ValueError(
+            f"robot types {', '.join(map(short_repr, unknown))} are unknown; known are {', '.join(models)}, or give "
+            f"their parameters as models={{type: {{'dynamics': ...}}}}"
+        )
+    parameters = [symmetric(models[name]) | models[name] for name in types]
+    names = tuple(map(model_name, parameters))
     team = Team(
         names,
         max_speed=[own["max_vel"] for own in parameters],
         max_acceleration=[own.get("max_acc") or own.get("max_acc_abs") or 1.0 for own in parameters],
         max_turn_rate=[own.get("max_angular_vel", 1.0) for own in parameters],
         own_limits=_own_limits(parameters, names),
-        footprint=[_footprint(own) for own in parameters],
+        footprint=[footprint_of(own) for own in parameters],
     )
     start, goal = np.zeros((2, team.num_robots, team.state_size))
     for robot, (entry, model) in enumerate(zip(robots, team.robot_models, strict=True)):
@@ -134,6 +109,11 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
                 given, kind = short_repr(entry[what]), entry["type"]
                 raise ValueError(f"{what} of robot_{robot} is {given}; a {kind} has {model.state_size} components")
             states[robot, : model.state_size] = _state(model, state)
+        end = goal[robot, : model.state_size].tolist()
+        if list(model.functions.rest(tuple(end), 0.0)) != end:
+            raise ValueError(
+                f"goal of robot_{robot} is {short_repr(entry['goal'])}; give one at rest, with zero speeds"
+            )
     turning = np.array([model.heading_index is not None for model in team.robot_models])
     inertia = np.array([not model.first_order for model in team.robot_models])
     d = team.dimension
@@ -147,56 +127,9 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     )  # fmt: skip
 
 
-def _check_types(types: list[Any], models: Mapping[str, dict[str, Any]]) -> None:
-    unknown = [name for name in dict.fromkeys(types) if name not in models]
-    if unknown:
-        raise ValueError(
-            f"robot types {', '.join(map(short_repr, unknown))} are unknown; known are {', '.join(models)}, or give "
-            f"their parameters as models={{type: {{'dynamics': ...}}}}"
-        )
-    for name in dict.fromkeys(types):
-        own = models[name]
-        if own.get("dynamics") not in DYNAMICS:
-            raise ValueError(
-                f"robot type {name}: dynamics {short_repr(own.get('dynamics'))} has no model here; "
-                f"there are {', '.join(DYNAMICS)}"
-            )
-        for limit, value in own.items():
-            if isinstance(value, str) and limit not in ("dynamics", "shape"):
-                raise ValueError(f"robot type {name}: {limit} is {short_repr(value)}; it must be a number")
-        for least in ("min_vel", "min_angular_vel"):
-            if own.get(least, -1.0) >= 0:
-                raise ValueError(f"robot type {name}: {least} is {own[least]:g}; it must be negative, for robots rest")
-
-
-def _symmetric(own: Mapping[str, Any]) -> dict[str, float]:
-    """The lower limits of a type whose parameters give none."""
-    return {f"min_{name}": -own[f"max_{name}"] for name in ("vel", "angular_vel") if f"max_{name}" in own}
-
-
-def _model(own: Mapping[str, Any]) -> str:
-    """The name of our model; the unicycle has limits for both directions only where they are not symmetric."""
-    name = DYNAMICS[own["dynamics"]]
-    if name == "car_with_1_trailer" and own["num_trailers"] > 1:
-        return f"car_with_{own['num_trailers']}_trailers"
-    return "unicycle" if name == "unicycle1" and own.items() >= _symmetric(own).items() else name
-
-
-def _limits_of(own: Mapping[str, Any]) -> dict[str, float]:
-    """Limits that only one of our models has, from a type's parameters."""
-    names = {"max_angular_acc": "max_turn_acceleration", "max_steering_abs": "max_steering", "l": "wheelbase"}
-    limits = {ours: float(own[theirs]) for theirs, ours in names.items() if theirs in own}
-    lower = {"min_vel": "max_reverse_speed", "min_angular_vel": "max_right_turn_rate"}
-    limits |= {ours: -float(own[theirs]) for theirs, ours in lower.items() if theirs in own}
-    for number, length in enumerate(own.get("hitch_lengths", ()), 1):
-        limits[f"hitch_length_{number}"] = float(length)
-        limits[f"max_hitch_angle_{number}"] = float(own.get("diff_max_abs", math.pi / 4))
-    return limits
-
-
 def _own_limits(parameters: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[float]]:
     """``(K,)`` values by name; one where a robot has no such limit."""
-    known, given = [{limit.name for limit in get_model(name).own_limits} for name in names], map(_limits_of, parameters)
+    known, given = [{limit.name for limit in get_model(name).own_limits} for name in names], map(limits_of, parameters)
     own = [{name: limits[name] for name in has} for has, limits in zip(known, given, strict=True)]
     return {name: [limits.get(name, 1.0) for limits in own] for name in dict.fromkeys(chain(*own))}
 
@@ -217,13 +150,6 @@ def _hitches(team: Team, states: Floats) -> Floats:
         for number, (hitch, _) in enumerate(model.trailers):
             hitches[robot, number] = states[robot, hitch]
     return hitches
-
-
-def _footprint(own: Mapping[str, Any]) -> Footprint:
-    footprint: Disc | Box = Disc(own["radius"]) if own["shape"] == "sphere" else Box(*own["size"][:2])
-    if own["dynamics"] != "car_with_trailers":
-        return footprint
-    return Train(footprint, [Box(*own["size_trailer"][:2])] * own["num_trailers"])
 
 
 def _world(environment: Mapping[str, Any], team: Team, goal: Floats) -> World:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import yaml
 
 from d4orm_env import load_dynobench, load_problem, verify
 from d4orm_env.footprints import Box, Disc
+from d4orm_env.scenarios.dynobench_types import MODELS, checked_types
 from d4orm_planners import make_planner
 
 INSTANCE = """
@@ -131,8 +133,52 @@ def test_limits_that_are_not_symmetric_are_taken(instance: Path) -> None:
     team = load_dynobench(instance, models={"unicycle1_v0": slow | shape}).team
     assert team.models == ("unicycle", "unicycle1", "holonomic2d")
     np.testing.assert_allclose(team.control_bounds[:, 1], np.float32([[-0.1, -0.25], [0.5, 0.5]]))
-    with pytest.raises(ValueError, match=r"robot type unicycle1_v0: min_vel is 0\.25; it must be negative"):
-        load_dynobench(instance, models={"unicycle1_v0": slow | shape | {"min_vel": 0.25}})
+
+
+CAR = {
+    "dynamics": "car_with_trailers", "max_vel": 0.5, "max_steering_abs": 1.0, "l": 0.25, "num_trailers": 1,
+    "hitch_lengths": [0.5], "shape": "box", "size": [0.5, 0.25], "size_trailer": [0.3, 0.25],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("models", "message"),
+    [
+        (["mine"], "models is ['mine']; give parameters by type"),
+        ({"mine": "unicycle1"}, "robot type mine is 'unicycle1'; give its parameters"),
+        ({"mine": {}}, "robot type mine: dynamics None has no model here; there are unicycle1, unicycle2"),
+        ({"mine": CAR | {"dynamics": "boat"}}, "robot type mine: dynamics 'boat' has no model here"),
+        ({"mine": CAR | {"shape": "blob"}}, "robot type mine: shape is 'blob'; it must be one of sphere, box"),
+        ({"mine": CAR | {"shape": "sphere"}}, "robot type mine: radius is missing, which car_with_trailers in the"),
+        ({"mine": CAR | {"max_val": 1}}, "robot type mine has the parameter 'max_val'"),
+        ({"mine": {"dynamics": "unicycle2", "max_vel": 1, "shape": "sphere"}}, "mine: max_angular_vel is missing"),
+        ({"mine": CAR | {"max_vel": "fast"}}, "robot type mine: max_vel must be a number, not 'fast'"),
+        ({"mine": CAR | {"l": 0}}, "robot type mine: l is 0; it must be positive and finite"),
+        ({"mine": CAR | {"min_vel": 0.25}}, "robot type mine: min_vel is 0.25; it must be negative"),
+        ({"mine": CAR | {"min_vel": None}}, "robot type mine: min_vel is None; it must be negative"),
+        ({"mine": CAR | {"size": 0.5}}, "robot type mine: size is 0.5; it must have numbers, 2 of them"),
+        ({"mine": CAR | {"num_trailers": 0}}, "robot type mine: num_trailers is 0; it must be at least 1"),
+        ({"mine": CAR | {"num_trailers": 2}}, "robot type mine: hitch_lengths has 1 entries for 2 trailers"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_told(instance: Path, models: Any, message: str) -> None:
+    """In their own words, and not as a fault of the file."""
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}|^robot type {re.escape(message)}"):
+        load_dynobench(instance, models=models)
+    load_dynobench(instance, models={"mine": CAR | {"distance_weights": [1, 0.5]}})
+
+
+def test_all_types_that_are_known_have_what_they_need() -> None:
+    assert checked_types(MODELS) == MODELS
+
+
+@pytest.mark.parametrize("goal", ["[4, 2.5, 0, 0.25, 0]", "[4, 2.5, 0, 0, 0.1]"])
+def test_goals_in_motion_are_refused(tmp_path: Path, goal: str) -> None:
+    path = tmp_path / "one.yaml"
+    robots = f"robots: [{{type: unicycle_second_order_0, start: [1, 2.5, 0, 0, 0], goal: {goal}}}]\n"
+    path.write_text("environment: {min: [0, 0], max: [5, 5]}\n" + robots)
+    with pytest.raises(ValueError, match=rf"goal of robot_0 is {re.escape(goal)}; give one at rest"):
+        load_dynobench(path)
 
 
 def test_a_unicycle_of_second_order_is_read(tmp_path: Path) -> None:
