@@ -27,6 +27,7 @@ from d4orm_env.verify.report import VerificationReport, Violation
 
 if TYPE_CHECKING:
     from d4orm_env.core.problem import Problem
+    from d4orm_env.core.team import Team
 
 __all__ = ["VerificationReport", "Violation", "verify"]
 
@@ -75,10 +76,10 @@ def verify(problem: Problem, controls: ArrayLike) -> VerificationReport:
     if sub_steps.max() > MAX_SUB_STEPS:
         return _left_out(problem, list(_too_violent(sub_steps, motion, problem)))
     course = _Course(motion, max(MIN_SUB_STEPS, int(sub_steps.max())), problem)
-    return _report(problem, motion, course)
+    return _report(problem, array, motion, course)
 
 
-def _report(problem: Problem, motion: TeamMotion, course: _Course) -> VerificationReport:
+def _report(problem: Problem, controls: Floats, motion: TeamMotion, course: _Course) -> VerificationReport:
     docking = find_docking(problem, motion, course.ends)
     robot, body = course.bodies(docking)
     shapes = course.shapes.take(body) if course.shapes is not None else None
@@ -90,7 +91,7 @@ def _report(problem: Problem, motion: TeamMotion, course: _Course) -> Verificati
             watch.observe(stretch)
     contacts = (violation for watch in watches for violation in watch.violations())
     violations = [
-        *_control_limits(motion, docking.last_steps),
+        *_control_limits(motion, docking.last_steps, controls, problem.team),
         *(replace(one, detail=one.detail + docking.notes(one.robots, problem.dt)) for one in contacts),
         *docking.violations,
     ]
@@ -233,16 +234,20 @@ def _too_violent(sub_steps: Floats, motion: TeamMotion, problem: Problem) -> Ite
         yield Violation("not judged", (int(robot),), step * problem.dt, detail)
 
 
-def _control_limits(motion: TeamMotion, docked_after: NDArray[np.intp]) -> Iterator[Violation]:
+def _control_limits(
+    motion: TeamMotion, docked_after: NDArray[np.intp], controls: Floats, team: Team
+) -> Iterator[Violation]:
     """Controls above a limit before docking, one entry for each robot and limit."""
-    sizes, limits = motion.sizes, motion.limits
-    before_docking = np.arange(len(sizes))[:, None] < docked_after
-    over = (sizes > limits * (1 + LIMIT_TOLERANCE)) & before_docking[..., None]
+    excess = motion.sizes - motion.limits
+    before_docking = np.arange(len(excess))[:, None] < docked_after
+    over = (excess > motion.limits * LIMIT_TOLERANCE) & before_docking[..., None]
     for robot, column in np.argwhere(over.any(axis=0)):
         steps = np.flatnonzero(over[:, robot, column])
-        values = sizes[steps, robot, column]
+        least, most = team.control_bounds[:, robot, column].astype(np.float64)
+        limits = np.where(controls[steps, robot, column] < 0, -least, most)
+        values = limits + excess[steps, robot, column]
         detail = (
             f"{motion.limited_quantity(robot, column)} of the control is {values[0]:.7g} at step {steps[0]}, "
-            f"limit {limits[robot, column]:.7g}; {len(steps)} steps over it, at most {values.max():.7g}"
+            f"limit {limits[0]:.7g}; {len(steps)} steps over it, at most {values.max():.7g}"
         )
         yield Violation("control limit", (int(robot),), float(steps[0] * motion.dt), detail)

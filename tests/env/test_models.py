@@ -310,6 +310,15 @@ def test_the_judge_names_the_control_of_a_car_that_exceeds_its_limit() -> None:
     assert "steering_rate of the control is 1.25 at step 5, limit 1;" in violation.detail
 
 
+@pytest.mark.parametrize(("speed", "beyond"), [(-0.5, "0.5 at step 0, limit 0.3"), (1.25, "1.25 at step 0, limit 1")])
+def test_the_judge_names_the_limit_of_each_direction(speed: float, beyond: str) -> None:
+    team = Team(("unicycle1",), own_limits={"max_reverse_speed": 0.3})
+    problem = Problem(team, [[0, 0, 0]], [[9, 0]], horizon=3)
+    report = verify(problem, np.array([[[speed, 0]], [[0, 0]], [[speed, 0]]]))
+    (violation,) = (violation for violation in report.violations if violation.kind == "control limit")
+    assert f"speed of the control is {beyond}; 2 steps over it" in violation.detail
+
+
 # Limits of a model's own.
 
 
