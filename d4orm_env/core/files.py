@@ -26,9 +26,9 @@ def checked_path(path: object, what: str) -> Path:
     """Return the path of ``what``.
 
     Raises:
-        ValueError: If it is neither text nor a path.
+        ValueError: If it is neither text nor a path, or empty.
     """
-    if not isinstance(path, (str, os.PathLike)):
+    if not isinstance(path, (str, os.PathLike)) or path == "":
         raise ValueError(f"the path of {what} must be text or a path, not {path!r}")
     return Path(path)
 

@@ -175,7 +175,7 @@ class Controller:
         Called more often than once every ``problem.dt`` it returns the same one again.
 
         Args:
-            states: ``(K, n)`` measured states; NaN where there is none.
+            states: ``(K, n)`` measured states; a robot with a NaN counts as not measured.
             time: Of the measurement [s].
 
         Raises:
