@@ -1,9 +1,10 @@
 """Smooth motions through a plan: splines of class C4 within limits on speed, acceleration and jerk, verified again.
 
 A plan's accelerations jump at every step, which no robot follows. Its positions are fitted by quintic P-splines (P. H.
-C. Eilers and B. D. Marx, Statistical Science, 1996), which begin and end without acceleration. Where they exceed a
-limit the whole team drives more slowly, which changes no path and no encounter. Smoother curves may be driven faster,
-but deviate more from the plan: of several, the quickest is taken that is free of collisions.
+C. Eilers and B. D. Marx, Statistical Science, 1996), which begin and end without acceleration; those of robots on
+wheels by curves along which they roll (:mod:`~d4orm_planners.tracking.rolling_curves`). Where they exceed a limit the
+whole team drives more slowly, which changes no path and no encounter. Smoother curves may be driven faster, but deviate
+more from the plan: of several, the quickest is taken that is free of collisions.
 """
 
 from __future__ import annotations
@@ -15,8 +16,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
-from scipy.sparse import diags_array
-from scipy.sparse.linalg import splu
 
 from d4orm_env.core.arrays import Floats
 from d4orm_env.core.problem import Problem
@@ -24,9 +23,10 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
 from d4orm_env.verify import VerificationReport
 from d4orm_env.verify.curves import verify_curves
+from d4orm_planners.tracking.rolling_curves import finer, groups_on_wheels, on_wheels, roll
+from d4orm_planners.tracking.splines import fit_spline
 from d4orm_planners.tracking.steering import present_velocities
 
-DEGREE = 5
 SMOOTHNESS = (1e-2, 1e-1, 1.0, 1e1, 1e2)
 """Weights of the squared third differences of a curve's coefficients, against the squared distances from the plan."""
 GATHERING, SETTLING = 2, 5
@@ -49,6 +49,7 @@ class MotionLimits:
     right_turn_rate: Floats  #: [rad/s]
     acceleration: Floats  #: [m/s^2]; of robots with a heading along it
     turn_acceleration: Floats  #: [rad/s^2]
+    steering_rate: Floats  #: [rad/s]; of robots with a wheelbase
     jerk: Floats  #: [m/s^3]
 
     @classmethod
@@ -68,7 +69,8 @@ class MotionLimits:
             rows.append([
                 limits[SPEED], np.inf if model.heading_index is None else lower[SPEED], left, right,
                 np.inf if model.first_order else limits[ACCELERATION],
-                own.get("max_turn_acceleration", np.inf), own.get("max_jerk", np.inf),
+                own.get("max_turn_acceleration", np.inf), own.get("max_steering_rate", np.inf),
+                own.get("max_jerk", np.inf),
             ])  # fmt: skip
         columns = dict(zip(LIMITS, np.array(rows, np.float64).T, strict=True))
         for name, given in (("acceleration", acceleration), ("jerk", jerk)):
@@ -78,7 +80,8 @@ class MotionLimits:
 
 LIMITS = {
     "speed": ("m/s", 1), "reverse_speed": ("m/s", 1), "turn_rate": ("rad/s", 1), "right_turn_rate": ("rad/s", 1),
-    "acceleration": ("m/s^2", 2), "turn_acceleration": ("rad/s^2", 2), "jerk": ("m/s^3", 3),
+    "acceleration": ("m/s^2", 2), "turn_acceleration": ("rad/s^2", 2), "steering_rate": ("rad/s", 1),
+    "jerk": ("m/s^3", 3),
 }  # fmt: skip
 """Units of the limits, and by which power of its duration a slower motion has less of each."""
 
@@ -102,6 +105,7 @@ class SmoothMotion:
     problem: Problem  #: The team and its world
     curves: BSpline  #: Of :meth:`position`, ``(K, d)`` by the plan's time [m]
     headings: BSpline  #: ``(K,)`` by the plan's time [rad]; zero for robots without one
+    curvatures: BSpline  #: ``(K,)`` by the plan's time [1/m], steered at rest too; zero for robots that do not steer
     deviation: float  #: Largest distance from the plan at its steps [m]
     stretch: float = 1.0  #: Times the plan's duration that it takes, at least 1
 
@@ -132,6 +136,8 @@ class SmoothMotion:
         ahead, faster = (
             part[..., 0] * np.cos(heading) + part[..., 1] * np.sin(heading) for part in (velocity, acceleration)
         )
+        curvature, change = (self._values(self.curvatures, times, order) for order in (0, 1))
+        wheelbase = self.problem.team.own_limits.get("wheelbase", 0.0)
         has_heading = np.array([model.heading_index is not None for model in self.problem.team.robot_models])
         return MotionLimits(
             speed=np.linalg.norm(velocity, axis=2).max(axis=0),
@@ -140,6 +146,7 @@ class SmoothMotion:
             right_turn_rate=(-rate).max(axis=0),
             acceleration=np.where(has_heading, np.abs(faster), np.linalg.norm(acceleration, axis=2)).max(axis=0),
             turn_acceleration=np.abs(self.heading(times, 2)).max(axis=0),
+            steering_rate=np.abs(change * wheelbase / (1 + (curvature * wheelbase) ** 2)).max(axis=0),
             jerk=np.linalg.norm(jerk, axis=2).max(axis=0),
         )
 
@@ -246,7 +253,7 @@ def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> Smoo
     poses = np.concatenate([trajectory.positions, problem.team.headings(trajectory.states)[..., None]], axis=2)
     moving = np.any(poses[1:] != poses[:-1], axis=(1, 2))
     last = int(np.flatnonzero(moving).max(initial=0)) + 1 + SETTLING
-    velocity, no_turn = _initial_velocity(problem), np.zeros(problem.num_robots)
+    velocity = _initial_velocity(problem)
     first = 0 if velocity.any() else -GATHERING
     rows = np.clip(np.arange(first, last + 1), 0, len(trajectory.positions) - 1)
     headings = np.zeros((len(rows), problem.num_robots))
@@ -255,29 +262,15 @@ def _fitted(problem: Problem, trajectory: Trajectory, smoothness: float) -> Smoo
             headings[:, robot] = np.unwrap(trajectory.states[rows, robot, model.heading_index].astype(np.float64))
     positions = trajectory.positions[rows].astype(np.float64)
     curves = fit_spline(positions, velocity, problem.dt, smoothness)
+    turns = fit_spline(headings, np.zeros(problem.num_robots), problem.dt, smoothness)
+    curvatures = BSpline(turns.t, 0 * turns.c, turns.k)
+    if groups := groups_on_wheels(problem):
+        poses = np.concatenate([positions, headings[..., None]], axis=2)
+        curves, turns = (finer(spline, len(rows) - 1) for spline in (curves, turns))
+        for group in groups:
+            rolled, steered = roll(on_wheels(problem, group, poses, velocity), problem.dt, smoothness)
+            curves.c[:, group], turns.c[:, group] = rolled.c[..., :2], rolled.c[..., 2]
+            curvatures.c[:, group] = steered.c
     offset = curves(np.linspace(0, (last - first) * problem.dt, len(rows))) - positions
     deviation = float(np.linalg.norm(offset, axis=2).max())
-    return SmoothMotion(problem, curves, fit_spline(headings, no_turn, problem.dt, smoothness), deviation)
-
-
-def fit_spline(values: Floats, velocity: Floats, dt: float, smoothness: float) -> BSpline:
-    """A quintic P-spline near ``values`` ``(N+1, ...)``, one every ``dt``, from a velocity to rest.
-
-    It begins and ends at the first and the last of them without acceleration.
-    """
-    steps, shape = len(values) - 1, values.shape[1:]
-    knots = np.concatenate([np.zeros(DEGREE), np.linspace(0, steps * dt, steps + 1), np.full(DEGREE, steps * dt)])
-    count = steps + DEGREE
-    coefficients = np.zeros((count, int(np.prod(shape))))
-    first, rows = values[0].ravel(), values.reshape(len(values), -1)
-    coefficients[0], coefficients[1] = first, first + velocity.ravel() * dt / DEGREE
-    coefficients[2] = 3 * coefficients[1] - 2 * first
-    coefficients[-4:] = rows[-1]
-    basis = BSpline.design_matrix(np.linspace(0, steps * dt, steps + 1), knots, DEGREE).tocsc()
-    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count)).tocsc()
-    matrix = (basis.T @ basis + smoothness * (differences.T @ differences)).tocsc()
-    free = np.arange(3, count - 4)
-    fixed = np.setdiff1d(np.arange(count), free)
-    target = (basis.T @ rows)[free] - matrix[free][:, fixed] @ coefficients[fixed]
-    coefficients[free] = splu(matrix[free][:, free].tocsc()).solve(target)
-    return BSpline(knots, coefficients.reshape(count, *shape), DEGREE)
+    return SmoothMotion(problem, curves, turns, curvatures, deviation)

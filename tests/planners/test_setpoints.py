@@ -22,7 +22,8 @@ from d4orm_planners.base.candidate import evaluate_controls
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.export import FORMATS, MOST_PIECES
-from d4orm_planners.tracking.smoothing import MotionLimits, fit_spline, smooth_motion
+from d4orm_planners.tracking.smoothing import MotionLimits, smooth_motion
+from d4orm_planners.tracking.splines import fit_spline
 
 CASES: dict[str, dict[str, Any]] = {
     "plane": {"scenario": "circle", "num_robots": 5},

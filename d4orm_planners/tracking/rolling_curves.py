@@ -1,0 +1,294 @@
+"""Smooth curves of robots on wheels, which roll along their headings and never slip sideways.
+
+A robot's way along its heading is a quintic spline of time. So is the heading, or, where a robot does not turn on the
+spot, the curvature of its way. What they lead to is fitted to a plan with the motion within each step as an equality
+constraint (direct collocation: J. T. Betts, Practical Methods for Optimal Control and Estimation Using Nonlinear
+Programming, 2010, chapter 4), by sequential quadratic programming.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.sparse import block_array, block_diag, csc_array, diags_array, eye_array, kron
+from scipy.sparse.linalg import splu
+
+from d4orm_env.core.arrays import Floats, IntArray
+from d4orm_env.core.problem import Problem
+from d4orm_env.dynamics.robot_model import PYTHON_OPS, Model
+from d4orm_planners.tracking.splines import DEGREE, through
+
+NODES = 3
+"""Points of Gauss and Legendre's quadrature in a step."""
+MAX_ITERATIONS = 30
+FRESH = 2
+"""Iterations whose slopes are found anew; later ones go on with these as long as no coefficients are newly held."""
+SETTLED = 1e-5
+"""Largest change of a pose in the last iteration, as a share of the radius."""
+END_WEIGHT = 1e6
+"""Weight of the squared distance from the plan at the end, against that at any other step."""
+STEERING_WEIGHT = 0.1
+"""Weight of the squared distance from the plan's curvature, as a share of the largest, times the radius."""
+BOUND_WEIGHT = 1e9
+"""Weight of coefficients that are held at the largest curvature."""
+WITHIN = 1 - 1e-3
+"""Share of the largest curvature that is used."""
+STANDING = 1e-3
+"""Way in a step below which a robot counts as standing, in radii."""
+FINER = 8
+"""Knots in a step of the splines that poses become."""
+
+
+class Wheeled(NamedTuple):
+    """``R`` robots on wheels, which all turn on the spot or all do not."""
+
+    poses: Floats  #: ``(R, N+1, 3)`` the plan's positions [m] and headings [rad]
+    speed: Floats  #: ``(R,)`` along their headings at the start [m/s]
+    radius: Floats  #: ``(R,)`` [m]
+    curvature: Floats  #: ``(R,)`` largest that they steer [1/m]; infinite where they turn on the spot
+
+    @property
+    def steers(self) -> bool:
+        """True if they do not turn on the spot."""
+        return bool(np.isfinite(self.curvature[0]))
+
+
+def groups_on_wheels(problem: Problem) -> list[list[int]]:
+    """The robots that roll along their headings: those that turn on the spot, and those that do not."""
+    groups: dict[bool, list[int]] = {}
+    for robot, model in enumerate(problem.team.robot_models):
+        if _rolls(model):
+            groups.setdefault(model.turns_in_place, []).append(robot)
+    return list(groups.values())
+
+
+def _rolls(model: Model) -> bool:
+    """Return True if the model has a heading, and no velocity across it."""
+    if model.heading_index is None:
+        return False
+    state, heading = [0.5] * model.state_size, 0.3
+    state[model.heading_index] = heading
+    controls, limits = [0.4, 0.3, 0.2][: model.control_size], [1.0] * len(model.limit_names)
+    x, y = model.functions.velocity(state, controls, limits, PYTHON_OPS)
+    return abs(y * math.cos(heading) - x * math.sin(heading)) < SETTLED
+
+
+def on_wheels(problem: Problem, robots: list[int], poses: Floats, velocity: Floats) -> Wheeled:
+    """Some robots of a team, from poses ``(N+1, K, 3)`` and velocities at the start ``(K, 2)`` [m/s]."""
+    team, heading = problem.team, poses[0, robots, 2]
+    speed = velocity[robots, 0] * np.cos(heading) + velocity[robots, 1] * np.sin(heading)
+    turning_radius = team.turning_radius[robots].astype(np.float64)
+    curvature = np.divide(1, turning_radius, out=np.full(len(robots), np.inf), where=turning_radius > 0)
+    return Wheeled(np.moveaxis(poses[:, robots], 1, 0), speed, team.radius[robots].astype(np.float64), curvature)
+
+
+def finer(spline: BSpline, steps: int) -> BSpline:
+    """The same spline over so many steps, from its velocity to rest, with as many knots as those that roll have."""
+    times = np.linspace(0, spline.t[-1], steps * FINER + 1)
+    return through(times, spline(times), spline(0.0, 1), spline(0.0, 2))
+
+
+def _quadrature(step: float) -> tuple[Floats, Floats, Floats]:
+    """Points ``(G,)`` in a step, weights ``(G,)`` of an integral over it, and ``(G, G)`` of those until each point."""
+    points, weights = np.polynomial.legendre.leggauss(NODES)
+    points, orders = (points + 1) * step / 2, np.arange(NODES)
+    powers = points[:, None] ** orders
+    return points, weights * step / 2, points[:, None] * powers / (orders + 1) @ np.linalg.inv(powers)
+
+
+class Steps:
+    """Quintic splines over ``N`` steps, of ``C`` coefficients for each of ``R`` robots, and integrals of them."""
+
+    def __init__(self, steps: int, dt: float, robots: int) -> None:
+        self.steps, self.dt, self.size, each = steps, dt, steps + DEGREE, eye_array(robots)
+        self.times = np.linspace(0, steps * dt, steps + 1)
+        self.knots = np.concatenate([np.zeros(DEGREE), self.times, np.full(DEGREE, self.times[-1])])
+        points, weights, until = _quadrature(dt)
+        times = (self.times[:-1, None] + points).ravel()
+        third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(self.size - 3, self.size))
+        change = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(steps, steps + 1))
+        #: ``(R N G, R C)`` values and derivatives at the quadrature's points
+        self.value, self.slope = (csc_array(kron(each, part)) for part in (self._values(times), self._slopes(times)))
+        #: ``(R (N+1), R C)`` values at all steps, and ``(R C, R C)`` the form of squared third differences
+        self.at_steps = csc_array(kron(each, self._values(self.times)))
+        self.roughness = csc_array(kron(each, third.T @ third))
+        #: ``(R N, R N G)`` integrals over each step, and ``(R N G, R N G)`` from its beginning until each point
+        self.over = csc_array(kron(eye_array(robots * steps), weights[None]))
+        self.until = csc_array(kron(eye_array(robots * steps), until))
+        #: ``(R N G, R (N+1))`` what there is at the beginning of its step, and ``(R N, R (N+1))`` changes within each
+        self.begin = csc_array(kron(each, kron(eye_array(steps, steps + 1), np.ones((NODES, 1)))))
+        self.change = csc_array(kron(each, change))
+
+    def _values(self, times: Floats) -> csc_array:
+        return csc_array(BSpline.design_matrix(times, self.knots, DEGREE))
+
+    def _slopes(self, times: Floats) -> csc_array:
+        width = self.knots[DEGREE + 1 : DEGREE + self.size] - self.knots[1 : self.size]
+        differences = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(self.size - 1, self.size))
+        lower = BSpline.design_matrix(times, self.knots[1:-1], DEGREE - 1)
+        return csc_array(lower @ diags_array(DEGREE / width) @ differences)
+
+
+def roll(robots: Wheeled, dt: float, smoothness: float) -> tuple[BSpline, BSpline]:
+    """Splines of their positions [m] and headings [rad], ``(R, 3)``, from their speed to rest, and curvatures ``(R,)``.
+
+    The curvatures [1/m] are those steered, also at rest; zero for robots that turn on the spot.
+
+    Args:
+        robots: What is fitted, one pose every ``dt``.
+        dt: [s].
+        smoothness: Weight of squared third differences of coefficients, of ways, and of turns times the radius.
+    """
+    count = len(robots.poses)
+    grid = Steps(robots.poses.shape[1] - 1, dt, count)
+    (quadratic, linear), (expand, offset) = _objective(grid, robots, smoothness), _free(grid, robots)
+    values, held, bounds = _guess(grid, robots, smoothness), np.zeros(len(linear)), np.zeros(len(linear))
+    turns, most = slice(grid.size * count, 2 * grid.size * count), np.repeat(WITHIN * robots.curvature, grid.size)
+    order, fresh = _by_time(grid, count, expand), FRESH
+    back = np.argsort(order)[: expand.shape[1]]
+    for number in range(MAX_ITERATIONS):
+        form, (missed, slopes) = quadratic + diags_array(held), _constraints(grid, robots, values)
+        if number < fresh:
+            used, free = slopes, slopes @ expand
+            system = csc_array(block_array([[expand.T @ form @ expand, free.T], [free, None]]))
+            solver = splu(system[order][:, order], permc_spec="NATURAL")
+        sides = expand.T @ (linear + held * bounds - form @ offset), used @ (values - offset) - missed
+        found = offset + expand @ solver.solve(np.concatenate(sides)[order])[back]
+        change, values = np.abs(found - values)[turns.stop :].max(), found
+        before, beyond = held, np.abs(values[turns]) > most
+        held, bounds[turns] = np.zeros(len(linear)), np.where(beyond, np.copysign(most, values[turns]), 0)
+        held[turns][beyond] = BOUND_WEIGHT
+        if (held != before).any():
+            fresh = number + 2
+        elif change < SETTLED * robots.radius.min():
+            break
+    values[turns] = values[turns].clip(-most, most)
+    ways, turning = (part.reshape(count, grid.size).T for part in (values[: turns.start], values[turns]))
+    way, turn = BSpline(grid.knots, ways, DEGREE), BSpline(grid.knots, turning, DEGREE)
+    return _poses(grid, robots, way, turn), BSpline(grid.knots, turning * robots.steers, DEGREE)
+
+
+def _objective(grid: Steps, robots: Wheeled, smoothness: float) -> tuple[csc_array, Floats]:
+    """Roughness and the squared distance from the plan: ``values @ quadratic @ values - 2 * linear @ values``."""
+    weights, count = np.ones(robots.poses.shape[:2]), len(grid.times)
+    weights[:, -1] = END_WEIGHT
+    turned, near = weights * robots.radius[:, None] ** 2, diags_array(weights.ravel())
+    scale = robots.radius / robots.curvature if robots.steers else robots.radius
+    turn, wanted = (
+        smoothness * diags_array(np.repeat(scale**2, grid.size)) @ grid.roughness,
+        np.zeros(len(scale) * grid.size),
+    )
+    if robots.steers:
+        data = diags_array(np.repeat(STEERING_WEIGHT * scale**2, count)) @ grid.at_steps
+        turn, wanted = turn + grid.at_steps.T @ data, data.T @ _curvatures(robots).ravel()
+    x, y, heading = np.moveaxis(robots.poses, 2, 0)
+    linear = np.zeros(len(wanted)), wanted, *(part.ravel() for part in (weights * x, weights * y, turned * heading))
+    forms = smoothness * grid.roughness, turn, near, near, diags_array(turned.ravel())
+    return csc_array(block_diag(forms)), np.concatenate(linear)
+
+
+def _ways(robots: Wheeled) -> Floats:
+    """``(R, N+1)`` ways along headings until each step, but for what chords are shorter [m]."""
+    middle, moved = (robots.poses[:, 1:, 2] + robots.poses[:, :-1, 2]) / 2, np.diff(robots.poses[..., :2], axis=1)
+    ways = np.cumsum(moved[..., 0] * np.cos(middle) + moved[..., 1] * np.sin(middle), axis=1)
+    return np.pad(ways, ((0, 0), (1, 0)))
+
+
+def _curvatures(robots: Wheeled) -> Floats:
+    """``(R, N+1)`` curvatures of the plan from each step on [1/m]; while a robot stands, from the last to the next."""
+    moved, turned = np.diff(_ways(robots), axis=1), np.diff(robots.poses[..., 2], axis=1)
+    curvatures, steps = np.zeros(robots.poses.shape[:2]), np.arange(robots.poses.shape[1])
+    for robot, most in enumerate(robots.curvature):
+        moving = np.flatnonzero(np.abs(moved[robot]) > STANDING * robots.radius[robot])
+        if len(moving):
+            known = turned[robot, moving] / moved[robot, moving]
+            curvatures[robot] = np.interp(steps, moving, known.clip(-most, most))
+    return curvatures
+
+
+def _guess(grid: Steps, robots: Wheeled, smoothness: float) -> Floats:
+    """Values near those that are sought, which need not keep to the constraints."""
+    turns = _curvatures(robots) if robots.steers else robots.poses[..., 2]
+    smooth = splu(csc_array(grid.at_steps.T @ grid.at_steps + smoothness * grid.roughness))
+    coefficients = [smooth.solve(grid.at_steps.T @ rows.ravel()) for rows in (_ways(robots), turns)]
+    return np.concatenate([*coefficients, *(part.ravel() for part in np.moveaxis(robots.poses, 2, 0))])
+
+
+def _free(grid: Steps, robots: Wheeled) -> tuple[csc_array, Floats]:
+    """What free variables add to the values, and the values without them: what the ends of curves fix."""
+    robot, count, size = np.arange(len(robots.poses)), len(grid.times), grid.size
+    ways, turns = robot[:, None] * size, (len(robot) + robot[:, None]) * size
+    offset = np.zeros(len(robot) * (2 * size + 3 * count))
+    fixed, source = np.zeros(len(offset), bool), np.arange(len(offset))
+    fixed[ways + np.arange(3)] = True
+    offset[ways + np.arange(3)] = robots.speed[:, None] * grid.dt / DEGREE * np.array([0, 1, 3])
+    # At rest at the end, wherever that is.
+    source[ways + size - np.arange(1, 4)] = ways + size - 4
+    if not robots.steers:
+        for ends, step in ((np.arange(3), 0), (np.arange(size - 4, size), -1)):
+            fixed[turns + ends], offset[turns + ends] = True, robots.poses[:, step, 2, None]
+    begin = len(robot) * (2 * size + np.arange(3) * count) + robot[:, None] * count
+    fixed[begin], offset[begin] = True, robots.poses[:, 0]
+    number = np.cumsum(~fixed & (source == np.arange(len(source)))) - 1
+    rows = np.flatnonzero(~fixed)
+    return csc_array((np.ones(len(rows)), (rows, number[source[rows]])), shape=(len(offset), number[-1] + 1)), offset
+
+
+def _by_time(grid: Steps, count: int, expand: csc_array) -> IntArray:
+    """The order of free variables and constraints by robots and steps, in which systems are banded."""
+    robot, steps = np.arange(count)[:, None] * 2 * grid.size, np.arange(grid.size)
+    splines, poses, changes = robot + steps - DEGREE // 2, robot + steps[: len(grid.times)], robot + steps[: grid.steps]
+    times = np.concatenate([part.ravel() for part in (splines, splines, poses, poses, poses)])
+    first = np.full(expand.shape[1], np.inf)
+    np.minimum.at(first, expand.tocoo().coords[1], times[expand.tocoo().coords[0]])
+    return np.argsort(np.concatenate([first, np.tile(changes.ravel() + 0.5, 3)]), kind="stable")
+
+
+def _constraints(grid: Steps, robots: Wheeled, values: Floats) -> tuple[Floats, csc_array]:
+    """What changes of poses within steps miss those that ways and turns lead to, and the slopes of that."""
+    count, size = len(robots.poses) * len(grid.times), len(robots.poses) * grid.size
+    way, turn, x, y, heading = np.split(values, [size, 2 * size, 2 * size + count, 2 * size + 2 * count])
+    pace, turned = grid.slope @ way, grid.value @ turn
+    if robots.steers:
+        rates = diags_array(turned) @ grid.slope, diags_array(pace) @ grid.value
+        now = grid.begin @ heading + grid.until @ (turned * pace)
+        now_by = [*(grid.until @ rate for rate in rates), grid.begin]
+        changed, changed_by = grid.over @ (turned * pace), [grid.over @ rate for rate in rates]
+    else:
+        now, now_by, ends = turned, [0 * grid.slope, grid.value, 0 * grid.begin], grid.change @ grid.at_steps
+        changed, changed_by = ends @ turn, [0 * ends, ends]
+    missed, rows = [], []
+    for number, (part, ahead, aside) in enumerate(((x, np.cos(now), -np.sin(now)), (y, np.sin(now), np.cos(now)))):
+        across, along = grid.over @ diags_array(pace * aside), grid.over @ diags_array(ahead) @ grid.slope
+        by_way, by_turn, by_heading = (across @ own for own in now_by)
+        places = [None, None]
+        places[number] = grid.change
+        rows.append([-along - by_way, -by_turn, *places, -by_heading])
+        missed.append(grid.change @ part - grid.over @ (pace * ahead))
+    rows.append([*(-own for own in changed_by), None, None, grid.change])
+    return np.concatenate([*missed, grid.change @ heading - changed]), csc_array(block_array(rows))
+
+
+def _poses(grid: Steps, robots: Wheeled, way: BSpline, turn: BSpline) -> BSpline:
+    """Splines of the poses that ways and turns lead to."""
+    fine = np.linspace(0, grid.times[-1], grid.steps * FINER + 1)
+    points, weights, until = _quadrature(fine[1])
+    times, start = fine[:-1, None] + points, robots.poses[:, 0]
+    pace, turning, poses = way(times, 1), turn(times), np.tile(start, (len(fine), 1, 1))
+    # First and second derivatives at the start; the curves end at rest.
+    begin = np.zeros((2, *start.shape))
+    if robots.steers:
+        rate = turning * pace
+        poses[1:, :, 2] += np.cumsum(np.einsum("g,tgr->tr", weights, rate), axis=0)
+        heading = poses[:-1, None, :, 2] + np.einsum("gh,thr->tgr", until, rate)
+        begin[..., 2] = turn(0.0) * robots.speed, turn(0.0, 1) * robots.speed
+    else:
+        heading, poses[..., 2] = turning, turn(fine)
+    for axis, direction in enumerate((np.cos, np.sin)):
+        poses[1:, :, axis] += np.cumsum(np.einsum("g,tgr->tr", weights, pace * direction(heading)), axis=0)
+        begin[0, :, axis] = robots.speed * direction(start[:, 2])
+    begin[1, :, :2] = begin[0, :, 2, None] * np.column_stack([-begin[0, :, 1], begin[0, :, 0]])
+    return through(fine, poses, *begin)
