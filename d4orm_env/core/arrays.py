@@ -56,7 +56,10 @@ def _detached(value: Any) -> Any:
         # In double precision NumPy has all their types.
         return value.detach().cpu().double().numpy()
     if isinstance(value, list | tuple):
-        return [part if isinstance(part, np.ndarray | float | int) else _detached(part) for part in value]
+        return [part if isinstance(part, float | int) else _detached(part) for part in value]
+    # NumPy would drop imaginary parts, and read text and times as numbers.
+    if isinstance(value, str | bytes) or (isinstance(value, np.ndarray) and value.dtype.kind in "cSUmM"):
+        raise TypeError("these are no real numbers")
     return value
 
 

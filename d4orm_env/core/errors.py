@@ -18,8 +18,12 @@ def first_line(error: BaseException) -> str:
 
 
 def describe(error: BaseException) -> str:
-    """Kind and message on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+    """Kind and message on one line, which any file holds."""
+    try:
+        message = " ".join(str(error).split()).encode("utf-8", "backslashreplace").decode("utf-8")
+    except Exception as another:  # a user's own may fail to say what it is
+        message = f"its message fails with {type(another).__name__}"
+    return f"{type(error).__name__}: {message}"
 
 
 def unknown(what: str, value: object, known: Iterable[str], *others: str) -> ValueError:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 MOST_TRAILERS = 3
 """Most trailers of a robot."""
+DEFAULT_TOLERANCE = 0.1
+"""Tolerance of goal headings that are given none [rad]."""
 LEAST_TOLERANCE = 1e-3
 """Smallest tolerance of a goal heading [rad]."""
 

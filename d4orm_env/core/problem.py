@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core import problem_checks as checks
 from d4orm_env.core.arrays import LARGEST, FloatArray, Floats, Frozen, frozen_array
-from d4orm_env.core.goal_poses import checked_goal_poses, goal_speeds
+from d4orm_env.core.goal_poses import DEFAULT_TOLERANCE, checked_goal_poses, goal_speeds
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem_arrays import ProblemArrays, as_arrays, digest_of
 from d4orm_env.core.problem_checks import Arrival
@@ -109,7 +109,7 @@ class Problem(Frozen):
         arrival: Arrival = "dock",
         collision_penalty: float = 1.0,
         goal_heading: ArrayLike | None = None,
-        goal_heading_tolerance: ArrayLike = 0.1,
+        goal_heading_tolerance: ArrayLike = DEFAULT_TOLERANCE,
         goal_hitches: ArrayLike | None = None,
     ) -> None:
         checks.check_is_team(team)

@@ -157,15 +157,18 @@ class MovingObstacle(Disturbance[Kept]):
     def __post_init__(self) -> None:
         super().__post_init__()
         times = frozen_array(self.times, "MovingObstacle times", (None,), largest=LARGEST).astype(np.float64)
-        positions = np.array(self.positions, np.float64)
+        try:
+            positions = np.array(self.positions, np.float64)
+        except (TypeError, ValueError):
+            positions = np.empty(0)
         if len(times) < 2 or (np.diff(times) <= 0).any():
             raise ValueError(f"MovingObstacle times are {short_repr(times.tolist())}; give two or more that increase")
         if positions.ndim == 2:
             positions = positions[:, None]
         if positions.ndim != 3 or len(positions) != len(times) or not 1 <= positions.shape[1] <= MAX_INTRUDERS:
             raise ValueError(
-                f"MovingObstacle positions have shape {np.shape(self.positions)}; they must be (T, d), or (T, N, d) of "
-                f"at most {MAX_INTRUDERS} bodies, for {len(times)} times"
+                f"MovingObstacle positions are {short_repr(self.positions)}; they must be numbers (T, d), or (T, N, d) "
+                f"of at most {MAX_INTRUDERS} bodies, for {len(times)} times"
             )
         if (np.abs(positions) > LARGEST).any():
             raise ValueError(f"MovingObstacle positions must be at most {LARGEST:g} m in magnitude, or NaN")

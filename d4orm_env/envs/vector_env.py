@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, whole_number
 from d4orm_env.core.observation_layout import ObservationLayout
-from d4orm_env.engine.types import SKIP
+from d4orm_env.disturbances.disturbance import truth
+from d4orm_env.engine.types import LOOK, SKIP
 from d4orm_env.envs.inputs import checked_autoreset_mode, joint_controls, reset_mask, world_seeds
 from d4orm_env.envs.joint_env import joint_spaces
 from d4orm_env.envs.options import EnvOptions
@@ -93,7 +94,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._action_shape = (self.num_envs, self.problem.num_robots * self.problem.control_size)
         self._observations = np.empty((self.num_envs, self.problem.num_robots, self.layout.size), np.float32)
-        self._copy = copy
+        self._copy = truth(copy, "copy")
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._running = np.zeros(self.num_envs, np.bool_)
 
@@ -146,10 +147,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             if own_seed is not None:
                 self._setup.forget()  # for they were drawn with another seed
                 self._generators[world] = seeding.np_random(own_seed)[0] if self._setup.draws else None
-        for term in self._simulation.terms.values():
-            term[mask] = 0
         observations = self._new_observations()
-        self._simulation.reset_worlds(self._drawn(mask), observations)
+        self._begin(mask, observations)
         self._running[mask] = True
         return self._simulation.show(observations).reshape(self.num_envs, -1), self._infos(mask)
 
@@ -183,10 +182,16 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
             infos |= {"metrics": _masked(self.metrics(), ended), "_metrics": ended}
             if self._mode is AutoresetMode.SAME_STEP:
                 final = _final_infos(observations, infos, ended)
-                simulation.reset_worlds(self._drawn(ended), seen, others=SKIP)
+                self._begin(ended, seen, others=SKIP)
                 shown[ended] = simulation.show(seen[ended], ended)
                 infos = self._infos() | final
         return observations, rewards, terminated, truncated, infos
+
+    def _begin(self, mask: BoolArray, observations: FloatArray, others: np.uint8 = LOOK) -> None:
+        """Begin episodes of the worlds in the mask ``(B,)``."""
+        for term in self._simulation.terms.values():
+            term[mask] = 0
+        self._simulation.reset_worlds(self._drawn(mask), observations, others=others)
 
     def set_state(self, states: ArrayLike) -> tuple[FloatArray, Info]:
         """Put the robots elsewhere; see :meth:`d4orm_env.navigation_v0.parallel_env.set_state`.

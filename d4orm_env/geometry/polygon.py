@@ -21,6 +21,10 @@ MAX_CORNERS, MAX_ALL_CORNERS = 2_000, 30_000
 """Limits of one polygon, as of a way of OpenStreetMap, for its triangulation may take quadratic time; and of all."""
 
 
+THIN = 1e-6
+"""Height up to which a triangle is left out, as a share of the largest coordinate: some roundings of float32."""
+
+
 def check_polygon(corners: FloatArray, name: str) -> None:
     """Refuse corners ``(v, 2)`` in order, either way round, that are those of no simple polygon."""
     if len(corners) < 3:
@@ -45,7 +49,8 @@ def check_polygon(corners: FloatArray, name: str) -> None:
 def triangulate(corners: FloatArray) -> NDArray[np.intp]:
     """``(v - 2, 3)`` corners of counterclockwise triangles that fill a simple polygon, fewer where some lie in line.
 
-    By cutting off ears (G. H. Meisters, "Polygons Have Ears", American Mathematical Monthly, 1975), the largest first.
+    Triangles so thin that rounding decides what is inside are left out. By cutting off ears (G. H. Meisters, "Polygons
+    Have Ears", American Mathematical Monthly, 1975), the largest first.
     """
     return np.array(_Ears(corners.astype(np.float64)).triangles())
 
@@ -60,6 +65,7 @@ class _Ears:
     def __init__(self, points: Floats) -> None:
         count = len(points)
         self._points, self._positions = points, points.tolist()
+        self._thin = THIN * float(np.abs(points).max())
         ring = list(range(count))
         if float(_cross(points, np.roll(points, -1, axis=0)).sum()) < 0:
             ring.reverse()
@@ -78,10 +84,17 @@ class _Ears:
         while len(self._turn) > 3:
             ear = self._find_ear()
             around = self._before[ear], self._after[ear]
-            if self._turn[ear] > 0:
-                found.append([around[0], ear, around[1]])
+            found.append([around[0], ear, around[1]])
             self._cut_off(ear, *around)
-        return [*found, [corner for corner in self._ring if corner in self._turn]]
+        found.append([corner for corner in self._ring if corner in self._turn])
+        height = self._heights(found)
+        return [triangle for triangle, thick in zip(found, (height > self._thin) | (height == height.max())) if thick]
+
+    def _heights(self, triangles: list[list[int]]) -> Floats:
+        """The least height of each triangle, negative where its corners lie clockwise."""
+        a, b, c = np.moveaxis(self._points[np.array(triangles)], 1, 0)
+        longest = np.max([np.hypot(*(end - begin).T) for begin, end in ((a, b), (b, c), (c, a))], axis=0)
+        return _cross(b - a, c - a) / longest
 
     def _entry(self, corner: int) -> tuple[float, int, int]:
         """Return the sort key: corners that lie in line, then large turns, then the order round the ring."""

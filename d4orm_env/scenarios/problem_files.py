@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 
 from d4orm_env.core.files import checked_path, naming, read_yaml, replaced_when_done
+from d4orm_env.core.goal_poses import DEFAULT_TOLERANCE
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
@@ -141,8 +142,9 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     for name in ("max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
     if not np.isnan(problem.goal_heading[robot]):
-        for name in ("goal_heading", "goal_heading_tolerance"):
-            (entry[name],) = _decimals(getattr(problem, name)[[robot]])
+        (entry["goal_heading"],) = _decimals(problem.goal_heading[[robot]])
+    if "goal_heading" in entry or problem.goal_heading_tolerance[robot] != np.float32(DEFAULT_TOLERANCE):
+        (entry["goal_heading_tolerance"],) = _decimals(problem.goal_heading_tolerance[[robot]])
     hitches = problem.goal_hitches[robot, : len(model.trailers)]
     if not np.isnan(hitches).all():
         entry["goal_hitches"] = [None if np.isnan(hitch) else _decimals([hitch])[0] for hitch in hitches]

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import did_you_mean
-from d4orm_env.core.goal_poses import MOST_TRAILERS
+from d4orm_env.core.goal_poses import DEFAULT_TOLERANCE, MOST_TRAILERS
 from d4orm_env.core.portable import arctan2
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import Arrival
@@ -62,7 +62,7 @@ class RobotEntry(Entry):
     own_limits: dict[str, Number] = Field(default_factory=dict)
     footprint: dict[str, Any] | None = None
     goal_heading: Number | None = None
-    goal_heading_tolerance: Number = 0.1
+    goal_heading_tolerance: Number = DEFAULT_TOLERANCE
     goal_hitches: Annotated[list[Number | None], Field(max_length=MOST_TRAILERS)] | None = None
 
     @model_validator(mode="after")
@@ -176,7 +176,7 @@ class ProblemFile(Entry):
     world: WorldEntry = WorldEntry()
 
     def build(self) -> Problem:
-        shaped = any(robot.footprint for robot in self.robots)
+        shaped = any(robot.footprint is not None for robot in self.robots)
         limits = (*(() if shaped else ("radius",)), "max_speed", "max_acceleration", "max_turn_rate")
         columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
         models = tuple(robot.model for robot in self.robots)

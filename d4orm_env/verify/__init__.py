@@ -186,6 +186,8 @@ class _Course:
 
 def _checked_controls(problem: Problem, controls: ArrayLike) -> Floats:
     try:
+        if np.iscomplexobj(controls):
+            raise TypeError("NumPy would drop the imaginary parts")
         array = np.asarray(controls, np.float64)
     except OverflowError as error:
         raise ValueError("controls hold a whole number too large for float64; keep them within the limits") from error

@@ -160,7 +160,8 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
     all_observations, all_infos = [observations], [infos]
     outcomes = [_outcome(env, {})]
     while env.agents:
-        acting = {agent: observations[agent] for agent in env.agents}
+        # A policy may change what it is given.
+        acting = {agent: observations[agent].copy() for agent in env.agents}
         observations, rewards, _, _, infos = env.step(actor.act(acting, env.state()))
         joints.append(split_state(problem, env.unwrapped.true_state()))
         effects.append(env.unwrapped.effect().copy())

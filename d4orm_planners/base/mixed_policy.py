@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from d4orm_env.core.arrays import FloatArray, short_repr
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.planner_registry import PolicyLike, called, make_policy, policy_settings
+from d4orm_planners.base.planner_registry import PolicyLike, called, copy_policy, make_policy, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ class MixedPolicy(Policy):
 
     def __getstate__(self) -> dict[str, object]:
         # A copy drives episodes of its own.
-        return {**super().__getstate__(), "_members": [*map(copy.copy, self._members)]}
+        return {**super().__getstate__(), "_members": [*map(copy_policy, self._members)]}
 
     def observation_options(self, problem: Problem) -> Mapping[str, object]:
         """The most that any of them wants to observe."""
@@ -75,7 +74,8 @@ class MixedPolicy(Policy):
         actions: Actions = {}
         for index, member in enumerate(self._members):
             own = {agent: seen for agent, seen in observations.items() if self._index(agent) == index}
-            actions |= member.act(own, state) if own else {}
+            given = member.act(own, state) if own else {}
+            actions |= {agent: given[agent] for agent in own if agent in given}
         return {agent: actions[agent] for agent in observations if agent in actions}
 
     def identity(self) -> dict[str, object]:

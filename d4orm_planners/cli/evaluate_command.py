@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -253,12 +254,11 @@ def leaderboard(
     """Write a page with the results of all trials in a store, or in several."""
     check_target(out, (".md",))
     limits = () if deadlines is None else decimals("--deadlines", deadlines)
-    trials = [
-        trial
-        for store in stores
-        for trial in (read_parquet(store) if store.suffix == ".parquet" else TrialStore.existing(store).trials())
-    ]
-    text = page(trials, limits)
+    trials = chain.from_iterable(
+        read_parquet(store) if store.suffix == ".parquet" else TrialStore.existing(store).trials() for store in stores
+    )
+    # A trial that several of them have is one.
+    text = page([*{trial.key: trial for trial in trials}.values()], limits)
     with target(out) as path:
         path.write_text(text, encoding="utf-8")
     tell_written(out, quiet=quiet)

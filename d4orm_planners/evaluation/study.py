@@ -6,8 +6,11 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
 
 from d4orm_env.core.arrays import LARGEST_WHOLE, duration, positive_number, short_repr, whole_number
 from d4orm_env.core.errors import unknown
@@ -65,6 +68,9 @@ class Study:
             replace(condition, physics=self.physics)
             for condition in conditions(self.control_noise_std, self.disturbances)
         )
+        for option in ("scenario_settings", "observation"):
+            if not isinstance(given := getattr(self, option), Mapping):
+                raise ValueError(f"{option} is {short_repr(given)}; give arguments by name, in a mapping")
         for name in self.observation:
             if name not in OBSERVATION:
                 raise unknown("observation", name, OBSERVATION)
@@ -241,7 +247,7 @@ def conditions(
         raise ValueError("control_noise_std is empty; give at least one level")
     if disturbances is None:
         return tuple(Condition(std) for std in noise)
-    if not isinstance(disturbances, Mapping):
+    if not isinstance(disturbances, Mapping) or not all(isinstance(name, str) and name for name in disturbances):
         raise ValueError(f"disturbances is {short_repr(disturbances)}; give levels by name, as {{'delay': [0, 1, 2]}}")
     varied = [one for name, levels in disturbances.items() for one in _varied(name, levels)]
     if not varied:
@@ -264,10 +270,7 @@ def _varied(name: str, levels: Levels) -> list[Varied]:
     if all(isinstance(one, Disturbance | Sequence) and not isinstance(one, str) and _holds(one) for one in listed):
         chosen = [checked_disturbances(one) for one in listed]
         return [(name, one, level) for one, level in zip(chosen, _levels_of(chosen))]
-    return [
-        (name, (disturbance_at(name, level),), float(level if isinstance(level, int | float) else index))
-        for index, level in enumerate(listed)
-    ]
+    return [(name, (disturbance_at(name, one),), level) for one, level in zip(listed, _numbers_or_indices(listed))]
 
 
 def _holds(given: object) -> bool:
@@ -280,6 +283,12 @@ def _levels_of(chosen: Sequence[tuple[AnyDisturbance, ...]]) -> list[float]:
     if all(len(one) == 1 and type(one[0]) is type(chosen[0][0]) for one in chosen):
         values = [attributes_of(one[0]) for one in chosen]
         differing = [name for name in values[0] if len({repr(each[name]) for each in values}) > 1]
-        if len(differing) == 1 and all(isinstance(each[differing[0]], int | float) for each in values):
-            return [float(each[differing[0]]) for each in values]  # type: ignore[arg-type] # a number, as was asked
-    return [float(index) for index in range(len(chosen))]
+        if len(differing) == 1:
+            return _numbers_or_indices([each[differing[0]] for each in values])
+    return _numbers_or_indices(chosen)
+
+
+def _numbers_or_indices(values: Sequence[Any]) -> list[float]:
+    """The values if all are numbers, or else their indices."""
+    numbers = all(isinstance(value, Real) and not isinstance(value, bool | np.bool_) for value in values)
+    return [float(value if numbers else index) for index, value in enumerate(values)]

@@ -6,7 +6,7 @@ import csv
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,8 @@ parquet: Any = LazyModule("pyarrow.parquet", "Parquet", "evaluate")
 
 MAX_TRIALS, MAX_BYTES = 10**7, 2**32
 """Limits of a Parquet file that is read."""
+LATER = {"denoising_share"}
+"""Columns that files of earlier versions do not have."""
 PARQUET_HINT = "trials.parquet is not written, which needs pyarrow; install it with: pip install 'd4orm-env[evaluate]'"
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
           "travel time, s", "stretch", "denoising steps", "denoising", "planning, s", "decision, ms", "training, min",
@@ -117,9 +119,9 @@ def _trials(file: ParquetFile) -> Iterator[Trial]:
     size = sum(about.row_group(group).total_byte_size for group in range(about.num_row_groups))
     if about.num_rows > MAX_TRIALS or size > MAX_BYTES:
         raise ValueError(f"it has {about.num_rows} rows of {size} bytes; at most {MAX_TRIALS} of {MAX_BYTES} are read")
-    defaults = {field.name: field.default for field in fields(Trial) if field.default is not MISSING}
-    names, required = set(file.schema_arrow.names), {field.name for field in fields(Trial)} - defaults.keys()
-    if wrong := sorted((names - required - defaults.keys()) | (required - names)):
+    defaults = {field.name: field.default for field in fields(Trial) if field.name in LATER}
+    names, known = set(file.schema_arrow.names), {field.name for field in fields(Trial)}
+    if wrong := sorted((names - known) | (known - names - LATER)):
         raise ValueError(f"its columns differ from those of trials in {', '.join(map(short_repr, wrong[:5]))}")
     number = 0
     for batch in file.iter_batches(batch_size=1024):

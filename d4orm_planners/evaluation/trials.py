@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import sysconfig
 import time
@@ -25,7 +24,7 @@ from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
 from d4orm_planners.base.episode import Episode, open_env, run_episode
 from d4orm_planners.base.plan import IterationRecord, Plan
-from d4orm_planners.base.planner_registry import is_planned, make_policy, policy_settings
+from d4orm_planners.base.planner_registry import copy_policy, is_planned, make_policy, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy
 from d4orm_planners.base.provenance import commit, describe_machine, versions
 from d4orm_planners.evaluation.store import Trial, TrialKey
@@ -156,7 +155,7 @@ class Job:
     def run(self) -> Iterator[Trial]:
         """Run the trials one after another; a plan is made once and executed under all conditions.
 
-        Whatever a policy raises is the result of its trial.
+        Whatever a policy raises is the result of its trial, an exit of the program too.
 
         Raises:
             KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
@@ -168,9 +167,10 @@ class Job:
             begin = time.perf_counter()
             error, outcome = "", {}
             try:
-                timed = timed or _TimedPolicy(make_policy(self.policy.source, **self.policy.settings))
+                if timed is None or timed.plan is None:
+                    timed = _TimedPolicy(make_policy(self.policy.source, **self.policy.settings))
                 outcome = _outcome(timed, self, condition)
-            except Exception as problem:
+            except (Exception, SystemExit, GeneratorExit) as problem:
                 error = describe(problem) + _place(problem)
             libraries, machine = _origin()
             trial = replace(self.failed(condition, error), versions=libraries, machine=machine, **outcome)
@@ -184,7 +184,7 @@ class Job:
         return [self.failed(condition, reason) for condition in left[:count]], rest
 
 
-def _place(error: Exception) -> str:
+def _place(error: BaseException) -> str:
     """Last place in a user's code on the way to it, in brackets; empty without one."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(("<", *PACKAGES))]
@@ -242,7 +242,7 @@ class _TimedPolicy(Policy):
     """A policy with a stopwatch. It keeps the plan of an open-loop policy from one episode to the next."""
 
     def __init__(self, policy: Policy) -> None:
-        self.actor = copy.copy(policy)  # a user's own, which trials must not change
+        self.actor = copy_policy(policy)
         self.wall_time = 0.0
         self.preparation = 0.0
         self.plan: Plan | None = None

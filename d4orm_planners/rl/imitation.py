@@ -243,8 +243,9 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver 
     limits, parts = env.unwrapped.problem.team.control_limits, []
     while env.agents:
         acting = {agent: observations[agent] for agent in env.agents}
+        seen = np.stack(list(acting.values()))
         asked = expert.act(acting, env.state())
-        seen, own = np.stack(list(acting.values())), limits[robot_indices(acting)]
+        own = limits[robot_indices(acting)]
         controls = as_float32([asked[agent] for agent in acting])
         parts.append(Samples(seen, controls, own))
         driven = controls if learner is None else learner(seen, own)

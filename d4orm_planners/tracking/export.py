@@ -99,6 +99,8 @@ def sample_motion(motion: SmoothMotion, rate: float) -> Setpoints:
         ValueError: If the rate is not positive, or so high that there would be over 10^8 numbers of a kind.
     """
     rate = positive_number(rate, "rate", most=MAX_RATE)
+    if rate * motion.duration < 1:
+        raise ValueError(f"rate is {rate:g} Hz for a motion of {motion.duration:.3g} s; give at least a setpoint more")
     count = int(np.ceil(motion.duration * rate)) + 1
     robots = motion.problem.num_robots
     if count * robots > MAX_SAMPLES:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from env_support import mixed_problem
 
-from d4orm_env import navigation_v0
+from d4orm_env import navigation_v0, verify
 from d4orm_env.core.arrays import as_float32
 from d4orm_env.envs.vector_env import NavigationVectorEnv
 from d4orm_env.envs.wrappers import GaussianControlNoise
@@ -128,3 +128,20 @@ def test_tensors_without_numbers_are_refused_by_name(value: Any) -> None:
     actions = {agent: np.zeros(2, np.float32) for agent in env.agents} | {"robot_1": value}
     with pytest.raises(ValueError, match="action of robot_1 is tensor"):
         env.step(actions)
+
+
+@pytest.mark.parametrize(
+    "action", [np.array([1j, 0]), np.array(["1", "2"]), ["1", "2"], np.array([1, 2], "m8[s]"), np.array([b"1", b"2"])]
+)
+def test_what_numpy_would_make_numbers_of_is_refused(action: Any) -> None:
+    env = navigation_v0.parallel_env("circle", num_robots=1)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="robot_0"):
+        env.step({"robot_0": action})
+    joint = NavigationVectorEnv(1, "circle", 1)
+    joint.reset(seed=0)
+    with pytest.raises(ValueError, match="actions"):
+        joint.step([action])
+    if isinstance(action, np.ndarray) and action.dtype.kind == "c":
+        with pytest.raises(ValueError, match="controls must be an array of numbers"):
+            verify(env.problem, np.zeros((env.problem.horizon, 1, 2)) + 1j)

@@ -134,7 +134,9 @@ def test_a_bad_file_is_an_error(tmp_path: Path, text: str, message: str) -> None
     ("arguments", "message"),
     [
         (([0, 0], [[0, 0], [1, 1]]), "times are .*; give two or more that increase"),
-        (([0, 1], [[0, 0]]), r"positions have shape \(1, 2\)"),
+        (([0, 1], [[0, 0]]), r"positions are \[\[0, 0\]\]; they must be numbers \(T, d\)"),
+        (([0, 1], "a"), "MovingObstacle positions are 'a'; they must be numbers"),
+        (([0, 1], [[0, 0], [1]]), r"positions are \[\[0, 0\], \[1\]\]; they must be numbers"),
         (([0, 1], [[0, 0], [1, 1]], 0), "radius is 0"),
         (([0, 1], [[0, 0], [1e9, 1]]), "at most 1e\\+06 m"),
     ],

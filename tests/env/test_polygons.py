@@ -5,15 +5,17 @@ from __future__ import annotations
 from itertools import combinations
 from typing import TypeAlias
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from shapely import Polygon
 
-from d4orm_env import World
+from d4orm_env import Problem, Team, World, navigation_v0, rollout
 from d4orm_env.geometry import polygon as polygons
 from d4orm_env.geometry.polygon import first_crossing, orientation, triangulate
+from d4orm_env.jax.functional_env import FunctionalEnv
 
 Corners: TypeAlias = list[tuple[float, float]]
 GRID = st.lists(st.tuples(st.integers(0, 4).map(float), st.integers(0, 4).map(float)), min_size=3, max_size=8)
@@ -87,13 +89,19 @@ def star(count: int) -> np.ndarray:
     return (np.column_stack([np.cos(angle), np.sin(angle)]) * radius[:, None]).astype(np.float32)
 
 
-@pytest.mark.parametrize("corners", [comb(300), comb(300)[::-1], star(300), star(7)])
+def in_line() -> np.ndarray:
+    """The last corner is in the middle of an edge, but for rounding."""
+    return np.array([[-1.5, -0.4], [-0.8, -0.6], [-0.9, 0.4], [-1.2, 0.0]], np.float32)
+
+
+@pytest.mark.parametrize("corners", [comb(300), comb(300)[::-1], star(300), star(7), in_line()])
 def test_triangles_fill_a_polygon(corners: np.ndarray) -> None:
     triangles = triangulate(corners)
     assert len(triangles) <= len(corners) - 2
     parts = [Polygon(corners[triangle]) for triangle in triangles]
     assert all(Polygon(corners).buffer(1e-6).contains(part) for part in parts)
-    assert sum(part.area for part in parts) == pytest.approx(Polygon(corners).area, rel=1e-9)
+    assert sum(part.area for part in parts) == pytest.approx(Polygon(corners).area, rel=1e-6)
+    assert min(2 * part.area / part.length for part in parts) > 1e-6
 
 
 def test_the_order_in_which_ears_go() -> None:
@@ -111,3 +119,32 @@ def test_more_corners_than_are_checked_quickly_are_refused() -> None:
     with pytest.raises(ValueError, match="polygons have 31500 corners in all, and a world at most 30000; give fewer"):
         World(polygons=[star(1500)] * 21)
     assert World(polygons=[star(2000)]).num_obstacles == 1
+
+
+@pytest.mark.parametrize("engine", ["cpu", "jax"])
+def test_a_corner_in_the_middle_of_an_edge_hides_and_touches_nothing(engine: str) -> None:
+    """Rays and contacts near the line through that edge, beyond its ends."""
+    world = World(2, lower=[-4, -4], upper=[4, 4], polygons=[in_line()])
+    beyond = [-0.720539391040802, 0.6392807364463806]
+    assert world.clearance(np.float32(beyond)) == pytest.approx(0.299, abs=1e-3)
+    problem = Problem(Team(("velocity2d",)), [beyond], [[3.5, -3.5]], world, horizon=1)
+    assert not rollout(problem, np.zeros((1, 1, 2)), engine=engine).collided.any()
+    start, goals = [[-2.7541589736938477, -2.900834083557129], [3, 3]], [[3.5, -3.5], [-3.5, -3.5]]
+    seen = Problem(Team(("velocity2d",) * 2), start, goals, world)
+    options = {"observed_rays": 36, "ray_range": 8.0}
+    if engine == "cpu":
+        env = navigation_v0.parallel_env(problem=seen, **options)
+        ranges = env.reset(seed=0)[0]["robot_0"][env.layout.rays]
+    else:
+        functional_env = FunctionalEnv(problem=seen, **options)
+        _, observations = jax.jit(functional_env.reset)(jax.random.key(0))
+        ranges = np.asarray(observations)[0, functional_env.layout.rays]
+    assert ranges[7] == pytest.approx(7.344, abs=1e-3)
+
+
+def test_a_corner_in_the_middle_of_an_edge_blocks_no_sight() -> None:
+    world = World(2, lower=[-4, -4], upper=[4, 4], polygons=[in_line()])
+    start, goals = [[-2.4959, 1.9959], [1.7226, -1.5638]], [[3.5, -3.5], [-3.5, -3.5]]
+    problem = Problem(Team(("velocity2d",) * 2), start, goals, world)
+    env = navigation_v0.parallel_env(problem=problem, line_of_sight=True)
+    assert env.reset(seed=0)[0]["robot_0"][12] == 1

@@ -420,3 +420,18 @@ def test_numbers_are_those_of_yaml_1_2() -> None:
     assert parse_yaml(text) == [
         1e-4, -1e5, 0.5, 5.0, 1e21, 12, "0x1F", "0o17", "1:30", "on", "yes", True, None, "1e-4", "1_000",
     ]  # fmt: skip
+
+
+def test_an_empty_footprint_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    path.write_text("version: 1\nrobots:\n  - {model: unicycle, start: [0, 0], goal: [2, 0], footprint: {}}\n")
+    with pytest.raises(ValueError, match="footprint"):
+        load_problem(path)
+
+
+def test_tolerances_of_robots_without_goal_headings_are_kept(tmp_path: Path) -> None:
+    headings = {"goal_heading": [0, np.nan, np.nan], "goal_heading_tolerance": [0.2, 0.3, 0.1]}
+    problem = Problem(Team(("unicycle",) * 3), [[0, k, 0] for k in range(3)], [[2, k] for k in range(3)], **headings)
+    save_problem(problem, tmp_path / "one.yaml")
+    loaded = load_problem(tmp_path / "one.yaml")
+    np.testing.assert_array_equal(loaded.goal_heading_tolerance, np.float32([0.2, 0.3, 0.1]))

@@ -307,3 +307,18 @@ def test_a_pool_of_instances_is_drawn_by_the_seed_and_chosen_from() -> None:
         NavigationVectorEnv(8, "circle", 2, num_instances=3)
     with pytest.raises(ValueError, match="num_instances"):
         NavigationVectorEnv(8, num_instances=0, **arguments)
+
+
+def test_a_world_that_is_reset_at_once_has_no_rewards_yet() -> None:
+    env = NavigationVectorEnv(1, "circle", 2, max_cycles=2, reward="training", autoreset_mode="SameStep")
+    env.reset(seed=0)
+    for _ in range(2):
+        *_, infos = env.step(np.ones((1, 4), np.float32))
+    assert infos["final_info"]["reward_time"].tolist() == [[pytest.approx(-0.05)] * 2]
+    for name in ("reward_time", "reward_progress"):
+        np.testing.assert_array_equal(infos[name], 0)
+
+
+def test_whether_observations_are_copied_is_true_or_false() -> None:
+    with pytest.raises(ValueError, match="copy is None; it must be True or False"):
+        NavigationVectorEnv(1, "circle", 2, copy=None)  # type: ignore[arg-type]

@@ -13,6 +13,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from disturbance_support import Wind
 from env_support import line_problem
@@ -390,3 +391,17 @@ def test_shards_on_the_command_line(d4orm: Call, tmp_path: Path) -> None:
         assert status != 0
         assert message in error
     assert "give one of them" in d4orm(*options, "--shard", "1/2", "--ray", "auto")[2]
+
+
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [
+        (np.array([10, 5, 0]), [10, 5, 0]),
+        ([np.int32(3), 1], [3, 1]),
+        ([[3, 6], 0, 2], [0, 1, 2]),
+        ([0, [1, 3], 1], [0, 1, 2]),
+    ],
+)
+def test_levels_are_numbers_or_else_all_of_them_indices(levels: Any, expected: list[float]) -> None:
+    assert [one.level for one in conditions(0.0, {"delay": levels})] == expected
+    assert [one.level for one in conditions(0.0, {"lag": np.float32([0.5, 0])})] == [0.5, 0]

@@ -22,7 +22,8 @@ import trial_support
 from planner_support import program
 
 from d4orm_env import make_problem, save_problem
-from d4orm_planners import IterationRecord, evaluate
+from d4orm_env.disturbances import Delay
+from d4orm_planners import IterationRecord, Policy, evaluate
 from d4orm_planners.evaluation import tables, trials
 from d4orm_planners.evaluation.evaluate import run_study
 from d4orm_planners.evaluation.leaderboard import leaderboard
@@ -497,6 +498,9 @@ def test_the_leaderboard_holds_everything_in_the_store(d4orm, tmp_path: Path) ->
     TrialStore(tmp_path / "more.sqlite").add(trial(0, policy="go-to-goal", label="go-to-goal"))
     assert d4orm("leaderboard", "trials.parquet", "more.sqlite", "-o", "both.md")[0] == 0
     assert "- 6 trials" in (tmp_path / "both.md").read_text()
+    # Trials that stand in two of them are counted once.
+    assert d4orm("leaderboard", ".", "trials.parquet", ".", "-o", "once.md", "--deadlines", "0.2,1")[0] == 0
+    assert (tmp_path / "once.md").read_text() == page
 
 
 @pytest.mark.parametrize(
@@ -638,6 +642,10 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"seeds": [0.5]}, "seed must be a whole number, not 0.5"),
         ({"seeds": [2**63]}, "seed is 9223372036854775808; a store of trials has room for seeds up to"),
         ({"control_noise_std": []}, "control_noise_std is empty"),
+        ({"disturbances": {"": [Delay(1)]}}, "give levels by name, as {'delay'"),
+        ({"disturbances": {3: [1]}}, "disturbances is {3: .*; give levels by name, as {'delay'"),
+        ({"scenario_settings": [1]}, r"scenario_settings is \[1\]; give arguments by name"),
+        ({"observation": ["observed_rays"]}, r"observation is \['observed_rays'\]; give arguments by name"),
     ],
 )
 def test_bad_arguments(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -723,3 +731,56 @@ def test_workers_know_the_models_of_a_scenarios_module(tmp_path: Path, d4orm) ->
     arguments = ("--policy", "go-to-goal", "--num-robots", "2", "--seeds", "2", "--workers", "2", "--out", "out", "-q")
     result = d4orm("evaluate", "--scenario", "own.py:arena", *arguments)
     assert result.status == 0, result.err
+
+
+class Remembers(Policy):
+    """It keeps what it did in an episode in a list, which it clears when it is reset."""
+
+    def __init__(self) -> None:
+        self.memory: list[int] = []
+
+    def reset(self, env: Any, seed: int = 0) -> None:
+        super().reset(env, seed)
+        self.memory.clear()
+
+    def act(self, observations: Any, state: Any) -> Any:
+        self.memory.append(1)
+        return dict.fromkeys(observations, np.full(2, 0.01 * len(self.memory)))
+
+
+def test_trials_do_not_change_a_policy_of_ones_own(tmp_path: Path) -> None:
+    """So that a study that is done does not run again."""
+    policy = Remembers()
+    for _ in range(2):
+        evaluate({"mine": policy}, "circle", out=tmp_path, scenario_settings={"horizon": 5}, **TINY)
+    assert not policy.memory
+    assert len(TrialStore(tmp_path / STORE).trials()) == len(TINY["seeds"])
+
+
+def leaves(_: Any) -> Any:
+    sys.exit()
+
+
+def no_utf8(_: Any) -> Any:
+    raise ValueError("bad \ud800 byte")
+
+
+class Nameless(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError
+
+
+def nameless(_: Any) -> Any:
+    raise Nameless
+
+
+def test_whatever_a_policy_raises_is_a_row(tmp_path: Path) -> None:
+    policies = {"leaves": leaves, "no_utf8": no_utf8, "nameless": nameless, "go-to-goal": {}}
+    evaluate(policies, "circle", out=tmp_path, **TINY)
+    errors = {row.label: row.error.partition(" (")[0] for row in TrialStore(tmp_path / STORE).trials()}
+    assert errors == {
+        "leaves": "SystemExit: ",
+        "no_utf8": r"ValueError: bad \ud800 byte",
+        "nameless": "Nameless: its message fails with RuntimeError",
+        "go-to-goal": "",
+    }

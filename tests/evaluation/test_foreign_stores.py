@@ -65,6 +65,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "garbled": garbled,
     "other columns": lambda path: table(path, surprise=[1]),
     "missing columns": lambda path: table(path, config=None),
+    "no verdicts": lambda path: table(path, success=None),
     "text for truth": lambda path: table(path, success=["yes"]),
     "lists for text": lambda path: table(path, label=[["a"]]),
     "no JSON": lambda path: table(path, config=["{"]),

@@ -15,7 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
-from d4orm_planners import Episode, OpenLoop, make_policy, run_episode
+from d4orm_planners import Episode, OpenLoop, Policy, make_policy, run_episode
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.policy import StatePolicy
 from d4orm_planners.engine.sampling_types import get_sampling_engine
@@ -223,3 +223,24 @@ def test_a_planner_has_nothing_to_do_where_an_episode_was_a_solution() -> None:
     plan = cheap_planner("d4orm-d").solve(problem, seed=0, initial_controls=episode.controls)
     assert plan.solved
     assert plan.iterations == 0
+
+
+def test_a_policy_that_changes_its_observations_changes_no_record() -> None:
+    class InPlace(Policy):
+        def act(self, observations: Any, state: Any) -> Any:
+            actions = {agent: 0.1 * row[:2] for agent, row in observations.items()}
+            for row in observations.values():
+                row /= 100
+            return actions
+
+    class Pure(Policy):
+        def act(self, observations: Any, state: Any) -> Any:
+            return {agent: 0.1 * row[:2] for agent, row in observations.items()}
+
+    seen = [
+        run_episode(navigation_v0.parallel_env("random", num_robots=2, horizon=5), policy, seed=0).observations
+        for policy in (InPlace(), Pure())
+    ]
+    for one, other in zip(*seen, strict=True):
+        for agent in one:
+            np.testing.assert_array_equal(one[agent], other[agent])

@@ -110,3 +110,19 @@ def test_a_comparison_tells_mixtures_apart(tmp_path: Path) -> None:
     assert {one["robot_0"]["control"] for one in stored} == {1, -1}
     assert {one["others"]["policy"] for one in stored} == {"go-to-goal"}
     assert all(len(one["robot_0"]["source"]) == 64 for one in stored)
+
+
+class Team(Constant):
+    """It answers for all robots, whoever asks."""
+
+    def act(self, observations: Any, state: Any) -> Any:
+        return {agent: np.array([self.control, 0]) for agent in (f"robot_{k}" for k in range(4))}
+
+
+def test_a_member_that_answers_for_others_does_not_drive_them() -> None:
+    still = Constant(0)
+    for members in ({"robot_0": Team(1), "others": still}, {"others": still, "robot_0": Team(1)}):
+        others = members.pop("others")
+        np.testing.assert_array_equal(controls(MixedPolicy(members, others=others))[0, :, 0], [1, 0, 0, 0])
+    mixed = MixedPolicy({"robot_1": still, "robot_2": still}, others=Team(1))
+    np.testing.assert_array_equal(controls(mixed)[0, :, 0], [1, 0, 0, 1])

@@ -16,7 +16,7 @@ import pytest
 
 from d4orm_env import make_problem, navigation_v0
 from d4orm_env.disturbances import Delay, Push, StateNoise
-from d4orm_planners import make_policy
+from d4orm_planners import Policy, make_policy
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.rl.dataset import Demonstrations, RecordedEpisode, record_episode, write_dataset
 from d4orm_planners.rl.dataset import write as write_module
@@ -336,3 +336,22 @@ def test_nothing_left_is_no_success(d4orm) -> None:
     outcome = d4orm("dataset", *options, "--out", "one")
     assert outcome.status == 1
     assert "every episode was left out" in outcome.err
+
+
+def test_policies_that_use_their_arrays_again_are_recorded_as_they_acted() -> None:
+    class Buffered(Policy):
+        def reset(self, env: Any, seed: int = 0) -> None:
+            super().reset(env, seed)
+            self.buffer, self.calls = np.zeros((2, 2), np.float32), 0
+
+        def act(self, observations: Any, state: Any) -> Any:
+            self.calls += 1
+            self.buffer[:] = 0.01 * self.calls
+            for row in observations.values():
+                row[:] = 0
+            return {agent: self.buffer[int(agent.removeprefix("robot_"))] for agent in observations}
+
+    env = navigation_v0.parallel_env("random", num_robots=2, horizon=4)
+    episode = record_episode(env, Buffered(), 0)
+    np.testing.assert_allclose(episode.actions[:, 0, 0], [0.01, 0.02, 0.03, 0.04], rtol=1e-6)
+    assert (np.abs(episode.observations).max(axis=(1, 2)) > 0.1).all()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import re
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +23,7 @@ from d4orm_env.core.registry import source_digest
 from d4orm_env.disturbances.disturbance import Disturbance
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
-from d4orm_planners.base.planner_registry import PolicyLike, make_policy, origin, policy_settings
+from d4orm_planners.base.planner_registry import PolicyLike, copy_policy, make_policy, origin, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
 from d4orm_planners.evaluation.trials import Condition
 
@@ -240,11 +239,18 @@ def _plain(metrics: Mapping[str, float]) -> dict[str, float | bool]:
     return numbers | ({"success": bool(metrics["success"])} if "success" in metrics else {})
 
 
+def _kept(action: Any) -> Any:
+    """A copy, for a policy may use the array again; or what it is, and the environment says what is wrong with it."""
+    with suppress(ValueError):
+        return as_float32(action)
+    return action
+
+
 class _Recorder(Policy):
     """A policy that notes what the team saw and did."""
 
     def __init__(self, policy: Policy) -> None:
-        self._policy = copy.copy(policy)
+        self._policy = copy_policy(policy)
         self.steps: list[TeamStep] = []
         self.states: list[FloatArray] = []
         self._actions: list[Actions] = []
@@ -258,8 +264,7 @@ class _Recorder(Policy):
         actions = self._policy.act(observations, state)
         self.steps.append(self._env.unwrapped.last_step)
         self.states.append(state.copy())
-        # The environment says what is wrong with them, if anything is.
-        self._actions.append({agent: actions[agent] for agent in observations if agent in actions})
+        self._actions.append({agent: _kept(actions[agent]) for agent in observations if agent in actions})
         return actions
 
     def team_actions(self) -> tuple[BoolArray, FloatArray]:
