@@ -507,6 +507,15 @@ def test_velocities_that_are_safe_are_left_alone() -> None:
     np.testing.assert_array_equal(safe_velocities(problem, joint(problem, problem.start), wanted, ALL, 0.02), wanted)
 
 
+def test_robots_with_room_between_them_may_stand_however_much_disturbs_them() -> None:
+    """A centimetre beyond the gap, where they may come to be faster than they brake."""
+    problem, states = hop_problem(2), np.zeros((2, 4), np.float32)
+    states[1, 0] = 2 * problem.team.largest_radius + 0.02 + 0.01
+    still = np.zeros((2, 2), np.float32)
+    safe = safe_velocities(problem, joint(problem, states), still, np.ones(2, bool), 0.02, speed_slack=5.0)
+    np.testing.assert_array_equal(safe, still)
+
+
 def test_who_cannot_be_told_anything_is_driven_around() -> None:
     """Two robots face each other 4 cm apart; one of them stands."""
     problem, states = hop_problem(2), np.zeros((2, 4), np.float32)

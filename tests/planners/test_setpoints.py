@@ -112,7 +112,8 @@ def test_rows_as_a_table(plans: dict[str, Plan]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"rate": 0}, "rate"), ({"rate": np.nan}, "rate"), ({"rate": 1e9}, "rate"), ({"rate": 1e-9}, "rate"), ({"rate": "fast"}, "rate"),
+        ({"rate": 0}, "rate"), ({"rate": np.nan}, "rate"), ({"rate": 1e9}, "rate"), ({"rate": 1e-9}, "rate"),
+        ({"rate": "fast"}, "rate"),
         ({"max_acceleration": 0}, "max_acceleration is 0; it must be positive"),
         ({"max_acceleration": [1, 2]}, r"max_acceleration must be one number or one per robot \(5\)"),
         ({"max_jerk": "soft"}, "max_jerk must be one number"),
