@@ -144,10 +144,18 @@ def roll(robots: Wheeled, dt: float, smoothness: float) -> tuple[BSpline, BSplin
     """
     count = len(robots.poses)
     grid = Steps(robots.poses.shape[1] - 1, dt, count)
-    (quadratic, linear), (expand, offset) = _objective(grid, robots, smoothness), _free(grid, robots)
-    values, held, bounds = _guess(grid, robots, smoothness), np.zeros(len(linear)), np.zeros(len(linear))
-    turns, most = slice(grid.size * count, 2 * grid.size * count), np.repeat(WITHIN * robots.curvature, grid.size)
-    order, fresh = _by_time(grid, count, expand), FRESH
+    parts = (part.reshape(count, grid.size).T for part in _fit(grid, robots, smoothness))
+    way, turn = (BSpline(grid.knots, part, DEGREE) for part in parts)
+    return _poses(grid, robots, way, turn), BSpline(grid.knots, turn.c * robots.steers, DEGREE)
+
+
+def _fit(grid: Steps, robots: Wheeled, smoothness: float) -> tuple[Floats, Floats]:
+    """``(R C,)`` coefficients of ways and of turns."""
+    size, (quadratic, linear) = grid.roughness.shape[0], _objective(grid, robots, smoothness)
+    (expand, offset), values = _free(grid, robots), _guess(grid, robots, smoothness)
+    held, bounds = np.zeros((2, len(linear)))
+    turns, most = slice(size, 2 * size), np.repeat(WITHIN * robots.curvature, grid.size)
+    order, fresh = _by_time(grid, len(robots.poses), expand), FRESH
     back = np.argsort(order)[: expand.shape[1]]
     for number in range(MAX_ITERATIONS):
         form, (missed, slopes) = quadratic + diags_array(held), _constraints(grid, robots, values)
@@ -165,10 +173,7 @@ def roll(robots: Wheeled, dt: float, smoothness: float) -> tuple[BSpline, BSplin
             fresh = number + 2
         elif change < SETTLED * robots.radius.min():
             break
-    values[turns] = values[turns].clip(-most, most)
-    ways, turning = (part.reshape(count, grid.size).T for part in (values[: turns.start], values[turns]))
-    way, turn = BSpline(grid.knots, ways, DEGREE), BSpline(grid.knots, turning, DEGREE)
-    return _poses(grid, robots, way, turn), BSpline(grid.knots, turning * robots.steers, DEGREE)
+    return values[:size], values[turns].clip(-most, most)
 
 
 def _objective(grid: Steps, robots: Wheeled, smoothness: float) -> tuple[csc_array, Floats]:
@@ -258,8 +263,9 @@ def _constraints(grid: Steps, robots: Wheeled, values: Floats) -> tuple[Floats, 
         now_by = [*(grid.until @ rate for rate in rates), grid.begin]
         changed, changed_by = grid.over @ (turned * pace), [grid.over @ rate for rate in rates]
     else:
-        now, now_by, ends = turned, [0 * grid.slope, grid.value, 0 * grid.begin], grid.change @ grid.at_steps
-        changed, changed_by = ends @ turn, [0 * ends, ends]
+        now, now_by = turned, [csc_array(grid.slope.shape), grid.value, csc_array(grid.begin.shape)]
+        ends = grid.change @ grid.at_steps
+        changed, changed_by = ends @ turn, [csc_array(ends.shape), ends]
     missed, rows = [], []
     for number, (part, ahead, aside) in enumerate(((x, np.cos(now), -np.sin(now)), (y, np.sin(now), np.cos(now)))):
         across, along = grid.over @ diags_array(pace * aside), grid.over @ diags_array(ahead) @ grid.slope

@@ -28,14 +28,16 @@ BESIDE = {"ablation": "disturbance_study", "cl_mapf": "dynobench"}
 """Studies that are functions in the module of another."""
 OWN = {path.stem for path in FOLDER.glob("[a-z]*.py")} - {"settings_studies"}
 NAMES = tuple(sorted({*COMPARISONS, "paper", *OWN, *BESIDE}))
-TIMED = ("big-teams", "coarseness", "ipopt")
-"""Figures of the paper that were measured on a machine that did nothing else."""
-FIGURES = ("amswarm", "nodes", "noise-schedule", "robustness", "selections", "team-size", *TIMED)
-
-PRESETS = {
+FIGURES = (
+    "amswarm", "big-teams", "coarseness", "ipopt", "nodes", "noise-schedule", "robustness", "selections", "team-size",
+)  # fmt: skip
+FURTHER = {
     "algorithm_4": ("big-teams", "coarseness"), "algorithm_4_noise": ("robustness",), "ipopt_preset": ("ipopt",),
+    "big-teams_seconds": ("big-teams",),
 }  # fmt: skip
-"""Further trials of these, on a machine that did other work: of the paper's presets, few."""
+"""Further trials of these, few: of the paper's presets, and for seconds of one machine."""
+TIMED = ("big-teams_seconds", "coarseness", "ipopt")
+"""Trials of one machine in one go, whose seconds can be compared."""
 
 
 def run(name: str, *arguments: object) -> None:
@@ -62,9 +64,10 @@ def make_all() -> None:
     for figure in FIGURES:
         times = () if figure in TIMED else ("--no-times",)
         run("paper", figure, "--trials", DATA / f"{figure}.parquet", *times, "--out", out)
-    for name, figures in PRESETS.items():
+    for name, figures in FURTHER.items():
+        times = () if name in TIMED else ("--no-times",)
         for figure in figures:
-            run("paper", figure, "--trials", DATA / f"{name}.parquet", "--no-times", "--out", out / name)
+            run("paper", figure, "--trials", DATA / f"{name}.parquet", *times, "--out", out / name)
     d4orm(["leaderboard", str(DATA / "leaderboard.parquet"), "--out", str(out / "leaderboard.md")])
 
 
