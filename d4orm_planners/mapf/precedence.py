@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import Floats, IntArray
+from d4orm_env.core.arrays import BoolArray, Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
@@ -111,27 +111,34 @@ def _corner_radii(problem: Problem, corners: Floats, owner: IntArray, cut: float
     bends = _bends_at(corners, inner)
     radii[inner[bends.sine > STRAIGHT]] = 0.0
     # Who turns back does so on the spot.
-    left = (bends.sine > STRAIGHT) & (bends.cosine > TURNING_BACK)
-    turning, size = problem.team.turning_radius.astype(np.float64)[owner], problem.team.largest_radius
-    for share in CUTS:
-        inner, bends = inner[left], RouteBends(*(values[left] for values in bends))
-        if not len(inner):
-            break
-        most = share * np.maximum(cut * bends.cosine / (1 - bends.cosine), turning[inner])
-        radius = np.minimum(most, bends.straight * bends.cosine / bends.sine)
-        fits = np.ones(len(inner), bool)
-        if problem.world.num_obstacles:
-            safety_distance = (
-                np.asarray(problem.team.radius, np.float64)[owner[inner]] + problem.margin + ARC_SLACK * size
-            )
-            arcs = _arcs(bends, radius, ARC_CHECKS)[..., : problem.dimension]
-            for distance in np.unique(safety_distance).tolist():
-                alike = safety_distance == distance
-                fits[alike] = problem.world.is_clear(arcs[alike], distance).all(axis=1)
-        rounded = fits & (radius > SHARPEST * size)
-        radii[inner[rounded]] = radius[rounded]
-        left = ~fits
+    turns = np.flatnonzero((bends.sine > STRAIGHT) & (bends.cosine > TURNING_BACK))
+    inner, bends = inner[turns], RouteBends(*(values[turns] for values in bends))
+    if not len(inner):
+        return radii
+    turning = problem.team.turning_radius.astype(np.float64)[owner[inner]]
+    most = np.maximum(cut * bends.cosine / (1 - bends.cosine), turning)
+    radius = np.minimum(np.multiply.outer(CUTS, most), bends.straight * bends.cosine / bends.sine)
+    fits = _fits(problem, bends, radius, owner[inner])
+    number, corner = fits.argmax(axis=0), np.arange(len(inner))
+    chosen = radius[number, corner]
+    rounded = fits[number, corner] & (chosen > SHARPEST * problem.team.largest_radius)
+    radii[inner[rounded]] = chosen[rounded]
     return radii
+
+
+def _fits(problem: Problem, bends: RouteBends, radius: Floats, owner: IntArray) -> BoolArray:
+    """``(S, C)`` whether arcs of each ``radius`` ``(S, C)`` leave room at walls."""
+    fits = np.ones(radius.shape, bool)
+    if problem.world.num_obstacles:
+        slack = problem.margin + ARC_SLACK * problem.team.largest_radius
+        safety_distance = np.asarray(problem.team.radius, np.float64)[owner] + slack
+        repeated = RouteBends(*(np.concatenate([values] * len(radius)) for values in bends))
+        arcs = _arcs(repeated, radius.ravel(), ARC_CHECKS)[..., : problem.dimension]
+        arcs = arcs.reshape(*radius.shape, *arcs.shape[1:])
+        for distance in set(safety_distance.tolist()):
+            alike = safety_distance == distance
+            fits[:, alike] = problem.world.is_clear(arcs[:, alike], distance).all(axis=-1)
+    return fits
 
 
 def _lengths(steps: Floats) -> Floats:
