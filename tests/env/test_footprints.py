@@ -17,6 +17,7 @@ from shapely import affinity
 from shapely import geometry as shapely
 
 from d4orm_env import Problem, Team, World, load_problem, make_problem, navigation_v0, rollout, save_problem, verify
+from d4orm_env.core.bodies import world_gap
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Footprint, Polygon
 from d4orm_env.scenarios.settings import parsed
@@ -305,3 +306,18 @@ def test_discs_among_other_footprints_survive_a_file(tmp_path: Path) -> None:
     assert load_problem(tmp_path / "team.yaml") == problem
     with pytest.raises(ValueError, match="offset of Box must be a number of metres, not True"):
         Box(0.5, 0.2, True)
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "gap"),
+    [
+        ({"spheres": [[1, 0, 0, 0.2]]}, 0.7),
+        ({"cylinders": [[0, -1, 0.2]]}, 0.6),
+        ({"boxes": [[-1, -1, 0.5, 1, 1, 2]]}, 0.2),
+        ({"boxes": [[-2, -1, -1, -1, 1, 1]]}, 0.9),
+    ],
+)  # fmt: skip
+def test_gaps_of_ellipsoids_along_their_axes(obstacles: Any, gap: float) -> None:
+    """Of semi-axes 0.1, 0.2, 0.3 m at the origin: that much less than to the obstacle."""
+    world = World(3, **obstacles)
+    assert world_gap(world, Ellipsoid(0.1, 0.2, 0.3), np.zeros(4)) == pytest.approx(gap, abs=1e-3)
