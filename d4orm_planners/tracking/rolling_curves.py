@@ -13,16 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.sparse import block_array, block_diag, csc_array, diags_array, eye_array, kron
+from scipy.sparse import block_array, block_diag, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from d4orm_env.core.arrays import Floats, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.dynamics.robot_model import PYTHON_OPS, Model
-from d4orm_planners.tracking.splines import DEGREE, through
+from d4orm_planners.tracking.splines import DEGREE, Steps, quadrature, through
 
-NODES = 3
-"""Points of Gauss and Legendre's quadrature in a step."""
 MAX_ITERATIONS = 30
 FRESH = 2
 """Iterations whose slopes are found anew; later ones go on with these as long as no coefficients are newly held."""
@@ -49,6 +47,7 @@ class Wheeled(NamedTuple):
     speed: Floats  #: ``(R,)`` along their headings at the start [m/s]
     radius: Floats  #: ``(R,)`` [m]
     curvature: Floats  #: ``(R,)`` largest that they steer [1/m]; infinite where they turn on the spot
+    steered: Floats  #: ``(R,)`` the curvature that they steer at the start [1/m]; NaN where it may be any
 
     @property
     def steers(self) -> bool:
@@ -82,54 +81,27 @@ def on_wheels(problem: Problem, robots: list[int], poses: Floats, velocity: Floa
     speed = velocity[robots, 0] * np.cos(heading) + velocity[robots, 1] * np.sin(heading)
     turning_radius = team.turning_radius[robots].astype(np.float64)
     curvature = np.divide(1, turning_radius, out=np.full(len(robots), np.inf), where=turning_radius > 0)
-    return Wheeled(np.moveaxis(poses[:, robots], 1, 0), speed, team.radius[robots].astype(np.float64), curvature)
+    steered = np.array([_steered(problem, robot) for robot in robots])
+    radius = team.radius[robots].astype(np.float64)
+    return Wheeled(np.moveaxis(poses[:, robots], 1, 0), speed, radius, curvature, steered)
+
+
+def _steered(problem: Problem, robot: int) -> float:
+    """The curvature that a robot steers at the start [1/m]; NaN where it may be any."""
+    model = problem.team.robot_models[robot]
+    if model.first_order or model.turns_in_place:
+        return np.nan
+    state = problem.start[robot, : model.state_size].astype(np.float64)
+    state[list(model.speed_indices)] = 1.0
+    limits, nothing = problem.team.limits[robot].tolist(), (0.0,) * model.control_size
+    rate: float = model.functions.derivative(tuple(state.tolist()), nothing, limits, PYTHON_OPS)[model.heading_index]
+    return rate
 
 
 def finer(spline: BSpline, steps: int) -> BSpline:
     """The same spline over so many steps, from its velocity to rest, with as many knots as those that roll have."""
     times = np.linspace(0, spline.t[-1], steps * FINER + 1)
     return through(times, spline(times), spline(0.0, 1), spline(0.0, 2))
-
-
-def _quadrature(step: float) -> tuple[Floats, Floats, Floats]:
-    """Points ``(G,)`` in a step, weights ``(G,)`` of an integral over it, and ``(G, G)`` of those until each point."""
-    points, weights = np.polynomial.legendre.leggauss(NODES)
-    points, orders = (points + 1) * step / 2, np.arange(NODES)
-    powers = points[:, None] ** orders
-    return points, weights * step / 2, points[:, None] * powers / (orders + 1) @ np.linalg.inv(powers)
-
-
-class Steps:
-    """Quintic splines over ``N`` steps, of ``C`` coefficients for each of ``R`` robots, and integrals of them."""
-
-    def __init__(self, steps: int, dt: float, robots: int) -> None:
-        self.steps, self.dt, self.size, each = steps, dt, steps + DEGREE, eye_array(robots)
-        self.times = np.linspace(0, steps * dt, steps + 1)
-        self.knots = np.concatenate([np.zeros(DEGREE), self.times, np.full(DEGREE, self.times[-1])])
-        points, weights, until = _quadrature(dt)
-        times = (self.times[:-1, None] + points).ravel()
-        third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(self.size - 3, self.size))
-        change = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(steps, steps + 1))
-        #: ``(R N G, R C)`` values and derivatives at the quadrature's points
-        self.value, self.slope = (csc_array(kron(each, part)) for part in (self._values(times), self._slopes(times)))
-        #: ``(R (N+1), R C)`` values at all steps, and ``(R C, R C)`` the form of squared third differences
-        self.at_steps = csc_array(kron(each, self._values(self.times)))
-        self.roughness = csc_array(kron(each, third.T @ third))
-        #: ``(R N, R N G)`` integrals over each step, and ``(R N G, R N G)`` from its beginning until each point
-        self.over = csc_array(kron(eye_array(robots * steps), weights[None]))
-        self.until = csc_array(kron(eye_array(robots * steps), until))
-        #: ``(R N G, R (N+1))`` what there is at the beginning of its step, and ``(R N, R (N+1))`` changes within each
-        self.begin = csc_array(kron(each, kron(eye_array(steps, steps + 1), np.ones((NODES, 1)))))
-        self.change = csc_array(kron(each, change))
-
-    def _values(self, times: Floats) -> csc_array:
-        return csc_array(BSpline.design_matrix(times, self.knots, DEGREE))
-
-    def _slopes(self, times: Floats) -> csc_array:
-        width = self.knots[DEGREE + 1 : DEGREE + self.size] - self.knots[1 : self.size]
-        differences = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(self.size - 1, self.size))
-        lower = BSpline.design_matrix(times, self.knots[1:-1], DEGREE - 1)
-        return csc_array(lower @ diags_array(DEGREE / width) @ differences)
 
 
 def roll(robots: Wheeled, dt: float, smoothness: float) -> tuple[BSpline, BSpline]:
@@ -232,6 +204,8 @@ def _free(grid: Steps, robots: Wheeled) -> tuple[csc_array, Floats]:
     offset[ways + np.arange(3)] = robots.speed[:, None] * grid.dt / DEGREE * np.array([0, 1, 3])
     # At rest at the end, wherever that is.
     source[ways + size - np.arange(1, 4)] = ways + size - 4
+    known = np.flatnonzero(~np.isnan(robots.steered))
+    fixed[turns[known, 0]], offset[turns[known, 0]] = True, robots.steered[known]
     if not robots.steers:
         for ends, step in ((np.arange(3), 0), (np.arange(size - 4, size), -1)):
             fixed[turns + ends], offset[turns + ends] = True, robots.poses[:, step, 2, None]
@@ -281,7 +255,7 @@ def _constraints(grid: Steps, robots: Wheeled, values: Floats) -> tuple[Floats, 
 def _poses(grid: Steps, robots: Wheeled, way: BSpline, turn: BSpline) -> BSpline:
     """Splines of the poses that ways and turns lead to."""
     fine = np.linspace(0, grid.times[-1], grid.steps * FINER + 1)
-    points, weights, until = _quadrature(fine[1])
+    points, weights, until = quadrature(fine[1])
     times, start = fine[:-1, None] + points, robots.poses[:, 0]
     pace, turning, poses = way(times, 1), turn(times), np.tile(start, (len(fine), 1, 1))
     # First and second derivatives at the start; the curves end at rest.

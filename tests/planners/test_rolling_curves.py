@@ -15,7 +15,7 @@ from d4orm_env import Problem, Team, make_problem
 from d4orm_env.dynamics.models import MODELS
 from d4orm_planners import make_planner
 from d4orm_planners.tracking import rolling_curves
-from d4orm_planners.tracking.rolling_curves import Wheeled, groups_on_wheels, roll
+from d4orm_planners.tracking.rolling_curves import Wheeled, groups_on_wheels, on_wheels, roll
 from d4orm_planners.tracking.smoothing import MotionLimits, smooth_motion
 
 WHEELED = [
@@ -47,7 +47,7 @@ def test_sampled_robots_on_wheels_do_not_slip_and_steer_within_their_limits(name
 
 def wheeled(poses: Any, **changes: Any) -> Wheeled:
     poses = np.asarray(poses, np.float64)
-    usual = Wheeled(poses, *(np.full(len(poses), value) for value in (0.0, 0.15, np.inf)))
+    usual = Wheeled(poses, *(np.full(len(poses), value) for value in (0.0, 0.15, np.inf, np.nan)))
     return usual._replace(**{name: np.array(value) for name, value in changes.items()})
 
 
@@ -119,3 +119,13 @@ def test_a_robot_that_moves_sideways_does_not_roll() -> None:
     functions = unicycle.functions._replace(velocity=lambda x, u, limits, ops: (u[0], u[1]))
     assert not rolling_curves._rolls(replace(unicycle, functions=functions))
     assert rolling_curves._rolls(unicycle)
+
+
+def test_a_car_begins_with_the_steering_angle_that_it_has() -> None:
+    """Of 0.4 rad, with a wheelbase of 0.3 m."""
+    problem = Problem(Team(("car",)), [[0, 0, 0, 0.5, 0.4]], [[2, 0]])
+    rolling = on_wheels(problem, [0], np.zeros((4, 1, 3)), np.array([[0.5, 0]]))
+    assert rolling.steered == pytest.approx(np.tan(0.4) / 0.3)
+    poses = np.stack([np.linspace(0, 1, 21), np.zeros(21), np.zeros(21)], axis=1)[None]
+    _, steered = roll(wheeled(poses, speed=[0.5], curvature=[2.28], steered=[1.4]), 0.1, 1.0)
+    assert steered(0.0) == pytest.approx(1.4)
