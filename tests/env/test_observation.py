@@ -13,7 +13,7 @@ from env_support import mixed_problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d4orm_env.core.observation import Sensed, insert_nearest, observe_robot
+from d4orm_env.core.observation import Sensed, _gap_to_triangle, insert_nearest, observe_robot
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -360,3 +360,13 @@ def test_wherever_robots_get_observations_keep_their_bounds(problem: Problem, da
     seed, scale = data.draw(st.integers(0, 2**31)), data.draw(st.floats(0, 5))
     for values in unclipped(problem, random_controls(problem, seed, scale), layout, 7):
         assert components_outside(layout, values) == []
+
+
+@pytest.mark.parametrize(
+    ("position", "expected"),
+    [((0.3, 0.3), (0, 0, 0)), ((-0.5, 0.2), (0.5, 0.5, 0)), ((1.0, 1.0), (0.5**0.5, -0.5, -0.5))],
+)
+def test_the_nearest_point_of_a_triangle(position: Any, expected: Any) -> None:
+    """Distance and the way to it; nothing from within."""
+    found = _gap_to_triangle(np.array(position), np.array([0.0, 0, 1, 0, 0, 1]))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
