@@ -175,8 +175,8 @@ def check_positions(
     gaps = world.clearance(positions) - radius
     if poses is None:
         poses = np.column_stack([positions.astype(np.float64), np.full(len(positions), np.nan)])
-    placed = [i for i, pose in enumerate(poses) if not np.isnan(pose[0])]
-    bodies = numbers_by_robot(team.bodies, team.num_robots, placed) if shaped else []
+    placed = np.flatnonzero(~np.isnan(poses[:, 0])) if shaped else ()
+    bodies = numbers_by_robot(team.bodies, team.num_robots, placed)
     for robot in np.flatnonzero(gaps <= margin) if shaped else ():
         gaps[robot] = min(world_gap(world, team.bodies[i].footprint, poses[i]) for i in bodies[robot])
     for robot in np.flatnonzero(gaps <= 0):

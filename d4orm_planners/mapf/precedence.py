@@ -130,8 +130,8 @@ def _fits(problem: Problem, bends: RouteBends, radius: Floats, owner: IntArray) 
     """``(S, C)`` whether arcs of each ``radius`` ``(S, C)`` leave room at walls."""
     fits = np.ones(radius.shape, bool)
     if problem.world.num_obstacles:
-        slack = problem.margin + ARC_SLACK * problem.team.largest_radius
-        safety_distance = np.asarray(problem.team.radius, np.float64)[owner] + slack
+        slack = ARC_SLACK * problem.team.largest_radius
+        safety_distance = np.asarray(problem.team.radius, np.float64)[owner] + problem.margin + slack
         repeated = RouteBends(*(np.concatenate([values] * len(radius)) for values in bends))
         arcs = _arcs(repeated, radius.ravel(), ARC_CHECKS)[..., : problem.dimension]
         arcs = arcs.reshape(*radius.shape, *arcs.shape[1:])
