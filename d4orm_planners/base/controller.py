@@ -19,6 +19,7 @@ from d4orm_planners.base.measured_states import completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, Policy
 from d4orm_planners.base.policy_threads import Background, check_episode
+from d4orm_planners.tracking.reference_feedback import Reference, with_feedback
 from d4orm_planners.tracking.steering import (
     advanced,
     by_model,
@@ -249,7 +250,12 @@ class Controller:
             actions = dict(zip(self._env.possible_agents, brakes)) if actions is None else actions
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
-        controls = self._with_feedback(measured, known & led, controls)
+        error = self._setpoint.position - measured[:, : self.problem.dimension]
+        follows = known & led & (np.linalg.norm(error, axis=1) > self.problem.rounding)
+        wanted = self._velocities(self._joint) + FEEDBACK / self.problem.dt * error
+        reference = Reference(before.states, self._joint.states, controls)
+        returning = with_feedback(self._robots, measured, wanted.astype(np.float32), reference)
+        controls = np.where(follows[:, None], returning, controls)
         return self._described(before, self._observer.compensated(controls, self.arrived), held)
 
     def _shift(self, measured: FloatArray, known: BoolArray) -> None:
@@ -270,14 +276,6 @@ class Controller:
         check_episode(self.policy, self._env)
         acting = {agent: self._observations[agent] for agent in self._env.agents}
         return self._background.run(partial(self.policy.act, acting, self._env.state()), self.timeout)
-
-    def _with_feedback(self, measured: FloatArray, follows: BoolArray, controls: FloatArray) -> FloatArray:
-        """``(K, m)`` controls that bring those robots from where they were measured to the reference."""
-        error = self._setpoint.position - measured[:, : self.problem.dimension]
-        wanted = self._velocities(self._joint) + FEEDBACK / self.problem.dt * error
-        followed = track_velocities(self._robots, measured, wanted.astype(np.float32))
-        off = np.linalg.norm(error, axis=1) > self.problem.rounding
-        return np.where((follows & off)[:, None], followed, controls)
 
     def _velocities(self, joint: JointState) -> Floats:
         """``(K, d)`` velocities; of first-order models those that were commanded."""

@@ -19,6 +19,7 @@ from d4orm_planners import Controller, make_planner, make_policy, run_episode
 from d4orm_planners.base.controller import ControlSetpoint
 from d4orm_planners.base.disturbance_observer import MOST, DisturbanceObserver
 from d4orm_planners.base.policy import GoToGoal, OpenLoop
+from d4orm_planners.tracking.steering import advanced
 
 MODELS = ("holonomic2d", "velocity2d", "differential_drive", "unicycle", "holonomic3d")
 
@@ -512,3 +513,21 @@ def test_a_finished_plan_needs_a_controller_without_a_reserve() -> None:
     with pytest.raises(ValueError, match="or give a Controller, which holds back some of the limits, reserve=0"):
         Controller(OpenLoop(plan=plan)).begin(problem, problem.start)
     Controller(OpenLoop(plan=plan), reserve=0.0).begin(problem, problem.start)
+
+
+@pytest.mark.parametrize(("model", "noise"), [("unicycle2", 0.01), ("car", 0.01), ("car", 0.0)])
+def test_robots_that_turn_stay_on_their_reference_and_come_to_rest(model: str, noise: float) -> None:
+    """Also if their limits are not the reference's; none goes to and fro at its goal."""
+    problem, random = make_problem("circle", num_robots=3, model=model, diameter=6.0), np.random.default_rng(0)
+    states, late = problem.start.copy(), []
+    with Controller("hybrid") as controller:
+        controller.begin(problem, states, seed=0)
+        for step in range(140):
+            measured = states + noise * random.standard_normal(states.shape)
+            setpoint = controller.step(measured, step * problem.dt)
+            states = advanced(problem, states, setpoint.control)
+            off = np.linalg.norm(states[:, :2] - setpoint.position, axis=1).max()
+            assert off < problem.team.radius.min() / 2
+            late.append(np.abs(setpoint.control).max())
+    assert setpoint.arrived.all()
+    assert max(late[-20:]) < (0.3 if noise else 0.02)
