@@ -99,7 +99,8 @@ class Plan(DisplayMixin):
         wall_time: Seconds, first-call compilation excluded.
         history: One record per iteration.
         trajectory: Rollout of the controls.
-        metrics: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, and ``"denoising_steps"`` and
+        metrics: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, which looks for contact at steps, where
+            ``solved`` and ``failures`` know of contact between them too; and ``"denoising_steps"`` and
             ``"denoising_share"``, the share of the iterations that did some. ``d-d4orm`` adds ``"messages"`` and
             ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
             time that they waited for each other.

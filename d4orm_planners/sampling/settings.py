@@ -37,6 +37,8 @@ whose preset was best keeps it.
 
 
 REFERENCE_STEPS = 100
+MOST_NOISE = 1e6
+"""Largest standard deviation of noise, in shares of the limits."""
 
 
 def alpha_bar(num_steps: int, beta_start: float, beta_end: float) -> np.ndarray:
@@ -148,6 +150,8 @@ class DiffusionSettings(CheckedSettings):
         super().__post_init__()
         if self.beta_start > self.beta_end:
             raise ValueError(f"beta_start {self.beta_start:g} is above beta_end {self.beta_end:g}; swap them")
+        if (most := float(annealed(REFERENCE_STEPS, self.beta_start, self.beta_end)[0])) > MOST_NOISE:
+            raise ValueError(f"beta_end is {self.beta_end:g}, with noise of {most:.2g} times the limits; give less")
 
     def noise_scale(self, num_steps: int) -> FloatArray:
         """``(num_steps,)`` standard deviations, from the first denoising step to the last."""

@@ -237,9 +237,14 @@ def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
     robot = needed[name][1]
     most, limit = getattr(usual.peaks, name)[robot], getattr(limits, name)[robot]
     values = f"{most:.3g} {LIMITS[name][0]} of {name.replace('_', ' ')}, limit {limit:.3g}"
-    remedy = "plan with goal_speed, for robots stop in one step without it"
-    demand = f"robot_{robot} needs {values}, and {why}"
-    return f"smoothed, the plan asks for too much: {demand}; {remedy}, or allow more with max_{name}"
+    demand, stops = f"robot_{robot} needs {values}, and {why}", usual.problem.goal_speed[robot] == np.inf
+    stops &= not usual.problem.team.robot_models[robot].first_order
+    remedies = ["plan with goal_speed, for robots stop in one step without it"] * bool(stops)
+    given = name in ("acceleration", "jerk")
+    remedies.append(
+        f"allow more with max_{name}" if given else f"plan for a team with less of {name.replace('_', ' ')}"
+    )
+    return f"smoothed, the plan asks for too much: {demand}; {', or '.join(remedies)}"
 
 
 def _initial_velocity(problem: Problem) -> Floats:

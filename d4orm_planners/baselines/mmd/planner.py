@@ -5,6 +5,7 @@ The search decides which robot plans again, and under which constraints.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -92,10 +93,14 @@ class Planning:
         self._distances: Floats = radius[:, None] + radius + problem.margin + self._slack
         self.steps = 0
 
-    def root(self, seeds: list[int]) -> TreeNode:
-        """All robots' motions, one after another around those that have planned (soft constraints only)."""
+    def root(self, seeds: list[int], should_stop: Callable[[], bool]) -> TreeNode | None:
+        """All robots' motions, one after another around those that have planned (soft constraints only); ``None`` if it
+        should stop before the last.
+        """
         motions: list[RobotMotion] = []
         for robot, seed in enumerate(seeds):
+            if should_stop():
+                return None
             motions.append(self._plan(robot, motions, list(range(robot)), (), seed, None))
         return self.node(0, tuple(motions), ((),) * len(seeds))
 
@@ -205,7 +210,10 @@ class MMD(Planner):
         denoiser = Denoiser(problem, self.config, search.should_stop)
         planning = Planning(problem, self.config, denoiser, state.frames, state.space)
         if not state.nodes:
-            added = [planning.root(_seeds(search, problem.num_robots))]
+            root = planning.root(_seeds(search, problem.num_robots), search.should_stop)
+            if root is None:
+                return state, Iteration(search.current.controls, planning.steps, note="no time for all robots")
+            added = [root]
         else:
             failed = np.flatnonzero(search.current.unsolved)
             unlucky = int(failed[0]) if len(failed) else search.iteration % problem.num_robots
@@ -241,4 +249,6 @@ def compile_mmd(problem: Problem) -> None:
         space = world_space(twice)
         frame = make_frame(twice, 0, space, np.ones(3))
         if frame is not None:
-            Planning(twice, config, Denoiser(twice, config, lambda: False), (frame, frame), space).root([0, 0])
+            Planning(twice, config, Denoiser(twice, config, lambda: False), (frame, frame), space).root(
+                [0, 0], lambda: False
+            )
