@@ -73,7 +73,7 @@ def _gains(weights: Floats, limits: FloatArray, by_state: Floats, by_control: Fl
     value, gains = cost, np.zeros(by_control.transpose(0, 2, 1).shape)
     for _ in range(HORIZON):
         left = by_control.transpose(0, 2, 1) @ value
-        gains = np.linalg.solve(price + left @ by_control, left @ by_state)
+        gains[:] = np.linalg.solve(price + left @ by_control, left @ by_state)
         value = cost + by_state.transpose(0, 2, 1) @ value @ (by_state - by_control @ gains)
     return gains
 

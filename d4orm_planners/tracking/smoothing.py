@@ -240,10 +240,8 @@ def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
     demand, stops = f"robot_{robot} needs {values}, and {why}", usual.problem.goal_speed[robot] == np.inf
     stops &= not usual.problem.team.robot_models[robot].first_order
     remedies = ["plan with goal_speed, for robots stop in one step without it"] * bool(stops)
-    given = name in ("acceleration", "jerk")
-    remedies.append(
-        f"allow more with max_{name}" if given else f"plan for a team with less of {name.replace('_', ' ')}"
-    )
+    may_be_given = name in ("acceleration", "jerk")
+    remedies.append(f"allow more with max_{name}" if may_be_given else "plan for a team with lower limits than it has")
     return f"smoothed, the plan asks for too much: {demand}; {', or '.join(remedies)}"
 
 

@@ -201,3 +201,8 @@ def test_policies_are_told_by_the_file_that_they_act_by(tmp_path: Path) -> None:
     other.write_bytes((SHIPPED / "sac.safetensors").read_bytes())
     assert policy_settings("ppo", path=str(other))["file"] == policy_settings("sac")["file"] != shipped["file"]
     assert policy_settings("ppo", path=str(tmp_path / "none.safetensors"))["file"] is None
+
+
+def test_noise_beyond_all_limits_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"beta_end is 0\.999999, with noise of .* times the limits; give less"):
+        make_planner("d4orm", beta_end=0.999999)

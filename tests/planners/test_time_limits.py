@@ -80,6 +80,15 @@ def test_no_node_goes_on_beyond_the_limit(inner: str, mode: str, clock: None) ->
     assert 0 < longest_iteration(plan) <= LOOKS
 
 
+def test_mmd_stops_between_the_first_motions_of_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+    planned = []
+    monkeypatch.setattr("d4orm_planners.baselines.mmd.planner.Planning._plan", lambda *given: planned.append(given))
+    planner = make_planner("mmd")
+    plan = planner.solve(make_problem("circle", num_robots=4), time_limit=1e-9)
+    assert plan.status == "time_limit"
+    assert not planned
+
+
 def test_what_an_iteration_has_by_then_is_a_candidate(clock: None) -> None:
     problem = make_problem("circle", num_robots=2)
     own = {"engine": "cpu", "num_samples": 64, "final_approach": False}

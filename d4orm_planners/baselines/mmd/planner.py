@@ -93,7 +93,7 @@ class Planning:
         self._distances: Floats = radius[:, None] + radius + problem.margin + self._slack
         self.steps = 0
 
-    def root(self, seeds: list[int], should_stop: Callable[[], bool]) -> TreeNode | None:
+    def root(self, seeds: list[int], should_stop: Callable[[], bool] = lambda: False) -> TreeNode | None:
         """All robots' motions, one after another around those that have planned (soft constraints only); ``None`` if it
         should stop before the last.
         """
@@ -249,6 +249,4 @@ def compile_mmd(problem: Problem) -> None:
         space = world_space(twice)
         frame = make_frame(twice, 0, space, np.ones(3))
         if frame is not None:
-            Planning(twice, config, Denoiser(twice, config, lambda: False), (frame, frame), space).root(
-                [0, 0], lambda: False
-            )
+            Planning(twice, config, Denoiser(twice, config, lambda: False), (frame, frame), space).root([0, 0])
