@@ -81,10 +81,10 @@ def checked_types(models: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
         where = f"robot type {name}"
         if not isinstance(own, Mapping):
             raise ValueError(f"{where} is {short_repr(own)}; give its parameters, as {{'dynamics': 'unicycle1', ...}}")
-        if own.get("dynamics") not in DYNAMICS:
+        if own.get("dynamics") not in [*DYNAMICS]:
             given = short_repr(own.get("dynamics"))
             raise ValueError(f"{where}: dynamics {given} has no model here; there are {', '.join(DYNAMICS)}")
-        if own.get("shape") not in SHAPES:
+        if own.get("shape") not in [*SHAPES]:
             raise ValueError(f"{where}: shape is {short_repr(own.get('shape'))}; it must be one of {', '.join(SHAPES)}")
         _check_parameters(own, where)
     return {name: dict(own) for name, own in models.items()}

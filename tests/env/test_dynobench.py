@@ -147,6 +147,7 @@ CAR = {
         (["mine"], "models is ['mine']; give parameters by type"),
         ({"mine": "unicycle1"}, "robot type mine is 'unicycle1'; give its parameters"),
         ({"mine": {}}, "robot type mine: dynamics None has no model here; there are unicycle1, unicycle2"),
+        ({"mine": CAR | {"dynamics": ["unicycle1"]}}, "robot type mine: dynamics ['unicycle1'] has no model here"),
         ({"mine": CAR | {"dynamics": "boat"}}, "robot type mine: dynamics 'boat' has no model here"),
         ({"mine": CAR | {"shape": "blob"}}, "robot type mine: shape is 'blob'; it must be one of sphere, box"),
         ({"mine": CAR | {"shape": "sphere"}}, "robot type mine: radius is missing, which car_with_trailers in the"),
