@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from d4orm_env.core.arrays import number_list, positive_number, short_repr, whole_number
@@ -81,10 +81,10 @@ def checked_types(models: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
         where = f"robot type {name}"
         if not isinstance(own, Mapping):
             raise ValueError(f"{where} is {short_repr(own)}; give its parameters, as {{'dynamics': 'unicycle1', ...}}")
-        if own.get("dynamics") not in [*DYNAMICS]:
+        if own.get("dynamics") not in list(DYNAMICS):
             given = short_repr(own.get("dynamics"))
             raise ValueError(f"{where}: dynamics {given} has no model here; there are {', '.join(DYNAMICS)}")
-        if own.get("shape") not in [*SHAPES]:
+        if own.get("shape") not in list(SHAPES):
             raise ValueError(f"{where}: shape is {short_repr(own.get('shape'))}; it must be one of {', '.join(SHAPES)}")
         _check_parameters(own, where)
     return {name: dict(own) for name, own in models.items()}
@@ -104,6 +104,8 @@ def _check_parameters(own: Mapping[str, Any], where: str) -> None:
         if not (isinstance(own[name], float | int) and own[name] < 0):
             raise ValueError(f"{where}: {name} is {short_repr(own[name])}; it must be negative, for robots rest")
     for name in own.keys() & SIZES.keys():
+        if not isinstance(own[name], Sequence):
+            raise ValueError(f"{where}: {name} is {short_repr(own[name])}; it must be a list of numbers")
         number_list(own[name], f"{where}: {name}", SIZES[name])
     if own["dynamics"] == "car_with_trailers":
         count = whole_number(own["num_trailers"], f"{where}: num_trailers", 1, MOST_TRAILERS)
