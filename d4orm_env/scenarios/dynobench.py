@@ -101,6 +101,22 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
         own_limits=_own_limits(parameters, names),
         footprint=[footprint_of(own) for own in parameters],
     )
+    start, goal = _starts_and_goals(robots, team)
+    turning = np.array([model.heading_index is not None for model in team.robot_models])
+    inertia = np.array([not model.first_order for model in team.robot_models])
+    d = team.dimension
+    distance = np.linalg.norm(goal[:, :d] - start[:, :d], axis=1)
+    steps = math.ceil(SLOWEST * float((distance / team.max_speed).max()) / DT)
+    return Problem(
+        team, start, goal[:, :d], _world(environment, team, goal[:, :d]), DT, max(LEAST_STEPS, steps), margin=0.0,
+        goal_radius=GOAL_TOLERANCE, goal_speed=np.where(inertia, GOAL_TOLERANCE, np.inf), name=Path(path).stem,
+        arrival="stay", goal_heading=np.where(turning, goal[:, min(2, team.state_size - 1)], np.nan),
+        goal_heading_tolerance=GOAL_TOLERANCE, goal_hitches=_hitches(team, goal),
+    )  # fmt: skip
+
+
+def _starts_and_goals(robots: list[Mapping[str, Any]], team: Team) -> tuple[Floats, Floats]:
+    """``(K, n)`` states of ours at starts and at goals, at rest at these."""
     start, goal = np.zeros((2, team.num_robots, team.state_size))
     for robot, (entry, model) in enumerate(zip(robots, team.robot_models, strict=True)):
         for what, states in (("start", start), ("goal", goal)):
@@ -114,17 +130,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
             raise ValueError(
                 f"goal of robot_{robot} is {short_repr(entry['goal'])}; give one at rest, with zero speeds"
             )
-    turning = np.array([model.heading_index is not None for model in team.robot_models])
-    inertia = np.array([not model.first_order for model in team.robot_models])
-    d = team.dimension
-    distance = np.linalg.norm(goal[:, :d] - start[:, :d], axis=1)
-    steps = math.ceil(SLOWEST * float((distance / team.max_speed).max()) / DT)
-    return Problem(
-        team, start, goal[:, :d], _world(environment, team, goal[:, :d]), DT, max(LEAST_STEPS, steps), margin=0.0,
-        goal_radius=GOAL_TOLERANCE, goal_speed=np.where(inertia, GOAL_TOLERANCE, np.inf), name=Path(path).stem,
-        arrival="stay", goal_heading=np.where(turning, goal[:, min(2, team.state_size - 1)], np.nan),
-        goal_heading_tolerance=GOAL_TOLERANCE, goal_hitches=_hitches(team, goal),
-    )  # fmt: skip
+    return start, goal
 
 
 def _own_limits(parameters: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, list[float]]:

@@ -195,7 +195,7 @@ def _guess(grid: Steps, robots: Wheeled, smoothness: float) -> Floats:
 
 
 def _free(grid: Steps, robots: Wheeled) -> tuple[csc_array, Floats]:
-    """What free variables add to the values, and the values without them: what the ends of curves fix."""
+    """Matrix from free variables to values, and the values without them, which the ends of curves fix."""
     robot, count, size = np.arange(len(robots.poses)), len(grid.times), grid.size
     ways, turns = robot[:, None] * size, (len(robot) + robot[:, None]) * size
     offset = np.zeros(len(robot) * (2 * size + 3 * count))
@@ -227,7 +227,7 @@ def _by_time(grid: Steps, count: int, expand: csc_array) -> IntArray:
 
 
 def _constraints(grid: Steps, robots: Wheeled, values: Floats) -> tuple[Floats, csc_array]:
-    """What changes of poses within steps miss those that ways and turns lead to, and the slopes of that."""
+    """Errors of the changes of poses within steps from those that ways and turns lead to, and their slopes."""
     count, size = len(robots.poses) * len(grid.times), len(robots.poses) * grid.size
     way, turn, x, y, heading = np.split(values, [size, 2 * size, 2 * size + count, 2 * size + 2 * count])
     pace, turned = grid.slope @ way, grid.value @ turn

@@ -20,21 +20,32 @@ def fit_spline(values: Floats, velocity: Floats, dt: float, smoothness: float) -
     It begins and ends at the first and the last of them without acceleration.
     """
     steps, shape = len(values) - 1, values.shape[1:]
-    knots = np.concatenate([np.zeros(DEGREE), np.linspace(0, steps * dt, steps + 1), np.full(DEGREE, steps * dt)])
+    times, knots = _knots(steps, dt)
     count = steps + DEGREE
     coefficients = np.zeros((count, int(np.prod(shape))))
     first, rows = values[0].ravel(), values.reshape(len(values), -1)
     coefficients[0], coefficients[1] = first, first + velocity.ravel() * dt / DEGREE
     coefficients[2] = 3 * coefficients[1] - 2 * first
     coefficients[-4:] = rows[-1]
-    basis = BSpline.design_matrix(np.linspace(0, steps * dt, steps + 1), knots, DEGREE).tocsc()
-    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count)).tocsc()
-    matrix = (basis.T @ basis + smoothness * (differences.T @ differences)).tocsc()
+    basis = BSpline.design_matrix(times, knots, DEGREE).tocsc()
+    matrix = (basis.T @ basis + smoothness * _roughness(count)).tocsc()
     free = np.arange(3, count - 4)
     fixed = np.setdiff1d(np.arange(count), free)
     target = (basis.T @ rows)[free] - matrix[free][:, fixed] @ coefficients[fixed]
     coefficients[free] = splu(matrix[free][:, free].tocsc()).solve(target)
     return BSpline(knots, coefficients.reshape(count, *shape), DEGREE)
+
+
+def _knots(steps: int, dt: float) -> tuple[Floats, Floats]:
+    """Times of steps ``(N+1,)``, and the knots of splines over them."""
+    times = np.linspace(0, steps * dt, steps + 1)
+    return times, np.concatenate([np.zeros(DEGREE), times, np.full(DEGREE, times[-1])])
+
+
+def _roughness(count: int) -> csc_array:
+    """``(C, C)`` form of squared third differences of so many coefficients."""
+    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count)).tocsc()
+    return csc_array(differences.T @ differences)
 
 
 def through(times: Floats, values: Floats, velocity: Floats, acceleration: Floats) -> BSpline:
@@ -56,17 +67,15 @@ class Steps:
 
     def __init__(self, steps: int, dt: float, robots: int) -> None:
         self.steps, self.dt, self.size, each = steps, dt, steps + DEGREE, eye_array(robots)
-        self.times = np.linspace(0, steps * dt, steps + 1)
-        self.knots = np.concatenate([np.zeros(DEGREE), self.times, np.full(DEGREE, self.times[-1])])
+        self.times, self.knots = _knots(steps, dt)
         points, weights, until = quadrature(dt)
         times = (self.times[:-1, None] + points).ravel()
-        third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(self.size - 3, self.size))
         change = diags_array([-1.0, 1.0], offsets=[0, 1], shape=(steps, steps + 1))
         #: ``(R N G, R C)`` values and derivatives at the quadrature's points
         self.value, self.slope = (csc_array(kron(each, part)) for part in (self._values(times), self._slopes(times)))
         #: ``(R (N+1), R C)`` values at all steps, and ``(R C, R C)`` the form of squared third differences
         self.at_steps = csc_array(kron(each, self._values(self.times)))
-        self.roughness = csc_array(kron(each, third.T @ third))
+        self.roughness = csc_array(kron(each, _roughness(self.size)))
         #: ``(R N, R N G)`` integrals over each step, and ``(R N G, R N G)`` from its beginning until each point
         self.over = csc_array(kron(eye_array(robots * steps), weights[None]))
         self.until = csc_array(kron(eye_array(robots * steps), until))
