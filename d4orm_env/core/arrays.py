@@ -52,11 +52,14 @@ def as_float32(value: ArrayLike) -> FloatArray:
 
 def _detached(value: Any) -> Any:
     """``value`` with PyTorch's tensors, in a list too, as arrays, whatever their device and gradients."""
+    # What most calls are for, in every step of an environment.
+    if isinstance(value, float | int) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
+        return value
     if hasattr(value, "detach"):
         # In double precision NumPy has all their types.
         return value.detach().cpu().double().numpy()
     if isinstance(value, list | tuple):
-        return [part if isinstance(part, float | int) else _detached(part) for part in value]
+        return [_detached(part) for part in value]
     # NumPy would drop imaginary parts, and read text and times as numbers.
     if isinstance(value, str | bytes) or (isinstance(value, np.ndarray) and value.dtype.kind in "cSUmM"):
         raise TypeError("these are no real numbers")
