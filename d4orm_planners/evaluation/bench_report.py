@@ -143,6 +143,7 @@ _SECTIONS: dict[str, Callable[[list[Measurement]], str]] = {
         "MiB": lambda row: f"{row['bytes'] / 2**20:.1f}",
     }),
     "robots": _tabulated("Control loops of D4orm-C2F, and setpoints of a plan at 100 Hz", {
+        "model": itemgetter("model"),
         "mode": itemgetter("mode"),
         "robots": itemgetter("num_robots"),
         "loop, ms": lambda row: milliseconds(row["loop"]),

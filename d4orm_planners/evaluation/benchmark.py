@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence, Set
 from functools import partial
 from importlib.util import find_spec
-from typing import Any, TypeAlias, get_args
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -49,6 +49,11 @@ from d4orm_planners.evaluation.probes import (
 from d4orm_planners.sampling.d4orm import D4orm
 
 PRESETS = (None, "paper")
+
+CONTROL_LOOPS: tuple[tuple[str, Mode], ...] = (
+    ("holonomic2d", "nominal"), ("holonomic2d", "measured"), ("differential_drive", "measured"), ("car", "measured"),
+)  # fmt: skip
+"""Models of the robots whose control loops are timed, and the controller's modes."""
 
 FIRST_STEPS = 5
 """Steps at the largest noise that are run together to time one."""
@@ -94,8 +99,8 @@ def _parts(settings: BenchmarkSettings) -> Iterator[Part]:
             yield "obstacles", f"{count} boxes {where}", partial(_measure_obstacles, settings, count, where)
     for cells in settings.map_cells:
         yield "index", f"index of {cells} x {cells} cells", partial(measure_index, cells)
-    for mode in get_args(Mode):
-        yield "robots", f"control loops, {mode}", partial(measure_robots, settings, mode)
+    for model, mode in CONTROL_LOOPS:
+        yield "robots", f"control loops of {model}, {mode}", partial(measure_robots, settings, model, mode)
     for scenario, size in (("circle", 8), ("warehouse", 16)):
         start = partial(measure_startup, scenario, size, min(settings.repetitions, 5))
         yield "startup", f"first plan of a process, {scenario}", start

@@ -23,6 +23,7 @@ from d4orm_planners.base.controller import Controller, Mode
 from d4orm_planners.base.planner_registry import make_planner, make_policy
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, measure
+from d4orm_planners.tracking.steering import advanced
 
 _FIRST_PLAN = """
 import json, sys, time
@@ -113,13 +114,13 @@ def measure_memory(num_robots: int, num_samples: int, horizon: int, diameter: fl
     return {"num_robots": num_robots, "num_samples": num_samples, "horizon": horizon, **result}
 
 
-def measure_robots(settings: BenchmarkSettings, mode: Mode) -> Measurement:
-    """Seconds of control loops of D4orm-C2F for ten robots, and of :meth:`Plan.sample` at 100 Hz for as many.
+def measure_robots(settings: BenchmarkSettings, model: str, mode: Mode) -> Measurement:
+    """Seconds of control loops of D4orm-C2F for ten robots of a model, and of :meth:`Plan.sample` at 100 Hz.
 
     The loops run at their own pace, because refining and planning anew go on beside them. Once a second all robots are
     moved by up to one and a half radii, and those that are far from the coarse plan then are planned for anew.
     """
-    problem = make_problem("circle", num_robots=CONTROLLED, goal_speed=0.1, horizon=150)
+    problem = make_problem("circle", num_robots=CONTROLLED, model=model, goal_speed=0.1, horizon=150)
     plan = make_planner().solve(problem, seed=0)
     sampling = measure(settings, plan.sample)
     seconds: list[float] = []
@@ -133,6 +134,7 @@ def measure_robots(settings: BenchmarkSettings, mode: Mode) -> Measurement:
         assert isinstance(controller.policy, D4ormC2F)
         replanned += sum(loop.replanned for loop in controller.policy.loops)
     return {
+        "model": model,
         "mode": mode,
         "num_robots": CONTROLLED,
         "loop": Spread.of(seconds),
@@ -152,7 +154,7 @@ def _driven(problem: Problem, controller: Controller, seed: int) -> list[tuple[f
         begin, now = time.perf_counter(), len(steps) * problem.dt
         setpoint = controller.step(states, now)
         steps.append((time.perf_counter() - begin, setpoint.held))
-        states = np.hstack([setpoint.position, setpoint.velocity]).astype(np.float32)
+        states = advanced(problem, states, setpoint.control)
         if len(steps) % round(1 / problem.dt) == 0:
             shift = 1.5 * problem.team.largest_radius
             states[:, : problem.dimension] += random.uniform(-shift, shift, problem.goal.shape)

@@ -6,7 +6,6 @@ Control: Linear Quadratic Methods, 1990): what cannot be corrected, as the way a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -46,15 +45,32 @@ def with_feedback(problem: Problem, states: FloatArray, velocities: FloatArray, 
     turning = np.array([model.heading_index is not None for model in problem.team.robot_models])
     if not turning.any():
         return directly
-    now, after, controls = reference
-    team, limits = problem.team, np.where(problem.team.control_limits > 0, problem.team.control_limits, np.float32(1))
-    by_state = _slopes(np.ones_like(now), lambda change: advanced(problem, now + change, controls), problem.dimension)
-    by_control = _slopes(limits, lambda change: advanced(problem, now, controls + change))
-    missed = after - advanced(problem, now, controls).astype(np.float64)
-    off = short_way_round(problem, (now - states).astype(np.float64))
-    regulated = controls + np.einsum("kmn,kn->km", np.linalg.pinv(by_control), short_way_round(problem, missed))
-    regulated += np.einsum("kmn,kn->km", _gains(_weights(team), limits, by_state, by_control), off)
+    limits = np.where(problem.team.control_limits > 0, problem.team.control_limits, np.float32(1))
+    missed, by_state, by_control = _linearised(problem, reference, limits)
+    off = short_way_round(problem, (reference.states - states).astype(np.float64))
+    regulated = reference.controls + np.einsum("kmn,kn->km", np.linalg.pinv(by_control), missed)
+    regulated += np.einsum("kmn,kn->km", _gains(_weights(problem.team), limits, by_state, by_control), off)
     return np.where(turning[:, None], limit_controls(problem, regulated.astype(np.float32)), directly)
+
+
+def _linearised(problem: Problem, reference: Reference, limits: FloatArray) -> tuple[Floats, Floats, Floats]:
+    """``(K, n)`` what the controls of a reference lack to its end, and the slopes of states a step later by states
+    ``(K, n, n)`` and by controls ``(K, n, m)``, varied by a share of their ``limits`` ``(K, m)``.
+
+    Motions are the same everywhere: at the origin positions lose least to rounding.
+    """
+    now, after, controls = reference
+    d, n = problem.dimension, now.shape[1]
+    here = np.hstack([np.zeros_like(now[:, :d]), now[:, d:], controls])
+    sizes = DIFFERENCE * np.hstack([np.ones_like(now), limits])
+    changes = sizes * np.eye(sizes.shape[1], dtype=np.float32)[:, None]
+    rows = here + np.concatenate([changes, -changes, np.zeros_like(changes[:1])])
+    ends = advanced(problem, rows[..., :n], rows[..., n:]).astype(np.float64)
+    more, less = ends[:-1].reshape(2, *changes.shape[:2], n)
+    slopes = np.moveaxis((more - less) / (2 * sizes.T[..., None]), 0, 2)
+    missed = after.astype(np.float64) - ends[-1]
+    missed[:, :d] -= now[:, :d]
+    return short_way_round(problem, missed), slopes[..., :n], slopes[..., n:]
 
 
 def _weights(team: Team) -> Floats:
@@ -76,20 +92,3 @@ def _gains(weights: Floats, limits: FloatArray, by_state: Floats, by_control: Fl
         gains[:] = np.linalg.solve(price + left @ by_control, left @ by_state)
         value = cost + by_state.transpose(0, 2, 1) @ value @ (by_state - by_control @ gains)
     return gains
-
-
-def _slopes(units: FloatArray, motion: Callable[[FloatArray], FloatArray], moved: int = 0) -> Floats:
-    """``(K, n, N)`` slopes of states a step later by changes ``(K, N)``, each varied by a share of its unit.
-
-    The first ``moved`` ones only move all that follows.
-    """
-    slopes = []
-    for column in range(units.shape[1]):
-        change = np.zeros_like(units)
-        change[:, column] = DIFFERENCE * units[:, column]
-        if column < moved:
-            slopes.append(np.sign(change).astype(np.float64))
-            continue
-        apart = motion(change).astype(np.float64) - motion(-change)
-        slopes.append(apart / (2 * change[:, column, None]))
-    return np.stack(slopes, axis=2)

@@ -96,7 +96,9 @@ def limited_states(problem: Problem, states: FloatArray) -> FloatArray:
 
 
 def advanced(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
-    """``(K, n)`` states a time step later, of robots that do not dock, under controls ``(K, m)`` within the limits."""
+    """``(..., K, n)`` states a time step later, of robots that do not dock, under controls ``(..., K, m)`` within the
+    limits.
+    """
     h = TimeStep(*problem.arrays.time_step)
 
     def law(model: ModelFunctions, x: Columns, u: Columns, limits: Columns) -> Columns:
@@ -144,12 +146,14 @@ def present_velocities(problem: Problem, states: FloatArray, controls: FloatArra
 
 
 def _by_rows(problem: Problem, width: int, rows: tuple[FloatArray, ...], law: Callable[..., Columns]) -> FloatArray:
-    """``(K, width)`` results of ``law(functions, *rows, limits)`` for the rows of every robot, padded with zeros."""
-    results = np.zeros((problem.num_robots, width), np.float32)
+    """``(..., K, width)`` results of ``law(functions, *rows, limits)`` for the rows ``(..., K, n)`` of every robot,
+    padded with zeros.
+    """
+    results = np.zeros((*rows[0].shape[:-1], width), np.float32)
     for model, robots in by_model(problem):
-        columns = (tuple(part[robots].T) for part in (*rows, problem.team.limits))
-        result = np.stack(law(model.functions, *columns), axis=1)
-        results[robots, : result.shape[1]] = result
+        columns = (tuple(np.moveaxis(part[..., robots, :], -1, 0)) for part in (*rows, problem.team.limits))
+        result = np.stack(law(model.functions, *columns), axis=-1)
+        results[..., robots, : result.shape[-1]] = result
     return results
 
 

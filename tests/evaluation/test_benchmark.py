@@ -17,7 +17,7 @@ from d4orm_env.dynamics.models import COMMON, MODEL_CODES, NUM_BUILT_IN, get_mod
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.provenance import commit, describe_machine
 from d4orm_planners.evaluation import bench_report, measuring, probes
-from d4orm_planners.evaluation.benchmark import parts, run_parts, thread_counts
+from d4orm_planners.evaluation.benchmark import CONTROL_LOOPS, parts, run_parts, thread_counts
 from d4orm_planners.evaluation.measuring import MODELS, QUICK, SECTIONS, BenchmarkSettings, Spread, measure
 from d4orm_planners.evaluation.probes import measure_startup
 
@@ -124,7 +124,7 @@ def test_the_numbers_hang_together(results: dict[str, list[Any]]) -> None:
     names = {row["environment"] for row in results["environments"]}
     assert {"make_vec, rooms along paths", "parallel_env, 32 rays", "make_vec, 32 rays", "FunctionalEnv"} <= names
     assert [(row["obstacles"], row["where"]) for row in results["obstacles"]] == [(3, "near"), (5, "far")]
-    assert [row["mode"] for row in results["robots"]] == ["nominal", "measured"]
+    assert [(row["model"], row["mode"]) for row in results["robots"]] == list(CONTROL_LOOPS)
     assert all(row["loop"].count > 30 and row["loop_95"] > 0 for row in results["robots"])
     (index,) = results["index"]
     assert 0 < index["bytes"] < 2**20
