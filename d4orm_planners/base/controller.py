@@ -76,7 +76,8 @@ class Controller:
     ``"measured"`` the policy sees what was measured. In both, controls make up for what pushes a robot all the time, as
     a thrust that is too weak does (:mod:`d4orm_planners.base.disturbance_observer`).
 
-    Measured states that are not finite are missing, and replaced by the reference. Speeds and coordinates beyond what a
+    Numbers of measured states that are not finite are missing: where a robot's position or heading is, the reference
+    takes its place, and what else is follows from its last state and control. Speeds and coordinates beyond what a
     robot's model allows count as the limit. A late step delays the reference; it never leaps.
 
     Args:
@@ -95,6 +96,9 @@ class Controller:
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
             way a step: all at once would ask again for what the robots are about to do.
         **settings: Of the policy.
+
+    Attributes:
+        states: ``(K, n)`` the last measured states, completed.
 
     Raises:
         ValueError: For a bad argument, or if there is no such policy.
@@ -163,7 +167,8 @@ class Controller:
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
-        start = self._possible(self._completed(states)[0])
+        self.states, _ = completed(problem, self._bounds, states, problem.start, lambda: problem.start)
+        start = self._possible(self.states)
         team = weaker(problem.team, 1 - self.reserve)
         self._open(problem.with_state(start, problem.goal, team=team), seed)
         self.policy.reset(self._env, seed=seed)
@@ -176,14 +181,15 @@ class Controller:
         Called more often than once every ``problem.dt`` it returns the same one again.
 
         Args:
-            states: ``(K, n)`` measured states; a robot with a NaN counts as not measured.
+            states: ``(K, n)`` measured states, NaN for what is missing.
             time: Of the measurement [s].
 
         Raises:
             RuntimeError: Before :meth:`begin`.
             ValueError: If the states have another shape, or the time is before that of the last step.
         """
-        measured, known = self._completed(states)
+        reference = self._joint.states
+        measured, known = completed(self.problem, self._bounds, states, reference, self._expected)
         dt = self.problem.dt
         passed = (seconds(time) - self._time) / dt
         if passed <= -SAME_PERIOD:
@@ -220,9 +226,9 @@ class Controller:
         self._env = open_env(problem, policy=self.policy)
         self._observations, _ = self._env.reset(seed=seed)
 
-    def _completed(self, states: ArrayLike) -> tuple[FloatArray, BoolArray]:
-        reference = self._joint.states
-        return completed(self.problem, self._bounds, states, reference)
+    def _expected(self) -> FloatArray:
+        """``(K, n)`` states that the last control led to from the last ones."""
+        return advanced(self._robots, self.states, self._setpoint.control)
 
     def _possible(self, states: FloatArray) -> FloatArray:
         """``(K, n)`` states within the robots' limits and the state space."""
@@ -230,6 +236,7 @@ class Controller:
 
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
         at_rest = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
+        self.states = measured
         self._observer.observe(measured, known)
         if self.tracker:
             self._shift(measured, known)

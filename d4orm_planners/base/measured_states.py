@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from numbers import Real
 
@@ -36,11 +37,12 @@ def seconds(time: object) -> float:
 
 
 def completed(
-    problem: Problem, bounds: Bounds, states: ArrayLike, reference: FloatArray
+    problem: Problem, bounds: Bounds, states: ArrayLike, reference: FloatArray, expected: Callable[[], FloatArray]
 ) -> tuple[FloatArray, BoolArray]:
-    """``(K, n)`` measured states, the reference's of robots with a number that is not finite, and ``(K,)`` the others.
+    """``(K, n)`` measured states, and ``(K,)`` whose position and heading are finite.
 
-    Whole turns of angles say nothing, and numbers far beyond the state space are cut off.
+    Others are where the ``reference`` is. What else of a robot is not finite, as it has no sensor for it, is as
+    ``expected``. Whole turns of angles say nothing, and numbers far beyond the state space are cut off.
 
     Raises:
         ValueError: If the states have another shape.
@@ -48,8 +50,12 @@ def completed(
     measured = numbers_of(states, "states must be an array of numbers")
     if measured.shape != reference.shape:
         raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
-    known: BoolArray = np.all(np.isfinite(measured), axis=1)
-    whole = np.where(known[:, None], measured, reference)
+    finite = np.isfinite(measured)
+    known: BoolArray = finite[:, : problem.dimension].all(axis=1)
+    for model, robots in by_model(problem):
+        if model.heading_index is not None:
+            known[robots] &= finite[robots, model.heading_index]
+    whole = np.where(known[:, None], measured if finite.all() else np.where(finite, measured, expected()), reference)
     for model, robots in by_model(problem):
         for index in model.angles:
             angle = whole[robots, index]

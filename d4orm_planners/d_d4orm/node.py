@@ -144,9 +144,12 @@ class Node:
         return True
 
     def check_number(self) -> None:
-        """Raise ``ValueError`` if another node has this one's number, and had it first."""
+        """Raise ``ValueError`` if another node has this one's number, and had it first, or says so.
+
+        A solution is not lost to that.
+        """
         namesake = self.inbox.namesake
-        if namesake is not None and namesake <= self._began:
+        if namesake is not None and namesake <= self._began and not self.search.best.solved:
             last = self._task.num_nodes - 1
             raise ValueError(
                 f"node is {self.number}, and another process on the network is node {self.number} already; give each "

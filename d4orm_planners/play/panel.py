@@ -67,7 +67,7 @@ SLIDERS = {
     "stall": Levels("Robots that stall", 0.0, 1.0, 0.05, 0.0),
     "intruder": Levels("Intruders", 0, 8, 1, 0),
     "drag": Levels("Drag [1/s]", 0.0, 2.0, 0.05, 0.0),
-    "limit_mismatch": Levels("Limits are truly times", 0.3, 1.5, 0.05, 1.0),
+    "limit_mismatch": Levels("Limits are truly times", 0.3, 1.0, 0.05, 1.0),
 }
 """Sliders for what goes wrong, by name and attribute, see :mod:`~d4orm_env.disturbances.disturbance_registry`."""
 
@@ -112,10 +112,10 @@ class Panel:
         text = status_text(frames)
         if text != self._text:
             self._text = self._status.content = text
-        refused = frames[0].status.refused
+        status = frames[0].status
         # The controls then say what is, unless a change waits that they show already.
-        if refused != self._refused and not self._session.busy:
-            self._refused = refused
+        if status.refused != self._refused and not self._session.busy:
+            self._refused, self.paused.value = status.refused, status.state == "paused"
             for name, slider in self._sliders.items():
                 slider.value = self._session.levels.get(name, SLIDERS[name].off)
             for name, box in self._drivers.items():

@@ -223,7 +223,7 @@ class Session:
                 self._show(self._state, moved=True)
         except Exception as error:  # of policies, whatever they are
             self._paused = True
-            self._show(self._state, _told(error))
+            self._say_refused(1, _told(error))
 
     def _obey(self) -> bool:
         """Do what was asked for meanwhile, or some of it if that takes long; whether there was anything."""

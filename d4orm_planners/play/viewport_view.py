@@ -64,7 +64,7 @@ class ViewportView:
         self._paths = {name: PathLines(frame.problem) for name in ("plans", "guidance")}
         self._colors = self._own_colors = 255 * robot_colors(frame.problem.num_robots)
         self._groups = meshes.body_groups(frame.problem)
-        self._positions: dict[str, Points] = {}
+        self._removed = False
         self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=position)}
         self._add_team(frame)
         self._add_world(frame.problem)
@@ -82,7 +82,8 @@ class ViewportView:
         )
 
     def remove(self) -> None:
-        """Take everything off the page."""
+        """Take everything off the page; who holds a shape then lets go of it."""
+        self._removed = True
         self._nodes[""].remove()
 
     def update(self, frame: Frame, now: float) -> None:
@@ -134,6 +135,7 @@ class ViewportView:
         flat = problem.dimension == 2
         mark, dot = 1.5 * radius if flat else 1.4 * radius, 0.35 * radius
         positions, goals = in_space(frame.positions(time.perf_counter())), in_space(frame.goals)
+        self._positions: dict[str, Points] = {"robot": positions, "goal": goals}
         shown = meshes.body_positions(problem, frame.states, positions)[0]
         for group in self._groups:
             at, colors = shown[group.bodies], self._colors[group.robots]
@@ -222,6 +224,8 @@ class ViewportView:
 
         @node.on_drag("left", modifier=modifier)
         async def _(event: viser.SceneNodeDragEvent[viser.SceneNodeHandle]) -> None:  # one after the other
+            if self._removed:
+                return
             instance = event.instance_index or 0
             index, hand = instance if numbers is None else int(numbers[instance]), (event.client_id, instance)
             if event.phase == "start":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,7 +35,7 @@ class FleetRobot:
     """A robot as it was last heard."""
 
     name: str  #: Name of its topics
-    state: FloatArray  #: ``(n,)`` as last heard; not a number before
+    state: FloatArray  #: ``(n,)`` as last heard; not a number before, and what no message says
     heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
     heading: float = 0.0  #: As last heard [rad]
     stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]
@@ -100,10 +99,11 @@ class FleetServer:
         self._problem, self._controller, self._seed = problem, controller, seed
         unknown = np.full(problem.state_size, np.nan, np.float32)
         self._robots = [FleetRobot(name, unknown) for name in names]
-        self._by_name = {name: robot for robot, name in enumerate(names)}
-        self._odometry = session.subscriber("*/odom", wire.ODOMETRY)
-        self._poses = session.subscriber("*/pose", wire.POSE)
-        self._goal = session.subscriber("*/goal", wire.POSE)
+        self._odometry = [session.subscriber(f"{name}/odom", wire.ODOMETRY) for name in names]
+        self._poses = [session.subscriber(f"{name}/pose", wire.POSE) for name in names]
+        self._goals = [session.subscriber(f"{name}/goal", wire.POSE) for name in names]
+        self._wanted: dict[int, tuple[Floats, float]] = {}  # goals of robots, and when they were heard
+        self._unusable = 0
         self._commands = [session.publisher(f"{name}/cmd_vel", wire.TWIST) for name in names]
         self._setpoints = [session.publisher(f"{name}/setpoint", wire.TRAJECTORY) for name in names]
         self._diagnostics = session.publisher("diagnostics", wire.DIAGNOSTICS)
@@ -114,7 +114,7 @@ class FleetServer:
         self._emergency = self._replan = False
         self._commanding = threading.RLock()
         self._e_stop = session.subscriber("e_stop", wire.BOOL, self._mind)
-        self._inputs = self._odometry, self._poses, self._goal, self._e_stop
+        self._inputs = *self._odometry, *self._poses, *self._goals, self._e_stop
         self.state, self._told, self.loops, self.refusal = WAITING, -np.inf, [0.0], ""
 
     def run(self, over: threading.Event) -> None:
@@ -170,45 +170,58 @@ class FleetServer:
         return DRIVING if self._begun is None else PLANNING
 
     def _read(self, now: float) -> None:
-        for number, message in self._taken(self._odometry):
-            self._hear(number, message.pose.pose, position_of(message.twist.twist.linear), now)
-        for number, message in self._taken(self._poses):
-            if np.isfinite(position_of(message.pose.position)).all():
-                robot = self._robots[number]
-                robot.take_pose(message, BASE * self._problem.dt)
-                own = turned(robot.velocity, -wire.heading_of(message.pose.orientation))
-                self._hear(number, message.pose, own, now)
-        for number, message in self._taken(self._goal):
-            self._take_goal(number, message.pose.position)
+        for number, robot in enumerate(self._robots):
+            for message in self._odometry[number].take():
+                told = message.twist.twist
+                self._hear(number, message.pose.pose, now, position_of(told.linear), told.angular.z)
+            for message in self._poses[number].take():
+                if np.isfinite(position_of(message.pose.position)).all():
+                    robot.take_pose(message, BASE * self._problem.dt)
+                    own = turned(robot.velocity, -wire.heading_of(message.pose.orientation))
+                    self._hear(number, message.pose, now, own)
+            for message in self._goals[number].take():
+                self._wanted[number] = position_of(message.pose.position)[: self._problem.dimension], now
+        self._take_goals(now)
         self._mind(self._e_stop)
-
-    def _taken(self, subscriber: Subscriber) -> Iterator[tuple[int, Any]]:
-        """Yield new messages about robots of the team, each with the robot's number."""
-        for topic, message in subscriber.take():
-            if (number := self._by_name.get(topic.partition("/")[0])) is not None:
-                yield number, message
 
     def _mind(self, e_stop: Subscriber) -> None:
         """Stop all robots at once on an emergency stop, whatever the loop is doing."""
         with self._commanding:
-            for _, message in e_stop.take():
+            for message in e_stop.take():
                 self._emergency = bool(message.data)
                 if self._emergency:
                     self._replan, self._pace = True, 0.0
                     self._stand()
 
-    def _hear(self, number: int, pose: Any, velocity: Floats, now: float) -> None:
-        state, robot = wire.state_from(self._problem, number, pose, velocity), self._robots[number]
-        if np.isfinite(state).all():
-            robot.state, robot.heading, robot.heard = state, wire.heading_of(pose.orientation), now
+    def _hear(self, number: int, pose: Any, now: float, velocity: Floats, turn_rate: float = np.nan) -> None:
+        state, robot = wire.state_from(self._problem, number, pose, velocity, turn_rate), self._robots[number]
+        heading = wire.heading_of(pose.orientation)
+        if np.isfinite(heading) and np.isfinite(state[: self._problem.dimension]).all():
+            robot.state, robot.heading, robot.heard = state, heading, now
+        else:
+            self._unusable += 1
 
-    def _take_goal(self, number: int, position: Any) -> None:
+    def _take_goals(self, now: float) -> None:
+        """Take the goals of the last moments together, as two robots may change places, or else one by one."""
+        self._wanted = {number: goal for number, goal in self._wanted.items() if now - goal[1] <= self.deadline}
+        if not self._take_goal(list(self._wanted)):
+            for number in list(self._wanted):
+                self._take_goal([number])
+
+    def _take_goal(self, numbers: list[int]) -> bool:
+        """Give some robots the goals that are wanted; return whether they can have them."""
         goals = self._problem.goal.copy()
-        goals[number] = [position.x, position.y, position.z][: self._problem.dimension]
-        try:
-            self._problem, self._replan = self._problem.replace(goal=goals), True
-        except ValueError as error:
-            self.refusal = f"goal of {self._robots[number].name}: {error}"
+        for number in numbers:
+            goals[number] = self._wanted[number][0]
+        if not np.array_equal(goals, self._problem.goal):
+            try:
+                self._problem, self._replan = self._problem.replace(goal=goals), True
+            except ValueError as error:
+                self.refusal = f"goal of {', '.join(self._robots[number].name for number in numbers)}: {error}"
+                return False
+        for number in numbers:
+            del self._wanted[number]
+        return True
 
     def _silent(self, now: float) -> list[str]:
         return [robot.name for robot in self._robots if now - robot.heard > self.deadline]
@@ -220,8 +233,9 @@ class FleetServer:
         return np.stack([robot.state if now - robot.heard <= lost else missing for robot in self._robots])
 
     def _drive(self, setpoint: ControlSetpoint) -> None:
+        states = self._controller.states
         commands = [
-            wire.twist(self._problem, number, robot.state, setpoint.control[number], robot.heading)
+            wire.twist(self._problem, number, states[number], setpoint.control[number], robot.heading)
             for number, robot in enumerate(self._robots)
         ]
         with self._commanding:
@@ -254,13 +268,13 @@ class FleetServer:
         with self._commanding:
             for robot, command, setpoint in zip(self._robots, self._commands, self._setpoints):
                 command.publish(ros.twist(np.zeros(3)))
-                if robot.stand is None and np.isfinite(robot.state).all():
+                if robot.stand is None and np.isfinite(robot.heard):
                     robot.stand = robot.state[:d].astype(np.float64)
                 if robot.stand is not None:
                     setpoint.publish(wire.full_state(robot.name, robot.stand, still, still, robot.heading))
 
     def _diagnosis(self, now: float) -> Any:
-        silent, refused = self._silent(now), sum(topic.refused for topic in self._inputs)
+        silent, refused = self._silent(now), self._unusable + sum(topic.refused for topic in self._inputs)
         values = {
             "silent": ", ".join(silent),
             "arrived": str(int(self._controller.arrived.sum())) if self.state == DRIVING else "",

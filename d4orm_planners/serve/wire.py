@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import LARGEST_NUMBER, FloatArray, Floats
 from d4orm_env.core.lazy import LazyModule, load
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -36,6 +36,10 @@ DEPTH = 64
 """Messages of a topic that wait to be read; older ones make room."""
 RELIABLE = f"::,{DEPTH}:,:,:,,"
 """Quality of service as tokens have it: all as by default, but for the depth."""
+UNNORMALISED = 0.1
+"""Most by which the norm of a quaternion differs from one."""
+TURN_RATE = "turn_rate"
+"""Name of a state component that odometry tells."""
 _ATTACHMENT = struct.Struct("<qqB16s")
 
 
@@ -83,11 +87,11 @@ class RosSession:
         return Publisher(self._session.declare_publisher(key, congestion_control=drop, express=True))
 
     def subscriber(self, topic: str, kind: str, heard: Callable[[Subscriber], None] | None = None) -> Subscriber:
-        """A subscriber to messages of a type; ``*`` in the topic is any one part of a name.
+        """A subscriber to messages of a type.
 
         ``heard`` is called with it, in a thread of the network's, as soon as there is a message to take.
         """
-        self._declare("MS", topic.replace("*", "robots"), kind)
+        self._declare("MS", topic, kind)
         # Whatever the hash: ROS 2 Humble has none.
         key, subscriber = _key(self._domain, topic, kind).rpartition("/")[0] + "/*", Subscriber(kind, heard)
         self._open.append(self._session.declare_subscriber(key, subscriber.hear))
@@ -117,7 +121,7 @@ class Publisher:
 
 
 class Subscriber:
-    """A topic, or several, to read from.
+    """A topic to read from.
 
     Attributes:
         refused: Messages that could not be read.
@@ -133,18 +137,15 @@ class Subscriber:
         if self._heard is not None:
             self._heard(self)
 
-    def take(self) -> list[tuple[str, Any]]:
-        """Return the messages since the last call, oldest first, each after its topic without the slash in front."""
+    def take(self) -> list[Any]:
+        """Return the messages since the last call, oldest first."""
         received = []
         while self._samples:
             sample = self._samples.popleft()
             try:
-                message = ros.message_types().deserialize_cdr(sample.payload.to_bytes(), self._kind)
+                received.append(ros.message_types().deserialize_cdr(sample.payload.to_bytes(), self._kind))
             except Exception:  # whatever bytes a stranger sends
                 self.refused += 1
-                continue
-            parts = str(sample.key_expr).split("/")
-            received.append(("/".join(parts[1:-2]), message))
         return received
 
 
@@ -159,22 +160,30 @@ def _type(kind: str) -> tuple[str, str]:
 
 
 def heading_of(orientation: Any) -> float:
-    """The heading of a quaternion [rad]."""
+    """The heading of a quaternion [rad]; not a number where its norm is not about one."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    if not abs(math.hypot(x, y, z, w) - 1) <= UNNORMALISED:
+        return math.nan
+    return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def state_from(problem: Problem, robot: int, pose: Any, velocity: Floats) -> FloatArray:
-    """``(n,)`` the state of a robot, from its ``geometry_msgs/Pose`` and its velocity ``(3,)`` in its own frame."""
+def state_from(problem: Problem, robot: int, pose: Any, velocity: Floats, turn_rate: float = math.nan) -> FloatArray:
+    """``(n,)`` the state of a robot, from its ``geometry_msgs/Pose`` and its velocity ``(3,)`` in its own frame.
+
+    What these do not say is not a number, as the steering angle of a car.
+    """
     model, d, heading = problem.team.robot_models[robot], problem.dimension, heading_of(pose.orientation)
-    state: FloatArray = np.zeros(problem.state_size, np.float32)
+    state = np.full(problem.state_size, np.nan)
+    state[model.state_size :] = 0.0  # padding
     state[:d] = position_of(pose.position)[:d]
     if model.heading_index is not None:
         state[model.heading_index] = heading
         state[list(model.speed_indices)] = velocity[0]
     elif model.speed_indices:
         state[list(model.speed_indices)] = turned(velocity, heading)[:d]
-    return state
+    if TURN_RATE in model.state_names:
+        state[model.state_names.index(TURN_RATE)] = turn_rate
+    return np.clip(state, -LARGEST_NUMBER, LARGEST_NUMBER).astype(np.float32)
 
 
 def position_of(point: Any) -> Floats:

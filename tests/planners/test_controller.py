@@ -213,6 +213,22 @@ def test_missing_robots_are_where_the_reference_has_them() -> None:
         states = np.hstack([told.position, told.velocity]).astype(np.float32)
 
 
+@pytest.mark.parametrize(("model", "unmeasured"), [("holonomic2d", [2, 3]), ("car", [3, 4]), ("unicycle2", [4])])
+def test_what_no_sensor_says_follows_from_states_and_controls(model: str, unmeasured: list[int]) -> None:
+    problem = team(model, 2)
+    seeing, guessing = (Controller("go-to-goal", mode="measured") for _ in range(2))
+    for controller in (seeing, guessing):
+        controller.begin(problem, problem.start)
+    states = problem.start.copy()
+    for step in range(30):
+        partly = states.copy()
+        partly[:, unmeasured] = np.nan
+        told, other = seeing.step(states, step * problem.dt), guessing.step(partly, step * problem.dt)
+        np.testing.assert_allclose(guessing.states, states, atol=1e-5)
+        np.testing.assert_allclose(other.control, told.control, atol=1e-4)
+        states = advanced(problem, states, told.control)
+
+
 def test_one_setpoint_a_period_and_none_skipped() -> None:
     problem = team("holonomic2d", 2)
     controller = Controller("go-to-goal")

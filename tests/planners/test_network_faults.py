@@ -219,6 +219,20 @@ def test_of_two_nodes_with_one_number_the_second_is_refused() -> None:
     assert first.plan.status == "stopped"
 
 
+def test_a_message_in_its_own_name_costs_no_node_its_solution(attacker: Callable[[str], ZenohTransport]) -> None:
+    endpoint = free_endpoint()
+    solve = Solve(
+        CIRCLE, node=0, nodes=1, zenoh={"listen": [endpoint], "grace_period": 0.1}, improve=True,
+        callback=lambda record: "x node" in record.note, **STRONG,
+    )  # fmt: skip
+    end = attacker(endpoint)
+    wait_until(lambda: solve.found, "a solution")
+    false = encode(Message(0, 1, np.zeros((CIRCLE.horizon, CIRCLE.num_robots, 2), np.float32), 0.0, False), CIRCLE)
+    end.publish(false)
+    assert solve.plan.solved
+    assert solve.plan.status == "stopped"
+
+
 @pytest.mark.parametrize("stalls", [True, False])
 def test_a_partition_that_heals(
     stalls: bool, tmp_path: Path, ends: list[ZenohTransport], monkeypatch: pytest.MonkeyPatch

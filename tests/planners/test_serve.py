@@ -20,6 +20,7 @@ from env_support import slow
 
 from d4orm_env import Problem, Team
 from d4orm_planners import Controller
+from d4orm_planners.base.controller import Mode
 from d4orm_planners.cli.app import main
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 
@@ -240,8 +241,18 @@ class Memory:
         return subscriber
 
     def say(self, topic: str, message: Any) -> None:
-        self.inbox[topic].append((topic, message))
-        self.heard[topic]()
+        self.inbox[topic].append(message)
+        if self.heard[topic]:
+            self.heard[topic]()
+
+
+def planned(tick: Callable[[], object], server: FleetServer) -> None:
+    """Tick until the robots drive: a thread plans, and kernels may have to be compiled for it."""
+    end = time.monotonic() + 600
+    while server.state != "driving":
+        tick()
+        time.sleep(0.01)
+        assert time.monotonic() < end
 
 
 def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
@@ -255,7 +266,7 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
             while not until_told():
                 for name, at, told in zip(names, position, commands, strict=True):
                     odometry = odometry_of(at, told[-1] if told else None)
-                    session.inbox["*/odom"].append((f"{name}/odom", odometry))
+                    session.say(f"{name}/odom", odometry)
                 server.tick(DT * len(states))
                 states.append(server.state)
                 position[:, 0] += [DT * told[-1].linear.x for told in commands]
@@ -265,7 +276,7 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
                     assert time.monotonic() < end
 
         live(lambda: bool(commands[1]) and commands[1][-1].linear.x > 0.4)
-        session.inbox["*/goal"].append(("robot_0/goal", pose_stamped(0.3, 0.2)))
+        session.say("robot_0/goal", pose_stamped(0.3, 0.2))
         begun = len(states)
         live(lambda: states[-1] == "planning" and len(states) > begun)
     speeds = np.array([command.linear.x for command in commands[1]])
@@ -282,19 +293,16 @@ def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
     session, thinking, go_on = Memory(), threading.Event(), threading.Event()
     with Controller("go-to-goal", mode="measured") as controller:
         server = FleetServer(session, problem(), controller, ("robot_0", "robot_1"), DEADLINE)  # type: ignore[arg-type]
-        command, period, end = session.sent["robot_0/cmd_vel"], 0, time.monotonic() + 600
+        command, period = session.sent["robot_0/cmd_vel"], 0
 
         def tick() -> None:
             nonlocal period
             period += 1
             for number, position in enumerate(problem().start[:, :2].astype(float)):
-                session.inbox["*/odom"].append((f"robot_{number}/odom", odometry_of(position)))
+                session.say(f"robot_{number}/odom", odometry_of(position))
             server.tick(DT * period)
 
-        while not (command and command[-1].linear.x > 0):
-            tick()
-            time.sleep(0.01)  # a thread plans, and kernels may have to be compiled for it
-            assert time.monotonic() < end
+        planned(tick, server)
         step = controller.step
 
         def slow(*arguments: Any) -> Any:
@@ -314,6 +322,85 @@ def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
         tick()
         assert {sent.linear.x for sent in command[told:]} == {0}
         assert server.state == "stopped"
+
+
+@contextlib.contextmanager
+def in_memory(team_problem: Problem, mode: Mode = "measured") -> Iterator[tuple[Memory, FleetServer]]:
+    session, names = Memory(), [f"robot_{number}" for number in range(team_problem.num_robots)]
+    with Controller("go-to-goal", mode=mode) as controller:
+        yield session, FleetServer(session, team_problem, controller, tuple(names), DEADLINE)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+@pytest.mark.parametrize("model", ["car", "unicycle2", "differential_drive"])
+def test_robots_whose_odometry_does_not_say_all_arrive(model: str, mode: Mode) -> None:
+    team = Team((model,))
+    alone = Problem(team, [[0.0] * team.state_size], [[2.0, 1.5]], horizon=150)
+    with in_memory(alone, mode) as (session, server):
+        x, y, heading, told, period = 0.0, 0.0, 0.0, ros.twist(np.zeros(3)), 0
+
+        def tick() -> None:
+            nonlocal period
+            period += 1
+            odometry = odometry_of(np.array([x, y]), told)
+            odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = (
+                np.sin(heading / 2),
+                np.cos(heading / 2),
+            )
+            session.say("robot_0/odom", odometry)
+            server.tick(alone.dt * period)
+
+        planned(tick, server)
+        for _ in range(alone.horizon):
+            told = session.sent["robot_0/cmd_vel"][-1]
+            middle = heading + told.angular.z * alone.dt / 2
+            x, y = x + alone.dt * told.linear.x * np.cos(middle), y + alone.dt * told.linear.x * np.sin(middle)
+            heading += told.angular.z * alone.dt
+            tick()
+    assert math.hypot(x - 2.0, y - 1.5) < alone.goal_radius + 0.02
+    assert abs(told.linear.x) < 0.05
+
+
+def test_goals_of_one_moment_are_taken_together_and_known_ones_change_nothing() -> None:
+    with in_memory(problem()) as (session, server):
+        period = 0
+
+        def tick(*goals: tuple[int, float, float]) -> str:
+            nonlocal period
+            period += 1
+            for number, position in enumerate(problem().start[:, :2].astype(float)):
+                session.say(f"robot_{number}/odom", odometry_of(position))
+            for number, *goal in goals:
+                session.say(f"robot_{number}/goal", pose_stamped(*goal))
+            server.tick(DT * period)
+            return server.state
+
+        planned(tick, server)
+        assert tick((0, 0.6, 0.0)) == tick((1, 0.6, 1.0)) == "driving"
+        assert tick((0, 0.6, 1.0)) == "driving"
+        assert "robot_0" in server.refusal
+        assert tick((1, 0.6, 0.0)) == "braking"
+        np.testing.assert_allclose(server._problem.goal, problem().goal[::-1])
+        planned(tick, server)
+        assert tick((0, math.nan, 0.0), (1, 0.0, 0.5)) == "braking"
+        np.testing.assert_allclose(server._problem.goal, np.float32([[0.6, 1.0], [0.0, 0.5]]))
+
+
+@pytest.mark.parametrize("broken", [(0, 0, 0, 0), (0, 0, 0, 2), (0, 0, math.nan, 1)])
+def test_odometry_without_a_heading_is_not_taken(broken: tuple[float, ...]) -> None:
+    team = Team(("velocity2d",))
+    alone = Problem(team, [[0.0, 0.0]], [[2.0, 1.5]])
+    with in_memory(alone) as (session, server):
+        odometry = odometry_of(np.array([1e300, 0.0]))
+        session.say("robot_0/odom", odometry)
+        server.tick(0.0)
+        orientation = odometry.pose.pose.orientation
+        orientation.x, orientation.y, orientation.z, orientation.w = broken
+        session.say("robot_0/odom", odometry)
+        server.tick(1.0)
+        assert server.state == "waiting"
+        told = {pair.key: pair.value for pair in session.sent["diagnostics"][-1].status[0].values}
+        assert (told["silent"], told["unreadable messages"]) == ("robot_0", "1")
 
 
 def test_velocities_are_taken_from_poses() -> None:

@@ -34,6 +34,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 from d4orm_env import make_problem
+from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.play import edits, panel
 from d4orm_planners.play.edits import MOST_WAITING
@@ -123,6 +124,25 @@ def test_a_control_takes_all_that_it_offers(playground: Playground, connection: 
         used = control(playground, label)
         say(connection, update(used, value))
         until(lambda used=used, value=value: used.value == value)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("name", panel.SLIDERS)
+def test_every_level_on_a_slider_is_one(name: str) -> None:
+    levels = panel.SLIDERS[name]
+    for level in {levels.low, levels.high} - {levels.off}:
+        assert disturbances_at({name: level})
+
+
+def test_after_a_step_that_fails_the_page_shows_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    playground = Playground(make_problem("circle", num_robots=2), "go-to-goal")  # whose clock does not run
+    try:
+        for viewport in playground.session._viewports:
+            monkeypatch.setattr(viewport, "advance", lambda: 1 / 0)
+        playground.session._advance_or_pause()
+        playground._panel.update()
+        assert playground._panel.paused.value
+    finally:
+        playground.close()
 
 
 def test_a_refusal_takes_no_change_back_that_waits() -> None:
