@@ -8,13 +8,15 @@ each other without any gap.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.manoeuvres.costs import pop
-from d4orm_planners.manoeuvres.curves import Curve, Curves, curve_of
+from d4orm_planners.manoeuvres.curves import Curve, Curves, curve_controls, curve_of
 from d4orm_planners.manoeuvres.lattice import cell_of, is_far_from_all, moved, pose_of
 from d4orm_planners.manoeuvres.nodes import (
     AHEAD,
@@ -32,7 +34,8 @@ from d4orm_planners.manoeuvres.nodes import (
     sweep,
 )
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
-from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, Goal, Limits, Snap, snap_of
+from d4orm_planners.manoeuvres.robots import Robot
+from d4orm_planners.manoeuvres.snapping import CURVING, NOWHERE, SIDEWAYS, Goal, Limits, Snap, snap_controls, snap_of
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meeting, safe_since, safe_until, visits_of
 
 NOTHING, PAUSED = -1, -2
@@ -230,3 +233,45 @@ def snap_from(limits: Limits, goal: Goal, x: float, y: float, heading: float, mo
 def curve_from(curves: Curves, goal: Goal, x: float, y: float, heading: float, move: int) -> Curve:
     """The last stretch of a first-order car from a pose, as one of the moves."""
     return curve_of(curves, goal, x, y, heading, -1.0 if move == BEHIND else 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A robot's motion."""
+
+    poses: FloatArray  #: ``(T + 1, 6)`` float32
+    controls: FloatArray  #: ``(T, m)``
+
+    @property
+    def steps(self) -> int:
+        """Steps until it has arrived."""
+        return len(self.controls)
+
+
+def motion_to(robot: Robot, task: Task, nodes: Nodes, node: int) -> Motion:
+    """The motion that ends in a node."""
+    chain = [node]
+    while nodes.parent[chain[-1]] >= 0:
+        chain.append(int(nodes.parent[chain[-1]]))
+    steps = int(nodes.time[node])
+    controls = np.zeros((steps, robot.model.control_size), np.float32)
+    for last in chain[:-1]:
+        since, until = int(nodes.depart[last]), int(nodes.time[last])
+        pose = nodes.pose[nodes.parent[last]].tolist()
+        controls[since:until] = _controls(robot, int(nodes.move[last]), pose)[: until - since]
+    poses = np.empty((steps + 1, POSE_SIZE), np.float32)
+    trace(task, nodes, node, poses)
+    return Motion(poses, controls)
+
+
+def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:
+    """``(n, m)`` controls of a move from a pose."""
+    task, (x, y, heading) = robot.task, pose[:3]
+    if move >= 0:
+        first, end = task.primitives.first[move : move + 2]
+        return task.primitives.controls[first:end]
+    if task.limits.way == CURVING:
+        curve = curve_from(task.curves, task.goal, x, y, heading, move)
+        return curve_controls(task.curves, curve, task.limits.dt)
+    controls = snap_controls(task.limits, snap_from(task.limits, task.goal, x, y, heading, move))
+    return controls[:, ::-1] if robot.model.name == "differential_drive" else controls

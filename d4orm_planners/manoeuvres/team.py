@@ -5,7 +5,7 @@ robot after another among the others, and replanned for a few at a time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
@@ -18,13 +18,12 @@ from d4orm_env.engine.threads import Threads, available_cores
 from d4orm_env.footprints import Box
 from d4orm_planners.base.planner import Iteration
 from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.manoeuvres.curves import NO_CURVES, curve_controls
+from d4orm_planners.manoeuvres.curves import NO_CURVES
 from d4orm_planners.manoeuvres.lattice import buffer_size
-from d4orm_planners.manoeuvres.nodes import AHEAD, Nodes, Task
+from d4orm_planners.manoeuvres.nodes import AHEAD, Nodes
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
-from d4orm_planners.manoeuvres.search import PAUSED, curve_from, find_motion, snap_from, trace
-from d4orm_planners.manoeuvres.snapping import CURVING, snap_controls
+from d4orm_planners.manoeuvres.search import PAUSED, Motion, curve_from, find_motion, motion_to
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
 
@@ -33,26 +32,13 @@ MAX_NODES = 100_000
 FIRST_NODES = 400_000
 """... and among others at first a robot's share of so many, once more after every four searches of each: in a large
 team it is quicker to change others' motions."""
-FINER = (0.8, 0.6)
-"""Sizes of cells that are tried in turn for a robot without a motion alone, as shares of the usual one: whether poses
-that count as one leave a way through a tight place is chance."""
+CELLS = ((1.0, MAX_NODES), (0.8, MAX_NODES), (0.6, MAX_NODES), (0.25, 10 * MAX_NODES))
+"""Sizes of cells that are tried in turn for a robot alone, as shares of the usual one, and nodes: whether poses that
+count as one leave a way through a tight place is chance."""
 ROUNDS = 200
 """Neighbourhoods that are replanned to find a motion for everybody."""
 BETTER_ROUNDS = 16
 """Neighbourhoods that are replanned in an iteration once everybody has one."""
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A robot's motion."""
-
-    poses: FloatArray  #: ``(T + 1, 6)`` float32
-    controls: FloatArray  #: ``(T, m)``
-
-    @property
-    def steps(self) -> int:
-        """Steps until it has arrived."""
-        return len(self.controls)
 
 
 class TeamMotions:
@@ -75,24 +61,29 @@ class TeamMotions:
         self.problem, self.robots, self.should_stop = scene.problem, robots, should_stop
         self._area, self._interaction_range, problem = scene.area, scene.interaction_range, scene.problem
         size, horizon = problem.num_robots, problem.horizon
-        self._nodes, self._searches = self._room_for_nodes(), size
         self._poses = np.empty((size, horizon + 1, POSE_SIZE), np.float32)
         self._poses[:] = np.array([robot.start for robot in self.robots])[:, None]
         self.motions: list[Motion | None] = [None] * size
         self.alone: list[Motion | None] = [None] * size
-        nobody = self._traffic((), {})
+        nobody, room = self._traffic((), {}), MAX_NODES
 
         def find_alone(part: IntArray) -> None:
-            nodes = self._room_for_nodes()
+            nonlocal room
+            nodes, searches = self._room_for_nodes(MAX_NODES), count(1)
             for robot in range(part[0], part[1]):
-                for share in (1.0, *FINER):
+                for share, most in CELLS:
                     if share < 1.0:
                         self.robots[robot] = make_robot(scene.with_cells(share), robot) or self.robots[robot]
-                    self.alone[robot] = self._search(robot, nobody, nodes, 1 + robot, MAX_NODES)
+                    if most > len(nodes.mode):
+                        nodes, room = self._room_for_nodes(most), most
+                    self.alone[robot] = self._search(robot, nobody, nodes, next(searches), most)
                     if self.alone[robot] is not None or should_stop():
                         break
+                else:
+                    return  # nor will the team have any
 
         Threads(available_cores()).over(size, find_alone)
+        self._nodes, self._searches = self._room_for_nodes(room), size
 
     @classmethod
     def prepared(cls, problem: Problem, should_stop: Callable[[], bool]) -> TeamMotions | None:
@@ -193,8 +184,8 @@ class TeamMotions:
                 last[other], gone[other] = 0, steps
         return traffic_of(self._poses, last, gone, self._area.low, self._area.high, self._interaction_range)
 
-    def _room_for_nodes(self) -> Nodes:
-        return Nodes.of(MAX_NODES, buffer_size(self.problem.team.all_footprint_arrays))
+    def _room_for_nodes(self, most: int) -> Nodes:
+        return Nodes.of(most, buffer_size(self.problem.team.all_footprint_arrays))
 
     def _find(self, number: int, traffic: Traffic) -> Motion | None:
         """A robot's motion among others: that which it would take alone, or else one that is looked for."""
@@ -214,7 +205,7 @@ class TeamMotions:
         while node == PAUSED and nodes.filled[0] < most and not self.should_stop():
             node = find_motion(task, traffic, nodes, robot.start, robot.mode, goes_on)
             goes_on = True
-        return None if node < 0 else _motion(robot, task, nodes, node)
+        return None if node < 0 else motion_to(robot, task, nodes, node)
 
     def controls(self) -> FloatArray:
         """``(H, K, m)`` of the whole team; a robot without a motion is at rest."""
@@ -224,35 +215,6 @@ class TeamMotions:
             if motion is not None:
                 controls[: motion.steps, robot, : motion.controls.shape[1]] = motion.controls
         return controls
-
-
-def _motion(robot: Robot, task: Task, nodes: Nodes, node: int) -> Motion:
-    """The motion that ends in a node."""
-    chain = [node]
-    while nodes.parent[chain[-1]] >= 0:
-        chain.append(int(nodes.parent[chain[-1]]))
-    steps = int(nodes.time[node])
-    controls = np.zeros((steps, robot.model.control_size), np.float32)
-    for last in chain[:-1]:
-        since, until = int(nodes.depart[last]), int(nodes.time[last])
-        pose = nodes.pose[nodes.parent[last]].tolist()
-        controls[since:until] = _controls(robot, int(nodes.move[last]), pose)[: until - since]
-    poses = np.empty((steps + 1, POSE_SIZE), np.float32)
-    trace(task, nodes, node, poses)
-    return Motion(poses, controls)
-
-
-def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:
-    """``(n, m)`` controls of a move from a pose."""
-    task, (x, y, heading) = robot.task, pose[:3]
-    if move >= 0:
-        first, end = task.primitives.first[move : move + 2]
-        return task.primitives.controls[first:end]
-    if task.limits.way == CURVING:
-        curve = curve_from(task.curves, task.goal, x, y, heading, move)
-        return curve_controls(task.curves, curve, task.limits.dt)
-    controls = snap_controls(task.limits, snap_from(task.limits, task.goal, x, y, heading, move))
-    return controls[:, ::-1] if robot.model.name == "differential_drive" else controls
 
 
 def compile_manoeuvres() -> None:

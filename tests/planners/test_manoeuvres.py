@@ -54,6 +54,30 @@ def test_a_robot_parks_between_two_obstacles(arrival: str) -> None:
     assert plan.metrics["makespan"] < 15
 
 
+@pytest.mark.parametrize("model", ["unicycle", "car_first_order"])
+def test_a_place_that_only_the_finest_cells_lead_into(model: str) -> None:
+    world = World(boxes=[[0.6, 0.0, 2.0, 0.3], [2.95, 0.0, 4.95, 0.3]], lower=[0, 0], upper=[5, 2.2])
+    team = Team((model,), footprint=Box(0.5, 0.25))
+    solved(
+        Problem(
+            team, [[0.8, 1.2, 0.0]], [[2.475, 0.16]], world, horizon=800, margin=0.01, goal_radius=0.05,
+            goal_heading=0.0, goal_heading_tolerance=0.15, arrival="stay",
+        )
+    )  # fmt: skip
+
+
+def test_searches_in_the_same_nodes_have_numbers_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[int, int]] = []
+
+    def search(self: TeamMotions, number: int, traffic: Any, nodes: Any, search: int, most: int) -> None:
+        seen.append((id(nodes.marks), search))
+
+    monkeypatch.setattr(TeamMotions, "_search", search)
+    problem = problem_of([[1.0, 0.6, 0.0]], [[2.65, 0.15, 0.0]], [])
+    assert TeamMotions.prepared(problem, lambda: False) is None
+    assert len(seen) == len(set(seen)) > 2
+
+
 def test_robots_that_meet_in_a_corridor_use_its_alcove() -> None:
     start, goal = [[0.7, 0.65, 0.0], [5.3, 0.65, np.pi]], [[5.3, 0.65, 0.0], [0.7, 0.65, np.pi]]
     plan = solved(problem_of(start, goal, CORRIDOR))
