@@ -170,6 +170,8 @@ def short_repr(value: object) -> str:
 def number_list(given: object, name: str, count: int | None = None) -> Floats:
     """A list of finite numbers in a file, or one number; the first ``count`` of them, where so many are wanted."""
     try:
+        if any(isinstance(value, bool) for value in (given if isinstance(given, list) else [given])):
+            raise TypeError("truth is no number")
         numbers = np.atleast_1d(np.array(given, np.float64))
     except (TypeError, ValueError):
         numbers = np.zeros((0, 0))

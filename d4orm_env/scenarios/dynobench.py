@@ -1,9 +1,9 @@
 """Multi-robot problems of dynobench, db-CBS and db-LaCAM as they are written, in YAML, and results for their checkers.
 
-Their models move by Euler steps of 0.1 s and ours by Runge-Kutta, which differ by less than the 0.01 that their
-checkers allow from one state to the next. They bound velocities and accelerations of integrators by component and we by
-norm, which is within. They keep reference points within the bounds and we bodies, so ours are wider by what every body
-covers.
+Their models move by Euler steps of 0.1 s and ours by Runge-Kutta, which differ by the 0.01 at most that db-CBS's
+checker allows from one state to the next, for robots as fast as theirs. They bound velocities and accelerations of
+integrators by component and we by norm, which is within. They keep reference points within the bounds and we bodies, so
+ours are wider by what every body covers.
 """
 
 from __future__ import annotations
@@ -45,8 +45,10 @@ SLOWEST = 10
 """A problem's duration, in times that its robots would need straight to their goals."""
 LEAST_STEPS = 300
 
-KEYS = ("min", "max", "obstacles")
-"""Keys of their environments that are read. One that looks like one of these is an error, all others are left."""
+KEYS, ROBOT_KEYS = ("min", "max", "obstacles"), ("type", "start", "goal")
+"""Keys of their environments and robots that are read. One that looks like one of these is an error, all others are
+left.
+"""
 
 
 def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[str, Any]] | None = None) -> Problem:
@@ -82,13 +84,15 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
 
 def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.PathLike[str]) -> Problem:
     robots, environment = content["robots"], content["environment"]
-    for name in environment:
-        if name not in KEYS and (meant := did_you_mean(name, KEYS)):
-            raise ValueError(f"environment has the key {short_repr(name)}{meant}")
+    entries = [(f"robot_{number}", robot, ROBOT_KEYS) for number, robot in enumerate(robots)]
+    for what, entry, keys in [("environment", environment, KEYS), *entries]:
+        for name in entry:
+            if name not in keys and (meant := did_you_mean(name, keys)):
+                raise ValueError(f"{what} has the key {short_repr(name)}{meant}")
     types = [robot["type"] for robot in robots]
-    if unknown := [name for name in dict.fromkeys(types) if name not in models]:
+    if unknown := dict.fromkeys(short_repr(name) for name in types if not isinstance(name, str) or name not in models):
         raise ValueError(
-            f"robot types {', '.join(map(short_repr, unknown))} are unknown; known are {', '.join(models)}, or give "
+            f"robot types {', '.join(unknown)} are unknown; known are {', '.join(models)}, or give "
             f"their parameters as models={{type: {{'dynamics': ...}}}}"
         )
     parameters = [symmetric(models[name]) | models[name] for name in types]
@@ -195,7 +199,7 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
             states[:, hitch] = states[:, hitch - 1] - states[:, hitch]
         if model.heading_index is not None:
             turned = [model.heading_index, *(hitch for hitch, _ in model.trailers)]
-            states[:, turned] = _wrapped(states[:, turned])
+            states[1:, turned] = _wrapped(states[1:, turned])  # the first one is as in the problem
         yield "-"
         for name, rows in (("states", states), ("actions", trajectory.controls[:last, robot, : model.control_size])):
             yield f"  {name}:" if len(rows) else f"  {name}: []"

@@ -51,7 +51,7 @@ def completed(
     if measured.shape != reference.shape:
         raise ValueError(f"states have shape {measured.shape}; expected (K, n) = {reference.shape}")
     finite = np.isfinite(measured)
-    known: BoolArray = finite[:, : problem.dimension].all(axis=1)
+    known: BoolArray = np.all(finite[:, : problem.dimension], axis=1)
     for model, robots in by_model(problem):
         if model.heading_index is not None:
             known[robots] &= finite[robots, model.heading_index]

@@ -131,8 +131,11 @@ class NoPaths:
     unreachable: tuple[int, ...] = ()  #: Robots that have no path to their goals, if that is why
 
     @classmethod
-    def unless_reachable(cls, problem: Problem) -> NoPaths | None:
+    def unless_reachable(cls, search: SolveRun) -> NoPaths | None:
         """Return why there are no paths, if :meth:`Problem.check_reachable` knows."""
+        problem = search.problem
+        with search.watch.paused():  # it may compile
+            _small_problem(problem, 0).check_reachable()
         try:
             problem.check_reachable()
         except ValueError as error:
@@ -187,7 +190,7 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
             driven = replanning.one_by_one(random, search.should_stop, paths)
             if driven is not None:
                 return RoadmapSolution(replanning, driven)
-        elif number == 0 and (reason := NoPaths.unless_reachable(problem)) is not None:
+        elif number == 0 and (reason := NoPaths.unless_reachable(search)) is not None:
             return reason
         if search.should_stop():
             return NoPaths(NOT_IN_TIME)

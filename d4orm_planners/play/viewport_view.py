@@ -64,7 +64,7 @@ class ViewportView:
         self._paths = {name: PathLines(frame.problem) for name in ("plans", "guidance")}
         self._colors = self._own_colors = 255 * robot_colors(frame.problem.num_robots)
         self._groups = meshes.body_groups(frame.problem)
-        self._removed = False
+        self._removed, self._positions = False, dict[str, Points]()
         self._nodes: dict[str, Any] = {"": self._scene.add_frame(self._root, show_axes=False, position=position)}
         self._add_team(frame)
         self._add_world(frame.problem)
@@ -135,7 +135,7 @@ class ViewportView:
         flat = problem.dimension == 2
         mark, dot = 1.5 * radius if flat else 1.4 * radius, 0.35 * radius
         positions, goals = in_space(frame.positions(time.perf_counter())), in_space(frame.goals)
-        self._positions: dict[str, Points] = {"robot": positions, "goal": goals}
+        self._positions = {"robot": positions, "goal": goals}
         shown = meshes.body_positions(problem, frame.states, positions)[0]
         for group in self._groups:
             at, colors = shown[group.bodies], self._colors[group.robots]

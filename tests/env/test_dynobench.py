@@ -105,6 +105,13 @@ def test_own_parameters_are_taken(instance: Path) -> None:
         ("unicycle1_v0", "hovercraft_7", "robot types 'hovercraft_7' are unknown; known are unicycle1_v0"),
         ("type: box", "type: torus", "obstacle type 'torus' is unknown; known are box, sphere"),
         ("obstacles:", "obstacle:", "environment has the key 'obstacle'; did you mean 'obstacles'?"),
+        ("goal: [4, 1.5, 0]", "gaol: [4, 1.5, 0]", "robot_0 has the key 'gaol'; did you mean 'goal'?"),
+        (
+            "goal: [4, 1.5, 0]",
+            "goal: [true, 1.5, 0]",
+            "goal of robot_0 is [True, 1.5, 0]; it must be a list of numbers",
+        ),
+        ("type: unicycle1_v0", "type: [a]", "robot types ['a'] are unknown; known are unicycle1_v0"),
         ("robots:", "agents:", "is no multi-robot problem of dynobench (it lacks 'robots'); it has environment: min"),
         ("goal: [4, 1.5, 0]", "goal: [4, left, 0]", "goal of robot_0 is [4, 'left', 0]; it must be a list of numbers"),
         ("goal: [4, 1.5, 0]", "goal: there", "goal of robot_0 is 'there'; it must be a list of numbers, as"),
@@ -182,6 +189,15 @@ def test_goals_in_motion_are_refused(tmp_path: Path, goal: str) -> None:
     path.write_text("environment: {min: [0, 0], max: [5, 5]}\n" + robots)
     with pytest.raises(ValueError, match=rf"goal of robot_0 is {re.escape(goal)}; give one at rest"):
         load_dynobench(path)
+
+
+def test_a_start_is_written_as_it_was_read(tmp_path: Path) -> None:
+    path = tmp_path / "one.yaml"
+    robots = f"robots: [{{type: unicycle1_v0, start: [4, 2.5, {np.pi}], goal: [3, 2.5, 3.0]}}]\n"
+    path.write_text("environment: {min: [0, 0], max: [5, 5]}\n" + robots)
+    make_planner().solve(load_dynobench(path), seed=0).to_dynobench(tmp_path / "result.yaml")
+    (result,) = yaml.safe_load((tmp_path / "result.yaml").read_text())["result"]
+    np.testing.assert_allclose(result["states"][0], [4, 2.5, np.pi], atol=1e-5)
 
 
 def test_a_unicycle_of_second_order_is_read(tmp_path: Path) -> None:

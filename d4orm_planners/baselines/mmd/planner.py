@@ -226,7 +226,7 @@ class MMD(Planner):
 def _begin(search: SolveRun) -> Tree | NoPaths:
     """The tree before its root."""
     problem, space = search.problem, world_space(search.problem)
-    reason = NoPaths.unless_reachable(problem)
+    reason = NoPaths.unless_reachable(search)
     if reason is not None:
         return reason
     # The first numbers are the robots'.
