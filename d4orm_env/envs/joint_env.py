@@ -78,7 +78,8 @@ class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
         terminated = bool(simulation.arrived.all())
         truncated = simulation.out_of_time and not terminated
         self._show()
-        return step.observations.ravel(), float(step.rewards.mean()), terminated, truncated, self._infos(step)
+        reward = float(simulation.worlds.reward[0])
+        return step.observations.ravel(), reward, terminated, truncated, self._infos(step)
 
     def set_state(self, states: ArrayLike) -> tuple[FloatArray, Info]:
         """Put the robots elsewhere; see :meth:`d4orm_env.navigation_v0.parallel_env.set_state`.

@@ -60,14 +60,19 @@ def save_animation(
     checked_trajectory(problem, trajectory)
     with replaced_when_done(path := Path(path), ANIMATION_SUFFIXES) as temporary:
         kind = path.suffix.lower()
-        if kind == ".mp4" and shutil.which("ffmpeg") is None:
-            raise ValueError(f"{path} needs ffmpeg, which is not on the PATH; install it, or write a .gif instead")
+        check_ffmpeg(path)
         most = _MOST_FRAMES_PER_SECOND[kind]
         steps, rate = frame_steps(problem, trajectory, _frame_rate(problem, fps, speed, most), speed, max_frames)
         write = _write_gif if kind == ".gif" else _write_mp4
         with closing(FrameRenderer(problem, frame_size(problem, trajectory), trajectory.positions)) as renderer:
             write(temporary, _Frames(renderer, trajectory, steps, events), rate)
     return path
+
+
+def check_ffmpeg(path: Path) -> None:
+    """Raise ``ValueError`` if an animation at this path needs ffmpeg and it is not installed."""
+    if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
+        raise ValueError(f"{path} needs ffmpeg, which is not on the PATH; install it, or write a .gif instead")
 
 
 def _frame_rate(problem: Problem, fps: float | None, speed: float, most: float) -> float:

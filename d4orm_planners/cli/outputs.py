@@ -81,6 +81,8 @@ class PictureOptions:
         """Raise ``ValueError`` if they cannot be written."""
         check_target(self.picture, (".png", ".svg", ".pdf"))
         check_target(self.animation, (".gif", ".mp4"))
+        if self.animation is not None:
+            render.check_ffmpeg(self.animation)
 
     def draw(self, problem: Problem, trajectory: Trajectory, events: DisturbanceEvents | None = None) -> None:
         """Write the pictures that were asked for."""
@@ -99,7 +101,7 @@ def episode_rows(episode: Episode) -> list[tuple[str, str]]:
         ("robots in contact", f"{metrics['collided']:.0f}"),
         ("travel time", f"{metrics['travel_time']:.2f} s"),
         ("makespan", f"{metrics['makespan']:.2f} s"),
-        ("stretch", f"{episode.stretch:.2f}"),
+        ("stretch", f"{episode.stretch:.2f}" if metrics["arrived"] else "-"),
     ]
 
 

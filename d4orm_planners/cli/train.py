@@ -55,7 +55,9 @@ class TrainOptions:
     num_robots: Annotated[int, typer.Option("--num-robots", "--robots", "-k", help="Size of the full team.")] = 4
     steps: Annotated[float, typer.Option(help="Robot-steps, as 5e6.")] = 5e6
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0
-    model: Model = None
+    model: Annotated[
+        str | None, typer.Option("--model", "-m", help="Robot model of all; the scenario's own by default.")
+    ] = None
     num_envs: Annotated[int | None, typer.Option(help="Robots that act at once; 1024 for ppo, 64 for sac.")] = None
     curriculum: Annotated[bool, typer.Option(help="Begin with smaller teams.")] = False
     stages: Annotated[int, typer.Option(help="Parts with a checkpoint and an evaluation each.")] = 50

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, fields
 from functools import cached_property
 from itertools import chain
@@ -166,14 +166,22 @@ class Trial:
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
 _TRUTHS = ("success", "verified")
-_JSON: Mapping[str, type | tuple[int, ...]] = {
-    "config": dict,
-    "versions": dict,
-    "machine": dict,
-    "history": (3, 4),
-    "disturbances": (2,),
+_MACHINE = {"processor", "cores", "cores_used", "python"}
+"""What a machine that is described has at least."""
+
+
+def _are_lists(content: Any, *lengths: int) -> bool:
+    return isinstance(content, list) and all(isinstance(entry, list) and len(entry) in lengths for entry in content)
+
+
+_JSON: Mapping[str, Callable[[Any], bool]] = {
+    "config": lambda content: isinstance(content, dict),
+    "versions": lambda content: isinstance(content, dict),
+    "machine": lambda content: content == {} or (isinstance(content, dict) and content.keys() >= _MACHINE),
+    "history": lambda content: _are_lists(content, 3, 4),
+    "disturbances": lambda content: _are_lists(content, 2) and all(isinstance(levels, dict) for _, levels in content),
 }
-"""Columns that must be JSON: an object, or a list of lists of one of these lengths."""
+"""Columns that must be JSON, and what it must be."""
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
@@ -278,13 +286,9 @@ def checked_trial(values: Mapping[str, Any]) -> Trial:
     return Trial(**{**values, **truths})
 
 
-def _is_json(text: str, kind: type | tuple[int, ...]) -> bool:
-    """Check whether a text is JSON of this kind: an object, or a list of lists of one of these lengths."""
+def _is_json(text: str, is_right: Callable[[Any], bool]) -> bool:
+    """Check whether a text is JSON, and as it must be."""
     try:
-        content = json.loads(text)
+        return is_right(json.loads(text))
     except (ValueError, RecursionError):
         return False
-    if isinstance(kind, tuple):
-        lists = content if isinstance(content, list) else [None]
-        return all(isinstance(entry, list) and len(entry) in kind for entry in lists)
-    return isinstance(content, kind)

@@ -79,6 +79,10 @@ class SetExtractor(BaseFeaturesExtractor):
         return named
 
 
+SHARES = ("tau", "gae_lambda")
+"""Settings that are at most 1."""
+
+
 class Algorithm:
     """One of Stable-Baselines3's algorithms."""
 
@@ -118,6 +122,8 @@ class Algorithm:
             if keyword not in self.tunable:
                 raise ValueError(f"learner_settings has {keyword!r}; choose of {', '.join(self.tunable)}")
             least = 1 if isinstance(self.tunable[keyword], int) else None
+            if keyword in SHARES and value > 1:
+                raise ValueError(f"learner_settings has {keyword}={value:g}; it must be at most 1")
             if value < 0 or (least and (value < least or value != int(value))):
                 wanted = "a whole number of at least 1" if least else "at least 0"
                 raise ValueError(f"learner_settings has {keyword}={value:g}; it must be {wanted}")
@@ -211,12 +217,18 @@ def set_network(model: BaseAlgorithm, normalization: VecNormalize, network: Netw
             f"the policy to start from is a {theirs_kind} network, and a {mine_kind} one is wanted; give "
             f"network={theirs_kind!r}, or another policy"
         )
+    if network.header.squashed != _squashed(model):
+        raise ValueError(
+            f"the policy to start from was trained by {network.header.algorithm}, whose networks differ; give one that "
+            "was trained by the same algorithm"
+        )
     mine = {name: tuple(parameter.shape) for name, parameter in parameters.items()}
     theirs = {name: array.shape for name, array in arrays.items() if not name.endswith(("_mean", "_variance"))}
-    if mine != theirs or network.header.squashed != _squashed(model):
+    if mine != theirs:
         raise ValueError(
-            f"the policy to start from is a network of {network.header.algorithm} with layers {theirs}, and {mine} are "
-            "wanted; give one that was trained for the same robots by the same algorithm"
+            f"the policy to start from is a network with layers {theirs}, and {mine} are wanted; give one that was "
+            f"trained with the same settings: it saw {network.header.num_neighbors} robots and "
+            f"{network.header.num_obstacles} obstacles"
         )
     with torch.no_grad():
         for name, parameter in parameters.items():

@@ -105,6 +105,12 @@ class _TrainingRun:
             raise ValueError(
                 f"start_from is {path}, whose robots look along their shortest paths; give --shortest-paths"
             )
+        robots = self.settings.worlds(self.stages[0], 0, 0, {})
+        try:  # whether it fits
+            normalized = VecNormalize(robots)
+            set_network(self._fresh_model(normalized), normalized, network)
+        finally:
+            robots.close()
         return network
 
     def learn(self, index: int) -> None:
@@ -143,9 +149,7 @@ class _TrainingRun:
         """The model with the state of the last checkpoint, in a new environment."""
         model, fresh = self._model, self._model is None
         if model is None:
-            set_random_seed(self._training_seed(0))
-            features = self._validation.features if self.settings.network == "sets" else None
-            model = self._algorithm.make(env, features, self.settings.learner_settings)
+            model = self._fresh_model(env)
             model.set_logger(configure(str(self._out / "tensorboard"), ["tensorboard"]))
         else:
             model.set_env(env, force_reset=True)
@@ -154,6 +158,11 @@ class _TrainingRun:
         elif self._start is not None:
             set_network(model, env, self._start)
         return model
+
+    def _fresh_model(self, env: VecNormalize) -> BaseAlgorithm:
+        set_random_seed(self._training_seed(0))
+        features = self._validation.features if self.settings.network == "sets" else None
+        return self._algorithm.make(env, features, self.settings.learner_settings)
 
     def _training_seed(self, number: int) -> int:
         """A seed for the libraries' own random states, which take 32 bits."""

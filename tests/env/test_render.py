@@ -25,6 +25,7 @@ from d4orm_env.render import FrameRenderer, WindowRenderer, plot, plot_trajector
 from d4orm_env.render.animation import frame_steps
 from d4orm_env.render.panels import CONTACT, robot_colors, view_limits
 from d4orm_env.render.pictures import contact_points
+from d4orm_planners.cli.outputs import PictureOptions
 
 CONTACT_RGB = np.round(255 * np.array(mpl.colors.to_rgb(CONTACT))).astype(int)
 
@@ -479,6 +480,8 @@ def test_mp4_without_ffmpeg_tells_the_way_out(tmp_path: Path, monkeypatch: pytes
     problem = ring_problem(2)
     with pytest.raises(ValueError, match=r"install it, or write a \.gif"):
         save_animation(problem, straight_drive(problem), tmp_path / "drive.mp4")
+    with pytest.raises(ValueError, match=r"install it, or write a \.gif"):
+        PictureOptions(animation=tmp_path / "drive.mp4").check_pictures()  # before anything is planned
     assert list(tmp_path.iterdir()) == []
 
 

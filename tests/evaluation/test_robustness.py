@@ -138,6 +138,7 @@ def test_a_seed_that_the_store_has_no_room_for_is_refused(tmp_path: Path) -> Non
     [
         ("reward", "much"), ("num_robots", "many"), ("success", "yes"), ("seed", "first"), ("config", "none"),
         ("label", b"x"), ("history", "[[1"), ("history", "[1, 2]"), ("control_noise_std", "much"), ("travel_time", "a"),
+        ("disturbances", '[["delay", 3]]'), ("machine", '{"processor": "x"}'),
     ],
 )  # fmt: skip
 def test_what_does_not_belong_in_a_column_is_one_clear_error(tmp_path: Path, column: str, value: Any) -> None:

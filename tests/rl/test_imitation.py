@@ -186,10 +186,13 @@ def test_ppo_goes_on_from_what_was_imitated(imitated: Path, tmp_path: Path) -> N
 
     assert 0 < distance(learned) < 0.1 * distance(nothing)
     np.testing.assert_allclose(learned.arrays["observation_mean"], start.arrays["observation_mean"], atol=1e-2)
-    with pytest.raises(ValueError, match=r"layers .* are wanted; give one that was trained for the same robots"):
+    with pytest.raises(ValueError, match=r"layers .* are wanted; give one that was trained with the same settings: it"):
         train(replace(settings, model="holonomic3d", scenario_settings={}), tmp_path / "space")
-    with pytest.raises(ValueError, match="give one that was trained for the same robots by the same algorithm"):
+    with pytest.raises(ValueError, match="was trained by ppo, whose networks differ; give one that was trained by the"):
         train(replace(settings, algorithm="sac"), tmp_path / "sac")
+    with pytest.raises(ValueError, match="give network='flat'"):
+        train(replace(settings, network="sets"), tmp_path / "sets")
+    assert not {"space", "sac", "sets"} & {folder.name for folder in tmp_path.iterdir()}
     with pytest.raises(FileNotFoundError, match="does not exist"):
         train(replace(settings, start_from=tmp_path / "none.safetensors"), tmp_path / "none")
 

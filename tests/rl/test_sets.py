@@ -461,6 +461,7 @@ def test_rewards_are_those_asked_for() -> None:
         ({"learner_settings": {"n_steps": 3}}, "learner_settings has 'n_steps'; choose of n_epochs, gae_lambda"),
         ({"learner_settings": {"n_epochs": 2.5}}, "learner_settings has n_epochs=2.5; it must be a whole number of at"),
         ({"learner_settings": {"n_epochs": 0}}, "n_epochs=0; it must be a whole number of at least 1"),
+        ({"learner_settings": {"gae_lambda": 5}}, "learner_settings has gae_lambda=5; it must be at most 1"),
         ({"learner_settings": {"ent_coef": -1}}, "learner_settings has ent_coef=-1; it must be at least 0"),
         ({"learner_settings": {"ent_coef": "much"}}, "learner_settings"),
         ({"algorithm": "sac", "learner_settings": {"n_epochs": 2}}, "has 'n_epochs'; choose of batch_size, gradient"),
