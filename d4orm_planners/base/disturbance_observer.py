@@ -50,10 +50,10 @@ class DisturbanceObserver:
 
     def __init__(self, problem: Problem, lag: ArrayLike = 0.0) -> None:
         self.problem, count, d = problem, problem.num_robots, problem.dimension
-        try:
-            constants: Floats = np.broadcast_to(np.asarray(check_lag(lag), np.float64), (count,))
-        except ValueError as error:
-            raise ValueError(f"lag must be one number or one per robot ({count}): {error}") from None
+        given: Floats = np.asarray(check_lag(lag), np.float64)
+        if given.shape not in ((), (1,), (count,)):
+            raise ValueError(f"lag has shape {given.shape}; give one number or one per robot ({count})")
+        constants = np.broadcast_to(given, (count,))
         names = problem.team.models
         columns = {"holonomic2d": range(d, 2 * d), "holonomic3d": range(d, 2 * d), "velocity2d": range(d)}
         self._observed: BoolArray = np.array([name in columns for name in names])

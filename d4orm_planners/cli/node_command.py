@@ -20,6 +20,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem
 from d4orm_env.scenarios.schema import VERSION, parse
 from d4orm_planners.base.controller import Controller
+from d4orm_planners.base.disturbance_observer import DisturbanceObserver
 from d4orm_planners.base.planner_registry import make_planner
 from d4orm_planners.cli import on_signals
 from d4orm_planners.cli.outputs import check_target
@@ -181,6 +182,8 @@ def _events_as_lines() -> Iterator[None]:
 
 
 FIELDS = ("problem", "policy", "settings", "controller", "robots", "deadline", "domain", "seed", "zenoh")
+CONTROLLER = {"mode", "reserve", "timeout", "lag", "tracker"}
+"""Settings of the controller."""
 SHARE = 0.9
 """Share of a period that the policy may take."""
 
@@ -219,6 +222,12 @@ def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
     own = {"timeout": SHARE * problem.dt} | dict(mapping("controller", fields.get("controller", {})))
     policy = fields.get("policy", "d4orm-c2f")
     settings = mapping("settings", fields.get("settings", {}))
+    for name in (own.keys() - CONTROLLER) | (settings.keys() & CONTROLLER):
+        raise ValueError(
+            f"{name!r} is in the wrong place; controller takes {', '.join(sorted(CONTROLLER))}, and settings those of "
+            "the policy"
+        )
+    DisturbanceObserver(problem, own.get("lag", 0.0))  # refuses a lag for another team
     names = fields.get("robots", [f"robot_{robot}" for robot in range(problem.num_robots)])
     if not isinstance(names, list) or not all(isinstance(name, str) and name.isidentifier() for name in names):
         raise ValueError(f"robots is {names!r}; give a list of names of letters, digits and '_'")

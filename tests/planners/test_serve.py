@@ -471,6 +471,12 @@ def test_strangers_bytes_are_counted(endpoint: str) -> None:
         ("problem: {scenario: circle}\nrobots: [a, b]", "there are 2 names for 8 robots"),
         ("problem: {scenario: circle, num_robots: 2}\nrobots: [a, a]", "robots are called a, a; give each a name of"),
         ("problem: {scenario: circle}\ncontroller: {mode: wild}", "mode is 'wild'"),
+        ("problem: {scenario: circle}\ncontroller: {policy: orca}", "'policy' is in the wrong place; controller takes"),
+        (
+            "problem: {scenario: circle}\nsettings: {mode: measured}",
+            "'mode' is in the wrong place; controller takes lag",
+        ),
+        ("problem: {scenario: circle}\ncontroller: {lag: [1, 2]}", "lag has shape (2,); give one number or one per"),
     ],
 )
 def test_bad_files_are_one_line(text: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
