@@ -224,10 +224,11 @@ def smooth_motion(problem: Problem, trajectory: Trajectory, limits: MotionLimits
     for motion in motions:
         if motion.report.ok and motion.stretch <= SLOWEST:
             return motion
-    raise ValueError(
-        f"smoothed, the plan fails: {best.report.violations[0]}; plan with a larger margin, or allow more acceleration "
-        "with max_acceleration"
-    )
+    violation = best.report.violations[0]
+    remedy = "plan with a larger margin, or allow more acceleration with max_acceleration"
+    if any(problem.team.robot_models[robot].trailers for robot in violation.robots):
+        remedy = "trailers that are backed up swing out; plan with another seed, or a larger margin"
+    raise ValueError(f"smoothed, the plan fails: {violation}; {remedy}")
 
 
 def _too_fast(motion: SmoothMotion, limits: MotionLimits, why: str) -> str:
