@@ -232,7 +232,10 @@ def policies_by_label(texts: list[str], option: str = "--policy") -> dict[str, d
         values = parse_settings(text.removeprefix(policy + colon).split(","), option)
         if reserved := {"policy", "name"} & values.keys():
             raise ValueError(f"{option} {text!r}: {min(reserved)!r} is no setting; the name stands before the colon")
-        labelled.append((str(values.pop("label", text)), {"policy": policy, **values}))
+        label = values.pop("label", text)
+        if label in (None, ""):
+            raise ValueError(f"{option} {text!r}: label is empty; give a name, as in d4orm:label=ours")
+        labelled.append((str(label), {"policy": policy, **values}))
     for label, _ in labelled:
         if [one for one, _ in labelled].count(label) > 1:
             raise ValueError(f"{option} gives {label!r} twice; leave one out, or set a label, as in d4orm:label=ours")

@@ -596,6 +596,7 @@ BAD = [
     (("-n", "9223372036854775808"), "--seeds '9223372036854775808' asks for more than 1000000 seeds"),
     (("-n", "0-1000000"), "--seeds '0-1000000' asks for more than"),
     (("-j", "0"), "workers is 0"),
+    (("-p", "go-to-goal:label="), "label is empty; give a name, as in d4orm:label=ours"),
     (("-p", "d4orm,d4orm"), "--policy gives 'd4orm' twice; leave one out, or set a label"),
     (("-p", "orca:time_horizon=3,label=x", "-p", "d4orm:label=x"), "--policy gives 'x' twice"),
     (("--time-limit", "0"), "time_limit is 0"),
