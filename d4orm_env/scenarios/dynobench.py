@@ -192,9 +192,11 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
             raise ValueError(
                 f"robot_{robot} is a {model.name}, which dynobench has no model for; it has {', '.join(known)}"
             )
-        moving = np.flatnonzero(~trajectory.arrived[:, robot])
-        last = int(moving[-1]) + 1 if len(moving) else 0
-        states = trajectory.states[: last + 1, robot, : model.state_size].astype(np.float64)
+        states = trajectory.states[:, robot, : model.state_size].astype(np.float64)
+        # Where it may leave its goal it is there before it is at rest.
+        moving = ~trajectory.arrived[:, robot] | (abs(states - states[-1]) > GOAL_TOLERANCE / 100).any(axis=1)
+        last = int(np.flatnonzero(moving)[-1]) + 1 if moving.any() else 0
+        states = states[: last + 1]
         for hitch, _ in model.trailers:
             states[:, hitch] = states[:, hitch - 1] - states[:, hitch]
         if model.heading_index is not None:

@@ -191,6 +191,16 @@ def test_goals_in_motion_are_refused(tmp_path: Path, goal: str) -> None:
         load_dynobench(path)
 
 
+def test_a_result_ends_when_nothing_moves_any_more(tmp_path: Path) -> None:
+    path, goal = tmp_path / "one.yaml", [2.7, 1.7, 1.8, 0, 0]
+    robots = f"robots: [{{type: unicycle2_v0, start: [1, 2.5, 0, 0, 0], goal: {goal}}}]\n"
+    path.write_text("environment: {min: [0, 0], max: [5, 5]}\n" + robots)
+    make_planner().solve(load_dynobench(path), seed=0).to_dynobench(tmp_path / "result.yaml")
+    (result,) = yaml.safe_load((tmp_path / "result.yaml").read_text())["result"]
+    np.testing.assert_allclose(result["states"][-1], goal, atol=0.01)
+    assert np.abs(result["actions"][-1]).max() > 0  # and not later
+
+
 def test_a_start_is_written_as_it_was_read(tmp_path: Path) -> None:
     path = tmp_path / "one.yaml"
     robots = f"robots: [{{type: unicycle1_v0, start: [4, 2.5, {np.pi}], goal: [3, 2.5, 3.0]}}]\n"
