@@ -1,9 +1,9 @@
 """Multi-robot problems of dynobench, db-CBS and db-LaCAM as they are written, in YAML, and results for their checkers.
 
-Their models move by Euler steps of 0.1 s and ours by Runge-Kutta, which differ by the 0.01 at most that db-CBS's
-checker allows from one state to the next, for robots as fast as theirs. They bound velocities and accelerations of
-integrators by component and we by norm, which is within. They keep reference points within the bounds and we bodies, so
-ours are wider by what every body covers.
+Their models move by Euler steps of 0.1 s and ours by Runge-Kutta, which differ by about the 0.01 that db-CBS's checker
+allows from one state to the next. They bound velocities and accelerations of integrators by component and we by norm,
+which is within. They keep reference points within the bounds and we bodies, so ours are wider by what every body
+covers.
 """
 
 from __future__ import annotations
@@ -150,7 +150,8 @@ def _state(model: Model, theirs: Floats) -> Floats:
 
 
 def _wrapped(angle: Floats) -> Floats:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    """Angles above -pi and, whatever rounding has added, below pi as it is written."""
+    return np.minimum(angle - 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi) - 1e-6), 3.141592)
 
 
 def _hitches(team: Team, states: Floats) -> Floats:
@@ -201,7 +202,7 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
             states[:, hitch] = states[:, hitch - 1] - states[:, hitch]
         if model.heading_index is not None:
             turned = [model.heading_index, *(hitch for hitch, _ in model.trailers)]
-            states[1:, turned] = _wrapped(states[1:, turned])  # the first one is as in the problem
+            states[:, turned] = _wrapped(states[:, turned])
         yield "-"
         for name, rows in (("states", states), ("actions", trajectory.controls[:last, robot, : model.control_size])):
             yield f"  {name}:" if len(rows) else f"  {name}: []"
