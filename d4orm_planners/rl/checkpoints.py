@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import TypeAdapter
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 from stable_baselines3.common.vec_env import VecNormalize
@@ -174,7 +175,10 @@ class Checkpoint:
         """
         with _readable(folder):
             state = json.loads((folder / "state.json").read_text())
-            return cls(folder, [Evaluation(**evaluation) for evaluation in state["evaluations"]])
+            evaluations = TypeAdapter(list[Evaluation]).validate_python(state["evaluations"])
+            if len(evaluations) != int(folder.name):
+                raise ValueError(f"it has {len(evaluations)} evaluations")
+            return cls(folder, evaluations)
 
     def restore(self, env: VecNormalize, model: BaseAlgorithm, fresh: bool) -> None:
         """Put a new environment, and the model if it is fresh, into the checkpoint's state.

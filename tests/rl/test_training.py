@@ -131,7 +131,7 @@ def test_a_training_that_is_killed_goes_on(tmp_path: Path) -> None:
     assert list((tmp_path / "tensorboard").glob("events*"))
 
 
-@pytest.mark.parametrize("damage", ["extra", "large", "cut", "state"])
+@pytest.mark.parametrize("damage", ["extra", "large", "cut", "state", "none", "null"])
 def test_a_damaged_checkpoint_is_one_clear_error(
     trained: tuple[TrainingSettings, Path], tmp_path: Path, damage: str
 ) -> None:
@@ -147,8 +147,12 @@ def test_a_damaged_checkpoint_is_one_clear_error(
     elif damage == "cut":
         (first / "state.npz").write_bytes((first / "state.npz").read_bytes()[:200])
     else:
-        (first / "state.json").write_text("{}")
-    text = {"extra": "it holds", "large": "observation_mean does not fit", "cut": "zip file", "state": "evaluations"}
+        state = json.loads((first / "state.json").read_text())
+        state["evaluations"][0]["success_rate"] = None
+        told = {"state": {}, "none": {"evaluations": []}, "null": state}[damage]
+        (first / "state.json").write_text(json.dumps(told))
+    text = {"extra": "it holds", "large": "observation_mean does not fit", "cut": "zip file", "state": "evaluations",
+            "none": "it has 0 evaluations", "null": "1 validation error"}  # fmt: skip
     with pytest.raises(ValueError, match=rf"checkpoint .*{first.name} cannot be read \(.*{text[damage]}.*; remove it"):
         train(settings, tmp_path / "out", command="d4orm train ...")
 
