@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 from d4orm_env.core.lazy import LazyModule
 
 if TYPE_CHECKING:
-    from d4orm_env.render.animation import check_ffmpeg, save_animation
+    from d4orm_env.render.animation import check_ffmpeg as check_ffmpeg
+    from d4orm_env.render.animation import save_animation
     from d4orm_env.render.frames import FrameRenderer, WindowRenderer
     from d4orm_env.render.pictures import plot, plot_trajectory, save_picture
     from d4orm_env.render.replay import Replay, motion
@@ -36,8 +37,7 @@ _HOMES = {
 }
 
 __all__ = [
-    "FrameRenderer", "Replay", "WindowRenderer", "check_ffmpeg", "motion", "plot", "plot_trajectory",
-    "save_animation", "save_picture",
+    "FrameRenderer", "Replay", "WindowRenderer", "motion", "plot", "plot_trajectory", "save_animation", "save_picture",
 ]  # fmt: skip
 
 _NOTHING: Mapping[Any, Any] = MappingProxyType({})

@@ -142,7 +142,7 @@ def _buffer(episode: RecordedEpisode, steps: int, who: slice | int) -> EpisodeBu
     if isinstance(who, slice):
         at_reset = np.zeros_like(rewards[:1])
         infos |= {"robot_rewards": np.concatenate([at_reset, rewards]), "state": episode.state}
-        ended, rewards = np.all(np.maximum.accumulate(ended), axis=1), rewards.mean(axis=1)
+        ended, rewards = np.all(np.maximum.accumulate(ended), axis=1), rewards.mean(axis=1, dtype=np.float64)
     last = np.arange(steps) == steps - 1
     return data_collector.EpisodeBuffer(
         seed=int(episode.metadata["seed"]),
