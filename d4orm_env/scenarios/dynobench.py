@@ -150,8 +150,8 @@ def _state(model: Model, theirs: Floats) -> Floats:
 
 
 def _wrapped(angle: Floats) -> Floats:
-    """Angles above -pi and, whatever rounding has added, below pi as it is written."""
-    return np.minimum(angle - 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi) - 1e-6), 3.141592)
+    """Angles above -pi, up to pi and what rounding may add."""
+    return angle - 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi) - 1e-6)
 
 
 def _hitches(team: Team, states: Floats) -> Floats:
@@ -202,7 +202,8 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
             states[:, hitch] = states[:, hitch - 1] - states[:, hitch]
         if model.heading_index is not None:
             turned = [model.heading_index, *(hitch for hitch, _ in model.trailers)]
-            states[:, turned] = _wrapped(states[:, turned])
+            # Not beyond pi as it is written: their checker would turn that round.
+            states[:, turned] = np.minimum(_wrapped(states[:, turned]), 3.141592)
         yield "-"
         for name, rows in (("states", states), ("actions", trajectory.controls[:last, robot, : model.control_size])):
             yield f"  {name}:" if len(rows) else f"  {name}: []"

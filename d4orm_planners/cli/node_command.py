@@ -222,10 +222,10 @@ def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
     own = {"timeout": SHARE * problem.dt} | dict(mapping("controller", fields.get("controller", {})))
     policy = fields.get("policy", "d4orm-c2f")
     settings = mapping("settings", fields.get("settings", {}))
-    for name in (own.keys() - CONTROLLER) | (settings.keys() & CONTROLLER):
+    if wrong := sorted((own.keys() - CONTROLLER) | (settings.keys() & CONTROLLER), key=str):
         raise ValueError(
-            f"{name!r} is in the wrong place; controller takes {', '.join(sorted(CONTROLLER))}, and settings those of "
-            "the policy"
+            f"{wrong[0]!r} is in the wrong place; controller takes {', '.join(sorted(CONTROLLER))}, and settings what "
+            "the policy takes"
         )
     DisturbanceObserver(problem, own.get("lag", 0.0))  # refuses a lag for another team
     names = fields.get("robots", [f"robot_{robot}" for robot in range(problem.num_robots)])

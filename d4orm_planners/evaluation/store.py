@@ -167,7 +167,7 @@ _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
 _TRUTHS = ("success", "verified")
 _MACHINE = {"processor", "cores", "cores_used", "python"}
-"""What a machine that is described has at least."""
+"""Least keys of a machine's description."""
 
 
 def _are_lists(content: Any, *lengths: int) -> bool:
@@ -181,7 +181,7 @@ _JSON: Mapping[str, Callable[[Any], bool]] = {
     "history": lambda content: _are_lists(content, 3, 4),
     "disturbances": lambda content: _are_lists(content, 2) and all(isinstance(levels, dict) for _, levels in content),
 }
-"""Columns that must be JSON, and what it must be."""
+"""Checks of the columns that must be JSON."""
 _SQL = {"str": "TEXT", "int": "INTEGER", "float": "REAL", "bool": "INTEGER"}
 _PYTHON: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
