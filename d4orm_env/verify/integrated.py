@@ -79,10 +79,11 @@ class Integrated:
     def _states(self, start: Floats) -> Floats:
         """``(n, H+1, R)`` at the beginning of every step and after the last, integrated as finely as it takes.
 
-        Roughly at first, one step after another. From there all steps are integrated at once, finely, and what they
-        miss each other by is made good (multiple shooting); one after another, finely, only where that finds no end.
+        Roughly at first (Euler), one step after another. From there all steps are integrated at once, finely, and what
+        they miss each other by is made good (multiple shooting); one after another, finely, only where that finds no
+        end.
         """
-        states = self._one_by_one(start, 1)
+        states = self._one_by_one(start, lambda x, u: x + self._dt * self._slope(x, u))
         sub_steps = self._sub_steps(states[:, :-1])
         for _ in range(CORRECTIONS):
             gaps = self._stepped(states[:, :-1], sub_steps) - states[:, 1:]
@@ -92,15 +93,14 @@ class Integrated:
                 return states
             states = states.copy()
             states[:, 1:] += self._carried(states[:, :-1], gaps)
-        return self._one_by_one(start, sub_steps)
+        return self._one_by_one(start, lambda x, u: self._integrated(x, u, sub_steps))
 
-    def _one_by_one(self, start: Floats, sub_steps: int) -> Floats:
+    def _one_by_one(self, start: Floats, advance: Callable[[Floats, Floats], Floats]) -> Floats:
         states, before = [start], None
         for u in np.moveaxis(self._commands, 1, 0):
             # Commands under which nothing has changed will change nothing.
             if before is None or not (np.array_equal(u, before) and np.array_equal(states[-1], states[-2])):
-                ends = self._integrated(states[-1], u, sub_steps)
-                states.append(self._call(self._model.functions.limit_state, ends))
+                states.append(self._call(self._model.functions.limit_state, advance(states[-1], u)))
             else:
                 states.append(states[-1])
             before = u
@@ -160,8 +160,11 @@ class Integrated:
         self, function: Callable[..., Iterable[ArrayLike]], *arguments: Floats, limits: tuple[Floats, ...] | None = None
     ) -> Floats:
         """A function of the model over arrays whose first axis is the component; it may return single numbers too."""
-        result = function(*map(tuple, arguments), self._limits if limits is None else limits, self._ops)
-        return np.stack([np.broadcast_to(part, arguments[0].shape[1:]) for part in result])
+        parts = tuple(function(*map(tuple, arguments), self._limits if limits is None else limits, self._ops))
+        result = np.empty((len(parts), *arguments[0].shape[1:]))
+        for part, value in enumerate(parts):
+            result[part] = value
+        return result
 
     def displacement(self, steps: slice, sub_steps: int) -> Floats:
         """``(T, S+1, R, d)`` where the robots are at the ends of sub-steps, from where each step began [m]."""
@@ -183,9 +186,11 @@ class Integrated:
 
     def _within(self, steps: slice, sub_steps: int) -> list[Floats]:
         """``(n, T, R)`` states at the ends of sub-steps, the beginning of each step first; those asked for last are
-        known. Who is at rest when a step begins is so until it ends.
+        known, and so are the first steps of them. Who is at rest when a step begins is so until it ends.
         """
-        if self._known is None or self._known[:2] != (steps, sub_steps):
+        steps = slice(*steps.indices(self._begins.shape[1]))
+        known = self._known
+        if known is None or known[1] != sub_steps or known[0].start != steps.start or known[0].stop < steps.stop:
             x, moving = self._begins[:, steps], self.moving[steps]
             own, u = x[:, moving], self._commands[:, steps][:, moving]
             limits = tuple(np.broadcast_to(limit, moving.shape)[moving] for limit in self._limits)
@@ -194,8 +199,8 @@ class Integrated:
                 own, x = self._advanced(own, u, self._dt / sub_steps, limits), x.copy()
                 x[:, moving] = own
                 states.append(x)
-            self._known = (steps, sub_steps, states)
-        return self._known[2]
+            self._known = known = (steps, sub_steps, states)
+        return [x[:, : steps.stop - steps.start] for x in known[2]]
 
 
 def _ops() -> Any:
