@@ -17,9 +17,9 @@ from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver, 
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.measured_states import completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
-from d4orm_planners.base.policy import Actions, Policy
+from d4orm_planners.base.policy import Actions, OpenLoop, Policy
 from d4orm_planners.base.policy_threads import Background, check_episode
-from d4orm_planners.tracking.reference_feedback import Reference, with_feedback
+from d4orm_planners.tracking.reference_feedback import Reference, regulated
 from d4orm_planners.tracking.steering import (
     advanced,
     by_model,
@@ -32,8 +32,6 @@ from d4orm_planners.tracking.steering import (
 
 Mode = Literal["nominal", "measured"]
 
-FEEDBACK = 0.25
-"""Share of a distance from the reference that controls are to make up for within a step."""
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
 
@@ -73,8 +71,9 @@ class Controller:
 
     In mode ``"nominal"`` the policy sees the reference, and robots follow it: by their own trackers, which are given
     position, velocity and acceleration, or by the controls, which have a feedback on what was measured. In mode
-    ``"measured"`` the policy sees what was measured. In both, controls make up for what pushes a robot all the time, as
-    a thrust that is too weak does (:mod:`d4orm_planners.base.disturbance_observer`).
+    ``"measured"`` the policy sees what was measured; a plan, which looks at nothing, is followed in either mode. In
+    both, controls make up for what pushes a robot all the time, as a thrust that is too weak does
+    (:mod:`d4orm_planners.base.disturbance_observer`).
 
     Numbers of measured states that are not finite are missing: where a robot's position or heading is, the reference
     takes its place, and what else is follows from its last state and control. Speeds and coordinates beyond what a
@@ -127,7 +126,8 @@ class Controller:
             settings = {"deadline": IN_TIME * self.timeout} | settings
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = tracker
-        self._lag, self._leads = check_lag(lag), mode == "nominal" or tracker
+        self._looks = mode == "measured" and not isinstance(self.policy, OpenLoop)
+        self._lag, self._leads = check_lag(lag), tracker or not self._looks
         self._background: Background[Actions] = Background()
         self._env: Any = None
         self._ending: JointState | None = None  # the reference once the episode is over
@@ -164,6 +164,7 @@ class Controller:
 
     def _begin(self, problem: Problem, states: ArrayLike, time: float, seed: int) -> None:
         self._observer, self._robots = DisturbanceObserver(problem, self._lag), problem
+        self._lags = self._observer.lags & self._leads  # elsewhere the measured states are taken as without a lag
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
@@ -240,7 +241,7 @@ class Controller:
         self._observer.observe(measured, known)
         if self.tracker:
             self._shift(measured, known)
-        if self.mode == "measured":
+        if self._looks:
             seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
             if not self.over:
                 states = self._possible(seen)
@@ -258,11 +259,11 @@ class Controller:
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
         error = self._setpoint.position - measured[:, : self.problem.dimension]
-        follows = known & led & (np.linalg.norm(error, axis=1) > self.problem.rounding)
-        wanted = self._velocities(self._joint) + FEEDBACK / self.problem.dt * error
-        reference = Reference(before.states, self._joint.states, controls)
-        returning = with_feedback(self._robots, measured, wanted.astype(np.float32), reference)
-        controls = np.where(follows[:, None], returning, controls)
+        off = (np.linalg.norm(error, axis=1) > self.problem.rounding) | self._lags
+        follows, reference = (known & led & off)[:, None], Reference(before.states, self._joint.states, controls)
+        if follows.any():
+            actuators = self._observer.actuators if self._lags.any() else None
+            controls = np.where(follows, regulated(self._robots, measured, reference, actuators), controls)
         return self._described(before, self._observer.compensated(controls, self.arrived), held)
 
     def _shift(self, measured: FloatArray, known: BoolArray) -> None:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, short_repr
 from d4orm_env.core.problem import Problem
+from d4orm_planners.tracking.reference_feedback import Actuators
 from d4orm_planners.tracking.steering import limit_controls
 
 GAIN = 0.1
@@ -41,6 +42,7 @@ class DisturbanceObserver:
         lag: Time constant of the actuators [s], one or ``K``.
 
     Attributes:
+        lags: ``(K,)`` bool: robots of such models whose actuators have a lag.
         trust: ``(K, 1)`` share of a robot's distance from its reference that its lag does not explain.
         bias: ``(K, d)`` the estimate, in units of the controls; zero for other models.
 
@@ -63,9 +65,10 @@ class DisturbanceObserver:
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
         self._fastest = fastest[:, None]
-        self._remains = np.where(constants > 0, np.exp(-problem.dt / np.maximum(constants, 1e-12)), 0.0)[:, None]
+        self.lags: BoolArray = self._lag[:, 0] > 0
+        self._remains = np.where(self.lags[:, None], np.exp(-problem.dt / np.maximum(self._lag, 1e-12)), 0.0)
         # Mean over a step of exp(-t / lag).
-        self._share = (constants / problem.dt)[:, None] * (1 - self._remains)
+        self._share = self._lag / problem.dt * (1 - self._remains)
         self.trust = problem.dt / (problem.dt + 2 * constants[:, None])
         self.bias, self._applied = np.zeros((count, d)), np.zeros((count, d))
         self._explained: Floats | None = None
@@ -97,6 +100,12 @@ class DisturbanceObserver:
         if self._second_order.any():
             ahead[:, d : 2 * d] += np.where(self._second_order, rate, 0.0).astype(np.float32)
         return ahead
+
+    @property
+    def actuators(self) -> Actuators:
+        """What the robots' actuators apply now, and how they go on."""
+        applied = np.pad(self._applied, ((0, 0), (0, self.problem.control_size - self._applied.shape[1])))
+        return Actuators(applied, self._remains, self._share)
 
     def executed(self, before: FloatArray, after: FloatArray, controls: FloatArray) -> FloatArray:
         """``(K, m)`` controls that take double integrators from one velocity to the other; of other models unchanged.

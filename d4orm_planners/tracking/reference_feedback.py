@@ -1,4 +1,4 @@
-"""Feedback that brings robots with a heading back to a reference, whatever their model.
+"""Feedback that brings robots back to a reference, whatever their model and the lag of their actuators.
 
 A linear-quadratic regulator about the reference's present state and control (B. D. O. Anderson and J. B. Moore, Optimal
 Control: Linear Quadratic Methods, 1990): what cannot be corrected, as the way aside of a car at rest, costs no control.
@@ -13,7 +13,7 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_planners.tracking.steering import advanced, limit_controls, short_way_round, track_velocities
+from d4orm_planners.tracking.steering import integrated, limit_controls, short_way_round
 
 HORIZON = 20
 """Steps that the regulator looks ahead."""
@@ -29,35 +29,55 @@ class Reference(NamedTuple):
     controls: FloatArray  #: ``(K, m)``
 
 
-def with_feedback(problem: Problem, states: FloatArray, velocities: FloatArray, reference: Reference) -> FloatArray:
+class Actuators(NamedTuple):
+    """Actuators that approach what they are told, with a lag of first order."""
+
+    applied: Floats  #: ``(K, m)`` what they apply now
+    remains: Floats  #: ``(K, 1)`` share of a difference from what they are told that is left after a step
+    share: Floats  #: ``(K, 1)`` of such a difference in the mean over a step
+
+
+def regulated(
+    problem: Problem, states: FloatArray, reference: Reference, actuators: Actuators | None = None
+) -> FloatArray:
     """``(K, m)`` controls within the limits that lead robots from ``states`` ``(K, n)`` back to a reference.
 
-    Those with a heading by the regulator, to which full control is worth a distance of a radius, or a radian; others
-    directly.
+    Full control is worth a distance of a radius, or a radian.
 
     Args:
         problem: The robots.
         states: Those of the robots.
-        velocities: ``(K, d)`` that lead directly to the reference [m/s].
         reference: Motion to go back to.
+        actuators: Those that have a lag; by default none has.
     """
-    directly = track_velocities(problem, states, velocities)
-    turning = np.array([model.heading_index is not None for model in problem.team.robot_models])
-    if not turning.any():
-        return directly
     limits = np.where(problem.team.control_limits > 0, problem.team.control_limits, np.float32(1))
     missed, by_state, by_control = _linearised(problem, reference, limits)
-    off = short_way_round(problem, (reference.states - states).astype(np.float64))
-    regulated = reference.controls + np.einsum("kmn,kn->km", np.linalg.pinv(by_control), missed)
-    regulated += np.einsum("kmn,kn->km", _gains(_weights(problem.team), limits, by_state, by_control), off)
-    return np.where(turning[:, None], limit_controls(problem, regulated.astype(np.float32)), directly)
+    made_good = np.einsum("kmn,kn->km", np.linalg.pinv(by_control), missed)
+    missed -= np.einsum("knm,km->kn", by_control, made_good)
+    controls, off = reference.controls + made_good, short_way_round(problem, (reference.states - states).astype(float))
+    if actuators is not None:
+        off = np.hstack([off, controls - actuators.applied])
+        by_state, by_control = _lagging(by_state, by_control, actuators)
+    # One more state, which is always one, has the reference go on to depart from its own controls as it does now.
+    off, missed = np.pad(off, ((0, 0), (0, 1)), constant_values=1.0), _widened(missed[..., None], off.shape[1] + 1)
+    by_state, by_control = np.dstack([_widened(by_state, off.shape[1]), missed]), _widened(by_control, off.shape[1])
+    by_state[:, -1, -1] = 1.0
+    weights = _widened(_weights(problem.team), off.shape[1])
+    controls += np.einsum("kmn,kn->km", _gains(weights, limits, by_state, by_control), off)
+    return limit_controls(problem, controls.astype(np.float32))
+
+
+def _widened(rows: Floats, size: int) -> Floats:
+    """``(K, size, ...)`` rows with zeros behind their own ``(K, n, ...)``."""
+    return np.pad(rows, ((0, 0), (0, size - rows.shape[1]), *[(0, 0)] * (rows.ndim - 2)))
 
 
 def _linearised(problem: Problem, reference: Reference, limits: FloatArray) -> tuple[Floats, Floats, Floats]:
     """``(K, n)`` what the controls of a reference lack to its end, and the slopes of states a step later by states
     ``(K, n, n)`` and by controls ``(K, n, m)``, varied by a share of their ``limits`` ``(K, m)``.
 
-    Motions are the same everywhere: at the origin positions lose least to rounding.
+    Motions are the same everywhere: at the origin positions lose least to rounding. Limits have no part in it: next to
+    them slopes would be those of one side.
     """
     now, after, controls = reference
     d, n = problem.dimension, now.shape[1]
@@ -65,12 +85,22 @@ def _linearised(problem: Problem, reference: Reference, limits: FloatArray) -> t
     sizes = DIFFERENCE * np.hstack([np.ones_like(now), limits])
     changes = sizes * np.eye(sizes.shape[1], dtype=np.float32)[:, None]
     rows = here + np.concatenate([changes, -changes, np.zeros_like(changes[:1])])
-    ends = advanced(problem, rows[..., :n], rows[..., n:]).astype(np.float64)
+    ends = integrated(problem, rows[..., :n], rows[..., n:]).astype(np.float64)
     more, less = ends[:-1].reshape(2, *changes.shape[:2], n)
     slopes = np.moveaxis((more - less) / (2 * sizes.T[..., None]), 0, 2)
     missed = after.astype(np.float64) - ends[-1]
     missed[:, :d] -= now[:, :d]
     return short_way_round(problem, missed), slopes[..., :n], slopes[..., n:]
+
+
+def _lagging(by_state: Floats, by_control: Floats, actuators: Actuators) -> tuple[Floats, Floats]:
+    """Slopes ``(K, n+m, n+m)`` and ``(K, n+m, m)`` of states and of what actuators apply."""
+    (_, remains, share), (count, n, m) = actuators, by_control.shape
+    kept = np.broadcast_to(np.eye(m), (count, m, m))
+    states = np.concatenate([by_state, share[..., None] * by_control], axis=2)
+    applied = np.concatenate([np.zeros((count, m, n)), remains[..., None] * kept], axis=2)
+    controls = np.concatenate([(1 - share[..., None]) * by_control, (1 - remains[..., None]) * kept], axis=1)
+    return np.concatenate([states, applied], axis=1), controls
 
 
 def _weights(team: Team) -> Floats:

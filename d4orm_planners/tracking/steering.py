@@ -17,7 +17,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import MODELS
 from d4orm_env.dynamics.robot_model import OWN_LIMITS, STANDARD_LIMITS, Model, ModelFunctions
-from d4orm_env.dynamics.transition import TimeStep, advance
+from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.paths.shortest_paths import along_paths
 
@@ -89,7 +89,7 @@ def track_velocities(problem: Problem, states: FloatArray, velocities: FloatArra
 
 
 def limited_states(problem: Problem, states: FloatArray) -> FloatArray:
-    """``(K, n)`` states within the robots' limits."""
+    """``(..., K, n)`` states within the robots' limits."""
     return _by_rows(
         problem, problem.state_size, (states,), lambda model, x, limits: model.limit_state(x, limits, NUMPY_OPS)
     )
@@ -99,10 +99,15 @@ def advanced(problem: Problem, states: FloatArray, controls: FloatArray) -> Floa
     """``(..., K, n)`` states a time step later, of robots that do not dock, under controls ``(..., K, m)`` within the
     limits.
     """
+    return limited_states(problem, integrated(problem, states, controls))
+
+
+def integrated(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
+    """``(..., K, n)`` states a time step later if neither these nor the controls ``(..., K, m)`` had limits."""
     h = TimeStep(*problem.arrays.time_step)
 
     def law(model: ModelFunctions, x: Columns, u: Columns, limits: Columns) -> Columns:
-        moved: Columns = advance(model, x, u, limits, h, NUMPY_OPS)
+        moved: Columns = model.integrate(x, u, limits, h, NUMPY_OPS)
         return moved
 
     return _by_rows(problem, problem.state_size, (states, controls), law)
