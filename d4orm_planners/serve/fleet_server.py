@@ -6,7 +6,7 @@ import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from d4orm_planners.base.controller import Controller, ControlSetpoint
 from d4orm_planners.serve import wire
 from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
 from d4orm_planners.tracking import ros_messages as ros
+from d4orm_planners.tracking.steering import braking_share
 
 NODE = "d4orm"
 DRIVING, BRAKING, PLANNING, WAITING, STOPPED = "driving", "braking", "planning", "waiting", "stopped"
@@ -39,7 +40,6 @@ class FleetRobot:
     heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
     heading: float = 0.0  #: As last heard [rad]
     stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]
-    command: Any = None  #: ``geometry_msgs/Twist`` that it was given last
     #: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s]
     velocity: Floats = field(default_factory=lambda: np.zeros(3))
     #: Time by the robot's clock [s] and ``(3,)`` position of the later one [m]
@@ -55,6 +55,14 @@ class FleetRobot:
         self.posed = now, position
 
 
+class Period(NamedTuple):
+    """A period of the controller's reference."""
+
+    begin: Floats  #: ``(K, d)`` where robots are to be when it begins [m]
+    setpoint: ControlSetpoint
+    twists: Floats  #: ``(K, 4)`` velocity in each robot's frame [m/s] and turn rate [rad/s]
+
+
 class FleetServer:
     """A controller as a ROS 2 node.
 
@@ -65,8 +73,8 @@ class FleetServer:
 
     Robots move only while all were heard within the deadline, and no emergency stop is in force, which takes effect at
     once. Afterwards the controller begins anew from where the robots are. For a new goal it does so after all have
-    braked: each goes on along its arc, slower by the same share as all others, so that the order in which they pass
-    each other stays, and a lost command changes little.
+    braked: they go on along the controller's reference, ever slower, all by the same share, so that they keep apart as
+    they would have.
 
     Args:
         session: The network.
@@ -109,8 +117,8 @@ class FleetServer:
         self._diagnostics = session.publisher("diagnostics", wire.DIAGNOSTICS)
         self._planner = ThreadPoolExecutor(1, thread_name_prefix="serve")
         self._begun: Future[None] | None = None
-        self._setpoint: ControlSetpoint | None = None
-        self._pace, self._braking = 1.0, _braking(problem)
+        self._period: Period | None = None
+        self._pace = self._passed = 1.0  # pace while braking, and share of the period that is over
         self._emergency = self._replan = False
         self._commanding = threading.RLock()
         self._e_stop = session.subscriber("e_stop", wire.BOOL, self._mind)
@@ -137,15 +145,11 @@ class FleetServer:
         self._read(now)
         before, self.state = self.state, self._next_state(now)
         if self.state == DRIVING:
-            if before != DRIVING:
-                for robot in self._robots:
-                    robot.stand = None
-            self._drive(self._controller.step(self._states(now), now))
+            self._drive(now)
             # The horizon is over, and a robot has not arrived.
             self._replan |= self._controller.over and not self._controller.arrived.all()
         elif self.state == BRAKING:
-            with self._commanding:
-                self._brake()
+            self._brake(now)
         else:
             self._stand()
         if self.state != before or now - self._told >= TELL:
@@ -226,41 +230,52 @@ class FleetServer:
     def _silent(self, now: float) -> list[str]:
         return [robot.name for robot in self._robots if now - robot.heard > self.deadline]
 
-    def _states(self, now: float) -> FloatArray:
-        """``(K, n)`` states; not a number for who was not heard within the last two periods."""
-        lost = 2 * self._problem.dt
-        missing = np.full(self._problem.state_size, np.nan, np.float32)
-        return np.stack([robot.state if now - robot.heard <= lost else missing for robot in self._robots])
+    def _next_period(self, states: FloatArray, now: float) -> Period:
+        setpoint = self._controller.step(states, now)
+        rows = zip(self._controller.states, setpoint.control, self._robots)
+        twists = [wire.twist(self._problem, number, x, u, robot.heading) for number, (x, u, robot) in enumerate(rows)]
+        begin = setpoint if self._period is None else self._period.setpoint
+        return Period(begin.position, setpoint, np.array(twists))
 
-    def _drive(self, setpoint: ControlSetpoint) -> None:
-        states = self._controller.states
-        commands = [
-            wire.twist(self._problem, number, states[number], setpoint.control[number], robot.heading)
-            for number, robot in enumerate(self._robots)
-        ]
+    def _drive(self, now: float) -> None:
+        missing = [now - robot.heard > 2 * self._problem.dt for robot in self._robots]  # for the last two periods
+        states = np.where(np.array(missing)[:, None], np.float32(np.nan), [robot.state for robot in self._robots])
+        period = self._next_period(states, now)
+        _, setpoint, twists = period
         with self._commanding:
             if self._emergency:  # it came while these were thought out
                 return
-            self._setpoint, self._pace = setpoint, 1.0
-            points = zip(setpoint.position, setpoint.velocity, setpoint.acceleration, setpoint.heading)
-            for number, (robot, command, point) in enumerate(zip(self._robots, commands, points)):
-                robot.command = command
-                self._commands[number].publish(command)
-                self._setpoints[number].publish(wire.full_state(robot.name, *point))
+            self._period, self._pace, self._passed = period, 1.0, 1.0
+            for robot in self._robots:
+                robot.stand = None
+            self._command(period, twists, setpoint.position, setpoint.velocity, setpoint.acceleration)
 
-    def _brake(self) -> None:
-        """Slow all robots down on their last arcs, by the same share."""
-        last, before, dt = self._setpoint, self._pace, self._problem.dt
-        assert last is not None  # braking comes after driving
-        self._pace = max(before - self._braking, 0.0)
-        for number, robot in enumerate(self._robots):
-            own, turn_rate = robot.command.linear, robot.command.angular.z
-            velocity = turned(position_of(own), robot.heading)[: self._problem.dimension]
-            stand = last.position[number] if robot.stand is None else robot.stand
-            robot.stand = stand + self._pace * dt * velocity
-            point = (robot.stand, self._pace * velocity, (self._pace - before) / dt * velocity, robot.heading)
+    def _brake(self, now: float) -> None:
+        """Slow all robots down on the controller's reference, by the same share."""
+        period, before, dt = self._period, self._pace, self._problem.dt
+        assert period is not None  # braking comes after driving
+        pace = max(before - braking_share(self._problem, period.setpoint.velocity, period.setpoint.acceleration), 0.0)
+        twists, passed = min(pace, 1.0 - self._passed) * period.twists, self._passed + pace
+        if passed >= 1.0:
+            period, passed = self._next_period(np.full_like(self._controller.states, np.nan), now), passed - 1.0
+            twists = twists + passed * period.twists
+        setpoint = period.setpoint
+        position = period.begin + passed * (setpoint.position - period.begin)
+        acceleration = pace * pace * setpoint.acceleration + (pace - before) / dt * setpoint.velocity
+        with self._commanding:
+            if self._emergency:
+                return
+            self._period, self._pace, self._passed = period, pace, passed
+            for robot, stand in zip(self._robots, position):
+                robot.stand = stand
+            self._command(period, twists, position, pace * setpoint.velocity, acceleration)
+
+    def _command(self, period: Period, twists: Floats, *points: Floats) -> None:
+        """Publish twists ``(K, 4)``, and positions, velocities and accelerations ``(K, d)`` with the headings."""
+        rows = zip(self._robots, twists, *points, period.setpoint.heading)
+        for number, (robot, twist, *point) in enumerate(rows):
+            self._commands[number].publish(ros.twist(twist[:3], float(twist[3])))
             self._setpoints[number].publish(wire.full_state(robot.name, *point))
-            self._commands[number].publish(ros.twist(self._pace * position_of(own), self._pace * turn_rate))
 
     def _stand(self) -> None:
         """Hold all robots where they were when they were stopped."""
@@ -283,10 +298,3 @@ class FleetServer:
             "refused": self.refusal,
         }
         return wire.diagnostics(NODE, LEVELS[self.state], self.state, values)
-
-
-def _braking(problem: Problem) -> float:
-    """Share of its largest speed by which the weakest robot brakes in a step; all of it where none has inertia."""
-    team, inertia = problem.team, [not model.first_order for model in problem.team.robot_models]
-    shares = team.max_acceleration[inertia] / team.max_speed[inertia] * problem.dt
-    return float(min(shares, default=1.0))

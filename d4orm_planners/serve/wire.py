@@ -202,8 +202,8 @@ def turned(vector: Floats, angle: float) -> Floats:
     return np.array([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]])
 
 
-def twist(problem: Problem, robot: int, state: FloatArray, control: FloatArray, heading: float) -> Any:
-    """The ``geometry_msgs/Twist`` of a control: the velocity that it leads to in a step, in the robot's own frame.
+def twist(problem: Problem, robot: int, state: FloatArray, control: FloatArray, heading: float) -> Floats:
+    """``(4,)`` velocity [m/s] that a control leads to in a step, in the robot's own frame, and turn rate [rad/s].
 
     Args:
         problem: The team.
@@ -221,7 +221,7 @@ def twist(problem: Problem, robot: int, state: FloatArray, control: FloatArray, 
     if model.heading_index is not None:
         turn_rate = (float(after[model.heading_index]) - float(state[model.heading_index])) / problem.dt
         heading = float(after[model.heading_index])
-    return ros.twist(turned(velocity, -heading), turn_rate)
+    return np.append(turned(velocity, -heading), turn_rate)
 
 
 def full_state(name: str, position: Floats, velocity: Floats, acceleration: Floats, heading: float) -> Any:

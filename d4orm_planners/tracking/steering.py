@@ -173,6 +173,23 @@ def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals
     return np.isfinite(problem.goal_speed) & (gap <= braking)
 
 
+def braking_share(problem: Problem, velocities: Floats, accelerations: Floats) -> float:
+    """Share of its pace that a team on its way can give up in a step: what its weakest robot brakes from full speed.
+
+    Where a robot brakes anyway, it is down to half of that. Models without inertia stop at once.
+
+    Args:
+        problem: The robots.
+        velocities: ``(K, d)`` of their way at full pace [m/s].
+        accelerations: ``(K, d)`` likewise [m/s^2].
+    """
+    team, inertia = problem.team, [not model.first_order for model in problem.team.robot_models]
+    along = (velocities * accelerations).sum(axis=1) / np.maximum(np.linalg.norm(velocities, axis=1), 1e-9)
+    brakes = np.clip(-along / team.max_acceleration, 0.0, 1.0)[inertia]
+    shares = team.max_acceleration[inertia] / team.max_speed[inertia] * problem.dt
+    return float(min(shares, default=1.0) * (1 - max(brakes, default=0.0) / 2))
+
+
 def brake_to_dock(problem: Problem, robots: list[int], controls: FloatArray, joint: JointState) -> FloatArray:
     """``(N, m)`` the controls of some robots, replaced by those of go-to-goal for robots that must brake now."""
     braking = must_brake(problem, joint.states, joint.controls, joint.goals)[robots, None]
