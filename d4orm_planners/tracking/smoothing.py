@@ -47,7 +47,7 @@ class MotionLimits:
     reverse_speed: Floats  #: [m/s]; of robots with a heading
     turn_rate: Floats  #: [rad/s]; to the left
     right_turn_rate: Floats  #: [rad/s]
-    acceleration: Floats  #: [m/s^2]; of robots with a heading along it
+    acceleration: Floats  #: [m/s^2]; of robots with a heading along it, of others with what makes good their drag
     turn_acceleration: Floats  #: [rad/s^2]
     steering_rate: Floats  #: [rad/s]; of robots with a wheelbase
     jerk: Floats  #: [m/s^3]
@@ -138,13 +138,14 @@ class SmoothMotion:
         )
         curvature, change = (self._values(self.curvatures, times, order) for order in (0, 1))
         wheelbase = self.problem.team.own_limits.get("wheelbase", 0.0)
+        pushed = np.linalg.norm(acceleration + self._drag[:, None] * velocity, axis=2)
         has_heading = np.array([model.heading_index is not None for model in self.problem.team.robot_models])
         return MotionLimits(
             speed=np.linalg.norm(velocity, axis=2).max(axis=0),
             reverse_speed=(-ahead).max(axis=0),
             turn_rate=rate.max(axis=0),
             right_turn_rate=(-rate).max(axis=0),
-            acceleration=np.where(has_heading, np.abs(faster), np.linalg.norm(acceleration, axis=2)).max(axis=0),
+            acceleration=np.where(has_heading, np.abs(faster), pushed).max(axis=0),
             turn_acceleration=np.abs(self.heading(times, 2)).max(axis=0),
             steering_rate=np.abs(change * wheelbase / (1 + (curvature * wheelbase) ** 2)).max(axis=0),
             jerk=np.linalg.norm(jerk, axis=2).max(axis=0),
@@ -154,6 +155,12 @@ class SmoothMotion:
     def report(self) -> VerificationReport:
         """Verdict of :func:`d4orm_env.verify.curves.verify_curves`."""
         return verify_motion(self.problem, self.position, self.heading, self.duration, self._num_samples)
+
+    @property
+    def _drag(self) -> Floats:
+        """``(K,)`` drag of robots that the air brakes [1/s]."""
+        drag: Floats = np.broadcast_to(self.problem.team.own_limits.get("drag", 0.0), self.problem.num_robots)
+        return drag
 
     @property
     def _num_samples(self) -> int:
@@ -168,7 +175,10 @@ class SmoothMotion:
         needed = {}
         for name, (_, power) in LIMITS.items():
             share = (1 + RESERVE) * getattr(self.peaks, name) / getattr(limits, name)
-            needed[name] = float(max(share.max(), 0.0)) ** (1 / power), int(np.argmax(share))
+            # Drag falls less than accelerations do.
+            powers = np.where((name == "acceleration") & (self._drag > 0), 1, power)
+            slower = np.maximum(share, 0.0) ** (1 / powers)
+            needed[name] = float(slower.max()), int(np.argmax(slower))
         return needed
 
 
