@@ -16,7 +16,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import OrderEnforcingWrapper
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
-from d4orm_env.core.arrays import MAX_ACTION, FloatArray, as_float32, usable, whole_number
+from d4orm_env.core.arrays import MAX_ACTION, FloatArray, as_float32, short_repr, usable, whole_number
 from d4orm_env.envs.base_env import RENDER_MODES, BaseEnv
 from d4orm_env.envs.inputs import check_options, checked_cycles
 from d4orm_env.envs.options import EnvOptions
@@ -212,7 +212,9 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
     def _complaint(self, actions: object) -> str:
         if not isinstance(actions, Mapping):
-            return f"actions must be a dictionary with an action for every agent in env.agents, not {actions!r}"
+            return (
+                f"actions must be a dictionary with an action for every agent in env.agents, not {short_repr(actions)}"
+            )
         for agent in self.agents:
             if agent not in actions:
                 return f"actions lack {agent}; give one for every agent in env.agents"

@@ -14,7 +14,7 @@ import re
 import time
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -116,7 +116,8 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
             error.filename = str(path)
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a folder that is read-only refuses before it looks
+            temporary.unlink(missing_ok=True)
 
 
 def claim_folder(path: Path, identity: Mapping[str, object], kind: str) -> None:

@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from d4orm_env.core.arrays import short_repr
-from d4orm_env.core.errors import describe, unknown
+from d4orm_env.core.errors import describe, did_you_mean, unknown
 
 T = TypeVar("T", covariant=True)
 
@@ -90,14 +90,19 @@ class Registry(Mapping[str, T]):
 
     def look_up(self, name: object) -> T:
         """Return the thing of this name."""
+        return self._known(
+            name, f"import the module that registers yours, or offer it by an entry point of {self.group}"
+        )
+
+    def _known(self, name: object, remedy: str) -> T:
         if not isinstance(name, str) or name not in self:
-            raise unknown(self.what, name, self)
+            raise unknown(self.what, name, self, remedy)
         return self[name]
 
     def find(self, text: object) -> T:
         """Return the thing that a name, or an import path, stands for."""
         if not isinstance(text, str) or text in self or ":" not in text:
-            return self.look_up(text)
+            return self._known(text, f"give {FORMS}")
         try:
             thing = load_reference(text)
         except ValueError as error:
@@ -155,7 +160,10 @@ def load_reference(text: str) -> object:
         ) from error
     for part in name.split("."):
         if not hasattr(found, part):
-            raise ValueError(f"{text!r} names nothing: {module} has no {name!r}; give a name that the module defines")
+            hint = did_you_mean(part, vars(found)) if hasattr(found, "__dict__") else ""
+            raise ValueError(
+                f"{text!r} names nothing: {module} has no {name!r}; give a name that the module defines{hint}"
+            )
         found = getattr(found, part)
     return found
 
@@ -221,6 +229,23 @@ def source_object(thing: Any) -> type | Callable[..., object]:
 def _is_compiled(thing: object) -> bool:
     """Check for a function in other clothes, as of ``jax.jit``; what Python wraps in a function has that's source."""
     return hasattr(thing, "__wrapped__") and not (inspect.isfunction(thing) or inspect.ismethod(thing))
+
+
+def check_call(function: Callable[..., object], owner: str, *arguments: str, **keywords: object) -> None:
+    """Refuse a function of a user that cannot be called with these arguments.
+
+    Raises:
+        ValueError: If it cannot; ``owner`` begins the message.
+    """
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # of built-in functions nobody knows
+        return
+    try:
+        signature.bind(*arguments, **keywords)
+    except TypeError as error:
+        call = ", ".join((*arguments, *(f"{name}={value!r}" for name, value in keywords.items())))
+        raise ValueError(f"{owner} takes {signature}, and is called with ({call}); {error}") from None
 
 
 def check_sendable(thing: object, owner: str) -> None:

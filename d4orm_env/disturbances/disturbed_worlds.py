@@ -8,14 +8,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import reduce
+from inspect import signature
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, read_only
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, read_only, short_repr
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.registry import check_call
 from d4orm_env.disturbances.disturbance import AnyDisturbance, Disturbance, DisturbanceEffect, Memory, Observed, Scene
 from d4orm_env.disturbances.draws import Ahead, Draws, Keys, Steps, episode_keys
 
@@ -60,6 +62,11 @@ class _ActiveDisturbance:
         make = getattr(type(self.memory), "_make", tuple)
         return make(parts)
 
+    def wrong(self, method: str, returned: object, expected: str) -> ValueError:
+        """The error for what a method of the disturbance returned."""
+        name = type(self.disturbance).__name__
+        return ValueError(f"disturbance {name}: {method} returned {short_repr(returned)}; expected {expected}")
+
     def has(self, method: str) -> bool:
         """Check whether it overrides a method."""
         return getattr(type(self.disturbance), method) is not getattr(Disturbance, method)
@@ -81,6 +88,7 @@ class DisturbedWorlds:
         occurrences: Counter[str] = Counter()
         self._all: list[_ActiveDisturbance] = []
         for disturbance in disturbances:
+            _check_methods(type(disturbance))
             name = type(disturbance).__name__
             # By name and not by order, so that each draws the same whatever others there are.
             self._all.append(_ActiveDisturbance(disturbance, zlib.crc32(f"{name}/{occurrences[name]}".encode())))
@@ -133,6 +141,10 @@ class DisturbedWorlds:
         # Those that bring bodies come first, for others see them.
         for one in sorted(self._all, key=lambda one: one not in self._effective):
             memory = one.disturbance.begin(scene, Draws(keys, scene.steps, one.stream, _Purpose.BEGIN))
+            if not (isinstance(memory, tuple) and all(np.shape(part)[:1] == (count,) for part in memory)):
+                raise one.wrong(
+                    "begin", memory, f"a NamedTuple of arrays, each with a row for every one of {count} worlds"
+                )
             one.remember(memory, worlds, first=not self._begun)
             bodies = one.disturbance.effect(memory, scene).bodies
             if bodies is not None:
@@ -153,8 +165,7 @@ class DisturbedWorlds:
         states = scene.states
         for one in self._moving:
             moved = one.disturbance.move(states, controls, one.memory, scene, self._draws(one, scene, _Purpose.MOVE))
-            states = _checked(moved[0], states.shape, one, "move")
-            controls = _checked(moved[1], controls.shape, one, "move")
+            states, controls = _all_checked(moved, (states, controls), one, "move")
         if states is not scene.states and scene.standing.any():
             states = np.where(scene.standing[..., None], scene.states, states)
         if self.bodies.shape[1]:
@@ -181,12 +192,7 @@ class DisturbedWorlds:
             memory = one.memory if worlds is None else one.memory_of(worlds)
             draws = self._draws(one, scene, _Purpose.SEE)
             draws = draws if worlds is None else draws.of(worlds)
-            states, controls, bodies = one.disturbance.see(seen, memory, part, draws)
-            seen = Observed(
-                _checked(states, seen.states.shape, one, "see"),
-                _checked(controls, seen.controls.shape, one, "see"),
-                _checked(bodies, seen.bodies.shape, one, "see"),
-            )
+            seen = Observed(*_all_checked(one.disturbance.see(seen, memory, part, draws), seen, one, "see"))
             if worlds is not None:
                 one.remember(memory, worlds)
         return seen
@@ -211,6 +217,14 @@ class DisturbedWorlds:
         return draws
 
 
+def _check_methods(kind: type[AnyDisturbance]) -> None:
+    """Check that what a class overrides can be called as what it inherits."""
+    for name in ("check", "slack", "begin", "limits", "command", "move", "see", "observe", "effect"):
+        own, inherited = getattr(kind, name), getattr(Disturbance, name)
+        if own is not inherited:
+            check_call(own, f"disturbance {kind.__name__}: {name}", *signature(inherited).parameters)
+
+
 def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
     """Join the effects of several disturbances; ``None`` if there is none."""
     done = [part for part in parts if part is not None]
@@ -218,9 +232,20 @@ def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
 
 
 def _checked(values: ArrayLike, shape: tuple[int, ...], one: _ActiveDisturbance, method: str) -> FloatArray:
-    """Return a disturbance's result as float32, its shape checked."""
+    """Return a disturbance's result as float32, its shape and numbers checked."""
     array = values if isinstance(values, np.ndarray) and values.dtype == _FLOAT32 else as_float32(values)
     if array.shape != shape:
         name = type(one.disturbance).__name__
         raise ValueError(f"disturbance {name}: {method} returned shape {array.shape}; expected {shape}")
+    if not np.isfinite(array).all():
+        raise one.wrong(method, array[~np.isfinite(array)], "finite numbers")
     return array
+
+
+def _all_checked(
+    values: object, like: tuple[FloatArray, ...], one: _ActiveDisturbance, method: str
+) -> list[FloatArray]:
+    """:func:`_checked` of all results of a method that returns several, of the shapes of these."""
+    if not (isinstance(values, tuple | list) and len(values) == len(like)):
+        raise one.wrong(method, values, f"{len(like)} arrays")
+    return [_checked(value, old.shape, one, method) for value, old in zip(values, like, strict=True)]

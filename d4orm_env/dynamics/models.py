@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from itertools import chain
 from types import FunctionType
+from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import short_repr
+from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.registry import Registry
 from d4orm_env.core.winding import Unwinding
 from d4orm_env.dynamics.car import CAR
@@ -20,8 +22,8 @@ from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
 from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D
 from d4orm_env.dynamics.holonomic3d_drag import HOLONOMIC3D_DRAG
-from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Model, RungeKutta
-from d4orm_env.dynamics.source_digest import bytecode, pieces, source_text
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Limit, Model, RungeKutta
+from d4orm_env.dynamics.source_digest import bytecode, check_formulas, pieces, source_text, with_strict_integers
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.dynamics.unicycle import UNICYCLE
 from d4orm_env.dynamics.unicycle1 import UNICYCLE1
@@ -114,6 +116,11 @@ def _admit(name: str, model: object) -> Model:
 
 
 def _check_attributes(model: Model) -> None:
+    own = model.own_limits
+    if not (isinstance(own, tuple) and all(isinstance(limit, Limit) for limit in own)):
+        raise ValueError(
+            f"model {model.name!r}: own_limits is {short_repr(own)}; give a tuple of Limit, as (Limit('drag', 0.3),)"
+        )
     n, m, num_limits = model.state_size, model.control_size, len(model.limit_names)
     indices = (*model.speed_indices, *(index for index, _ in (*model.state_limits, *model.trailers)), *model.angles)
     columns = (
@@ -147,7 +154,7 @@ def _check_functions(model: Model) -> None:
     x, u = (0.5,) * n, (0.25,) * m
     limits = (1.0,) * OWN_LIMITS + tuple(limit.default for limit in model.own_limits)
     h = TimeStep(0.1, 0.1 / 2, 0.1 / 3, 0.1 / 6)
-    calls: dict[str, tuple[int, tuple[object, ...]]] = {
+    calls: dict[str, tuple[int, tuple[Any, ...]]] = {
         "derivative": (n, (x, u, limits, PYTHON_OPS)),
         "limit_control": (m, (u, limits, PYTHON_OPS)),
         "limit_state": (n, (x, limits, PYTHON_OPS)),
@@ -174,6 +181,33 @@ def _check_functions(model: Model) -> None:
                 f"model {model.name!r}: {name} uses the float {floats[0]:g}, which would change an engine's "
                 f"precision; make it one of own_limits"
             )
+        own = function
+        while isinstance(own, Unwinding):
+            own = own.limit_state
+        if isinstance(own, FunctionType) and not own.__module__.startswith("d4orm_env."):
+            _check_compilable(f"model {model.name!r}: {name}", own, arguments)
+
+
+def _check_compilable(owner: str, function: FunctionType, arguments: tuple[Any, ...]) -> None:
+    """Check that engines can compile a function, and that its numbers stay in their precision."""
+    check_formulas(owner, function)
+    try:
+        results = with_strict_integers(function)(*map(_in_float32, arguments))
+    except Exception as error:
+        raise ValueError(f"{owner} fails on float32 numbers: {error!r}") from error
+    if any(getattr(value, "dtype", np.float32) != np.float32 for value in results):
+        raise ValueError(
+            f"{owner} computes with a whole number that it names, which would change an engine's precision; write the "
+            "number out, or make it one of own_limits"
+        )
+
+
+def _in_float32(argument: Any) -> Any:
+    if isinstance(argument, TimeStep):
+        return TimeStep(*map(np.float32, tuple[Any, ...](argument)))
+    if argument is PYTHON_OPS:
+        return NUMPY_OPS
+    return tuple(map(np.float32, argument)) if isinstance(argument, tuple) else np.float32(argument)
 
 
 MODELS = Registry("model", "d4orm.models", _admit, model_digest)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dis
 import inspect
 import re
 import sys
@@ -77,6 +78,38 @@ def _named(function: FunctionType) -> Mapping[str, Any]:
 
 _EMPTY = CellType()
 """Of a name that has no value yet."""
+
+
+def check_formulas(owner: str, function: FunctionType) -> None:
+    """Refuse a function with branches or loops, or that names a module or a function from outside the physics.
+
+    Raises:
+        ValueError: If it does; ``owner`` begins the message.
+    """
+    jumps = [step.opname for step in dis.get_instructions(function) if "JUMP" in step.opname and "IF" in step.opname]
+    if jumps:
+        raise ValueError(f"{owner} branches, as by 'if' or 'and'; engines compute many robots at once: use ops.where")
+    if len(list(_codes(function.__code__))) > 1 or any(
+        step.opname == "FOR_ITER" for step in dis.get_instructions(function)
+    ):
+        raise ValueError(f"{owner} has a loop or a function within; write its terms out")
+    named = {step.argval for step in dis.get_instructions(function) if step.opname in ("LOAD_GLOBAL", "LOAD_DEREF")}
+    for name, value in sorted(_named(function).items()):
+        if name in named and isinstance(value, ModuleType):
+            raise ValueError(f"{owner} names the module {name}; take mathematics from ops, as ops.cos")
+        if name in named and callable(value) and not value.__module__.startswith("d4orm_env."):
+            raise ValueError(f"{owner} names {name}, which engines cannot compile; write its formula into the function")
+
+
+def with_strict_integers(function: FunctionType) -> FunctionType:
+    """The function with whole numbers that it names, which widen what they meet, as they do once it is compiled."""
+    whole = {name: np.int64(value) for name, value in _named(function).items() if type(value) is int}
+    cells = tuple(
+        CellType(whole.get(name, cell.cell_contents))
+        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or ())
+    )
+    defaults = tuple(np.int64(value) if type(value) is int else value for value in function.__defaults__ or ())
+    return FunctionType(function.__code__, function.__globals__ | whole, function.__name__, defaults, cells)
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:

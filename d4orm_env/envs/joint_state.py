@@ -27,9 +27,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, frozen_array
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, Floats, frozen_array, short_repr
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.core.winding import MAX_ANGLE
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
 
@@ -74,9 +75,14 @@ def split_state(problem: Problem, state: ArrayLike) -> JointState:
         The parts, as copies.
 
     Raises:
-        ValueError: If the vector's length does not fit the problem.
+        ValueError: If it is no vector of numbers, or its length does not fit the problem.
     """
-    team_size, vector = problem.num_robots, np.array(state, np.float32)
+    check_is_problem(problem)
+    try:
+        vector = np.array(state, np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"state is {short_repr(state)}; give the vector that env.state() returns") from None
+    team_size = problem.num_robots
     widths = (problem.state_size, problem.dimension, problem.control_size, 1)
     expected, body = team_size * sum(widths) + 1, 2 * problem.dimension + 1
     if vector.ndim != 1 or not _fits(vector[expected - team_size - 1 :], team_size, body):

@@ -91,6 +91,14 @@ def reset(problem: Problem, key: jax.Array) -> State:
     return State(jnp.asarray(problem.start, jnp.float32), jnp.zeros(num_robots, bool), jnp.int32(0), idle)
 
 
+def checked_controls(problem: Problem, controls: ArrayLike) -> jax.Array:
+    """``(K, m)`` controls of a team, or actions, as float32; another shape would be broadcast."""
+    array, expected = jnp.asarray(controls, jnp.float32), (problem.num_robots, problem.control_size)
+    if array.shape != expected:
+        raise ValueError(f"actions have shape {array.shape}; expected (K, m) = {expected}")
+    return array
+
+
 def step(
     problem: Problem, state: State, controls: ArrayLike, reward: str | RewardFunction = "paper"
 ) -> tuple[State, Step]:
@@ -107,10 +115,10 @@ def step(
         The next state and what happened.
 
     Raises:
-        ValueError: If there is no such reward.
+        ValueError: If there is no such reward, or the controls have another shape.
     """
     function = find_reward(reward)
-    arrays, controls = _arrays(problem), jnp.asarray(controls, jnp.float32)
+    arrays, controls = _arrays(problem), checked_controls(problem, controls)
     d = arrays.goal.shape[1]
     worlds = Worlds(state.states[..., None], state.arrived[..., None], jnp.zeros_like(controls)[..., None])
     worlds = advance_worlds(problem.team.models, arrays, worlds, controls[..., None])

@@ -199,7 +199,7 @@ class FunctionalEnv:
 
     def _move(self, key: jax.Array, state: EnvState, actions: jax.Array) -> tuple[EnvState, Transition]:
         problem, team = self.instance(state.instance), state.team
-        actions = jnp.asarray(actions, jnp.float32)
+        actions = functional.checked_controls(problem, actions)
         if self.features is not None:
             frames = self.features.encode(self._seen(state))[1]
             actions = self.features.decode(actions, frames, self.problem.team.control_limits)

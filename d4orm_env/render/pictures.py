@@ -15,9 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.core.summary_line import KeyFigure, count
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory, arrival_times
 from d4orm_env.render import own_style
@@ -53,6 +55,9 @@ def contact_points(trajectory: Trajectory) -> list[Array]:
 
 def checked_trajectory(problem: Problem, trajectory: Trajectory) -> None:
     """Check that a trajectory belongs to a problem of this size."""
+    check_is_problem(problem)
+    if not isinstance(trajectory, Trajectory):
+        raise ValueError(f"trajectory is {short_repr(trajectory)}; give a Trajectory, such as plan.trajectory")
     shape = np.shape(trajectory.states)
     if len(shape) != 3 or shape[0] < 1 or shape[1:] != (problem.num_robots, problem.state_size):
         raise ValueError(

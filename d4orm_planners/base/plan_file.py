@@ -72,7 +72,7 @@ def read_plan(path: str | os.PathLike[str]) -> Plan:
         raise FileNotFoundError(f"there is no plan at {source}; write one with Plan.save or d4orm plan") from None
     except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
         raise ValueError(
-            f"{source} is not a readable plan ({first_line(error)}); write it anew with Plan.save"
+            f"{source} is not a readable plan ({first_line(error)}); mend that, or write it anew with Plan.save"
         ) from error
 
 

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from d4orm_env.core.arrays import duration, short_repr
 from d4orm_env.core.errors import UnknownKeywordError, did_you_mean, no_setting, unknown
-from d4orm_env.core.registry import load_reference, source_digest, source_object
+from d4orm_env.core.registry import check_call, load_reference, source_digest, source_object
 from d4orm_planners.base.names import PLANNERS, POLICIES, is_planner_class
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy import OpenLoop, Policy, acts, as_policy, makes_policy
@@ -254,6 +254,7 @@ def _planner_class(name: object) -> type[Planner]:
     kind = name if is_planner_class(name) else PLANNERS.find(name)
     if inspect.isabstract(kind):
         raise ValueError(f"planner {called(name)!r} lacks iterate; define it in the class")
+    check_call(kind.iterate, f"planner {called(name)!r}: iterate", "self", "search", "state")
     return kind
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, usable
 from d4orm_env.core.problem import Problem
+from d4orm_env.core.registry import check_call
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.plan import Plan
@@ -157,6 +158,8 @@ def within_limits(problem: Problem, actions: Actions) -> Actions:
     """
     controls, size = np.zeros((problem.num_robots, problem.control_size), np.float32), (problem.control_size,)
     robots = {f"robot_{robot}": robot for robot in range(problem.num_robots)}
+    if not isinstance(actions, Mapping):
+        return actions
     for agent, action in actions.items():
         try:
             control = as_float32(action)
@@ -207,6 +210,11 @@ class OpenLoop(StatePolicy):
     ) -> None:
         if (planner is None) == (plan is None):
             raise ValueError("an open-loop policy needs either a planner or a plan")
+        if not isinstance(planner, Planner | None) or not isinstance(plan, Plan | None):
+            given = short_repr(planner if plan is None else plan)
+            raise ValueError(
+                f"an open-loop policy takes a planner, or plan= of a Plan, as load_plan() reads, not {given}"
+            )
         self.planner, self.plan, self.time_limit = planner, plan, time_limit
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
@@ -272,6 +280,8 @@ def as_policy(thing: Any, owner: str) -> Policy:
     if isinstance(thing, Planner):
         return OpenLoop(thing)
     if acts(thing) and not isinstance(thing, type):
+        check_call(thing.act, f"{owner}: act", "observations", "state")
+        check_call(thing.reset, f"{owner}: reset", "env", seed=0)
         return thing
     count = required_parameters(thing) if callable(thing) and not isinstance(thing, type) else 0
     if count not in (1, 2):

@@ -195,7 +195,8 @@ class SolveRun:
                 "Iteration(controls)"
             )
         self.state, iteration = result
-        self.current = drive_further_in(self, iteration.evaluated or self._evaluate(iteration.controls), self._evaluate)
+        candidate = iteration.evaluated or self._evaluate(checked_controls(self.problem, iteration.controls))
+        self.current = drive_further_in(self, candidate, self._evaluate)
         self.iteration += 1
         self.denoising_steps += iteration.denoising_steps
         if self.current.rank > self.best.rank:

@@ -93,9 +93,9 @@ def _draw(path: Path, evaluations: Sequence[Evaluation]) -> None:
     figure = figures.Figure(figsize=(7, 3), layout="constrained")
     left, right = figure.subplots(1, 2)
     steps = [evaluation.steps / 1e6 for evaluation in evaluations]
-    left.plot(steps, [100 * evaluation.success_rate for evaluation in evaluations])
+    left.plot(steps, [100 * evaluation.success_rate for evaluation in evaluations], marker=".")
     left.set(xlabel="robot-steps [million]", ylabel="success [%]", ylim=(0, 100))
-    right.plot(steps, [evaluation.travel_time for evaluation in evaluations], color="tab:orange")
+    right.plot(steps, [evaluation.travel_time for evaluation in evaluations], marker=".", color="tab:orange")
     right.set(xlabel="robot-steps [million]", ylabel="travel time [s]")
     for axes in (left, right):
         axes.grid(alpha=0.3)

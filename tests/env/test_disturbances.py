@@ -41,7 +41,6 @@ from d4orm_env.disturbances import (
     Occlusion,
     Push,
     Quantisation,
-    Scene,
     Stall,
     StateDelay,
     StateNoise,
@@ -663,17 +662,29 @@ def test_what_an_environment_cannot_have_is_refused(disturbances: Any, complaint
             make(problem=line_problem([1.0]), disturbances=disturbances)
 
 
-def test_a_users_disturbance_that_returns_nonsense_is_named() -> None:
-    class Wrong(Disturbance[Any]):
-        def command(self, controls: Any, memory: Any, scene: Scene, draws: Draws) -> Any:
-            return controls[:, :1]
+@pytest.mark.parametrize(
+    ("method", "complaint"),
+    [
+        ({"command": lambda self, controls, memory, scene, draws: controls[:, :1]},
+         r"command returned shape \(1, 1, 2\); expected \(1, 3, 2\)"),
+        ({"command": lambda self, controls, memory, scene, draws: controls * np.nan},
+         r"command returned array\(\[nan.*; expected finite numbers"),
+        ({"move": lambda self, states, controls, *rest: states}, "move returned array.*; expected 2 arrays"),
+        ({"see": lambda self, seen, memory, scene, draws: None}, "see returned None; expected 3 arrays"),
+        ({"begin": lambda self, scene, draws: np.zeros(1)}, r"begin returned array\(\[0.\]\); expected a NamedTuple"),
+        ({"command": lambda self, controls, memory: controls}, "command takes .* is called with .*scene, draws"),
+    ],
+)  # fmt: skip
+def test_a_users_disturbance_that_returns_nonsense_is_named(method: Any, complaint: str) -> None:
+    wrong = type("Wrong", (Disturbance,), method)
 
-    env = navigation_v0.parallel_env("circle", 3, disturbances=[Wrong()])
-    env.reset(seed=0)
-    with pytest.raises(
-        ValueError, match=r"disturbance Wrong: command returned shape \(1, 1, 2\); expected \(1, 3, 2\)"
-    ):
+    def go() -> None:
+        env = navigation_v0.parallel_env("circle", 3, disturbances=[wrong()])
+        env.reset(seed=0)
         env.step(sampled_actions(env))
+
+    with pytest.raises(ValueError, match=f"disturbance Wrong: {complaint}"):
+        go()
 
 
 # Names

@@ -102,6 +102,14 @@ def test_a_reward_of_ones_own_is_traced() -> None:
         functional.step(problem, state, controls, reward="mine")
 
 
+@pytest.mark.parametrize("shape", [(3, 1), (1, 2), (2,), (2, 3)])
+def test_actions_of_another_shape_are_not_broadcast(shape: tuple[int, ...]) -> None:
+    env = FunctionalEnv("circle", num_robots=3)
+    state, _ = env.reset(KEY)
+    with pytest.raises(ValueError, match=r"actions have shape .*; expected \(K, m\) = \(3, 2\)"):
+        jax.jit(env.step)(KEY, state, jnp.ones(shape))
+
+
 def test_the_way_is_not_to_be_seen() -> None:
     env = navigation_v0.parallel_env("circle", 2, observed_path=True)
     with pytest.raises(ValueError, match="leave observed_path out"):

@@ -77,6 +77,13 @@ def boat() -> Iterator[Model]:
     kernels_of_codes.cache_clear()
 
 
+ONE = 1
+
+
+def doubled(x: Any) -> Any:
+    return x + x
+
+
 def with_function(**functions: Any) -> Model:
     return replace(BOAT, functions=FUNCTIONS._replace(**functions))
 
@@ -97,6 +104,13 @@ def with_function(**functions: Any) -> Model:
         (with_function(rest=lambda x, zero: [*x]), r"rest returns \[0.5, 0.5\]; expected a tuple of 2 finite numbers"),
         (with_function(rest=lambda x: x), "rest fails on Python's numbers: TypeError"),
         (with_function(rest=lambda x, zero: (x[0] * 0.5, x[1])), "rest uses the float 0.5, .* one of own_limits"),
+        (with_function(rest=lambda x, zero: (x[0] and zero, x[1])), "rest branches, .*: use ops.where"),
+        (with_function(rest=lambda x, zero: tuple([part for part in x])), "rest has a loop .* write its terms out"),  # noqa: C416
+        (with_function(rest=lambda x, zero: (np.abs(x[0]), x[1])), "rest names the module np; take .* from ops"),
+        (with_function(rest=lambda x, zero: (doubled(x[0]), x[1])), "rest names doubled, which engines cannot compile"),
+        (with_function(rest=lambda x, zero: (ONE * x[0], x[1])), "rest computes with a whole number that it names"),
+        (with_function(rest=lambda x, zero, one=1: (one * x[0], x[1])), "rest computes with a whole number"),
+        (replace(BOAT, own_limits=Limit("drag", 0.3)), r"own_limits is Limit\(.*; give a tuple of Limit"),
         ("boat", "register_model takes a Model, not 'boat'"),
     ],
 )

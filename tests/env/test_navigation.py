@@ -416,6 +416,10 @@ def test_a_state_of_another_problem_is_refused() -> None:
     env.reset()
     with pytest.raises(ValueError, match=r"state has shape \(28,\)"):
         split_state(make_problem("circle", num_robots=4), env.state())
+    with pytest.raises(ValueError, match=r"state is <bound method.*; give the vector that env.state\(\) returns"):
+        split_state(env.problem, env.state)
+    with pytest.raises(ValueError, match=r"problem is array.*; give a Problem"):
+        split_state(env.state(), env.problem)  # type: ignore[arg-type]
 
 
 def test_time_left_runs_out() -> None:

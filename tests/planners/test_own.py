@@ -118,6 +118,12 @@ def test_an_episode_takes_whatever_acts(policy: Any) -> None:
     np.testing.assert_array_equal(controls(policy), controls("test_own:Push"))
 
 
+def test_controls_of_an_iteration_have_the_shape_that_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ahead, "iterate", lambda self, search, state: (state, Iteration(np.zeros((2, 50, 2)))))
+    with pytest.raises(ValueError, match=r"controls have shape \(2, 50, 2\); expected \(H, K, m\) = \("):
+        make_planner(Ahead).solve(PROBLEM, seed=0)
+
+
 @pytest.mark.parametrize("result", [None, (None, np.zeros((1, 1, 2))), Iteration(np.zeros((1, 1, 2)))])
 def test_an_iteration_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch, result: object) -> None:
     monkeypatch.setattr(Ahead, "iterate", lambda *_: result)
@@ -151,6 +157,14 @@ def test_settings_reach_what_takes_them() -> None:
         ("test_own:Nothing", {}, "test_own has no 'Nothing'"),
         ("test_own:not a name", {}, "is no import path; give package.module:Name"),
         ("test_own:PROBLEM", {}, "which does not act"),
+        ("test_own:PROBLEN", {}, "test_own has no 'PROBLEN'; .*; did you mean 'PROBLEM'"),
+        (
+            type("One", (Policy,), {"act": lambda self, all: {}}),
+            {},
+            r"'One': act takes .* called with \(observations, ",
+        ),
+        (type("No", (Push,), {"reset": lambda self, env: None}), {}, r"'No': reset takes .* called with \(env, seed=0"),
+        (type("Be", (Planner,), {"iterate": lambda self: None}), {}, "'Be': iterate takes .* called with .*search, st"),
     ],
 )
 def test_what_does_not_act_is_refused(policy: Any, settings: dict[str, Any], message: str) -> None:
