@@ -88,8 +88,8 @@ class Controller:
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
             meanwhile, and its late answer is not used. ``None`` waits. A policy that is named and has a ``deadline``,
             as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
-        lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
-            in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
+        lag: Time constant of the robots' actuators [s], one or one per robot. Controls and the estimate of that allow
+            for it; in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
             are shifted against a lasting distance from the reference, as a thrust that is too weak causes, up to the
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the

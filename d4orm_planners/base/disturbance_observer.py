@@ -42,7 +42,7 @@ class DisturbanceObserver:
         lag: Time constant of the actuators [s], one or ``K``.
 
     Attributes:
-        lags: ``(K,)`` bool: robots of such models whose actuators have a lag.
+        lags: ``(K,)`` bool: robots whose actuators have a lag, of whatever model.
         trust: ``(K, 1)`` share of a robot's distance from its reference that its lag does not explain.
         bias: ``(K, d)`` the estimate, in units of the controls; zero for other models.
 
@@ -65,12 +65,12 @@ class DisturbanceObserver:
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
         self._fastest = fastest[:, None]
-        self.lags: BoolArray = self._lag[:, 0] > 0
-        self._remains = np.where(self.lags[:, None], np.exp(-problem.dt / np.maximum(self._lag, 1e-12)), 0.0)
+        self.lags: BoolArray = constants > 0
+        self._remains = np.where(self.lags, np.exp(-problem.dt / np.maximum(constants, 1e-12)), 0.0)[:, None]
         # Mean over a step of exp(-t / lag).
-        self._share = self._lag / problem.dt * (1 - self._remains)
+        self._share = (constants / problem.dt)[:, None] * (1 - self._remains)
         self.trust = problem.dt / (problem.dt + 2 * constants[:, None])
-        self.bias, self._applied = np.zeros((count, d)), np.zeros((count, d))
+        self.bias, self._applied = np.zeros((count, d)), np.zeros((count, problem.control_size))
         self._explained: Floats | None = None
         self._before: Floats | None = None
 
@@ -94,7 +94,7 @@ class DisturbanceObserver:
         double integrator under the control itself; so does ``p + tau v`` of first-order models.
         """
         d, ahead = self.problem.dimension, states.copy()
-        rate = self._lag * (self._applied + self.bias)
+        rate = self._lag * (self._applied[:, :d] + self.bias)
         velocity = states[:, d : 2 * d] if states.shape[1] >= 2 * d else 0.0
         ahead[:, :d] += np.where(self._second_order, self._lag * velocity, rate).astype(np.float32)
         if self._second_order.any():
@@ -104,8 +104,7 @@ class DisturbanceObserver:
     @property
     def actuators(self) -> Actuators:
         """What the robots' actuators apply now, and how they go on."""
-        applied = np.pad(self._applied, ((0, 0), (0, self.problem.control_size - self._applied.shape[1])))
-        return Actuators(applied, self._remains, self._share)
+        return Actuators(self._applied, self._remains, self._share)
 
     def executed(self, before: FloatArray, after: FloatArray, controls: FloatArray) -> FloatArray:
         """``(K, m)`` controls that take double integrators from one velocity to the other; of other models unchanged.
@@ -127,7 +126,7 @@ class DisturbanceObserver:
         d, wanted = self.problem.dimension, controls.copy()
         wanted[:, :d] -= np.where(resting[:, None], 0.0, self.bias).astype(np.float32)
         sent = limit_controls(self.problem, wanted)
-        self._explained = sent[:, :d] + self._share * (self._applied - sent[:, :d])
+        self._explained = (sent + self._share * (self._applied - sent))[:, :d]
         self._explained[resting] = np.nan
-        self._applied = sent[:, :d] + self._remains * (self._applied - sent[:, :d])
+        self._applied = sent + self._remains * (self._applied - sent)
         return sent
