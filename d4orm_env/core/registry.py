@@ -231,6 +231,20 @@ def _is_compiled(thing: object) -> bool:
     return hasattr(thing, "__wrapped__") and not (inspect.isfunction(thing) or inspect.ismethod(thing))
 
 
+def required_parameters(function: Callable[..., object]) -> int | None:
+    """Return the number of positional parameters that a function requires; ``None`` if that says nothing about it."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    count = sum(
+        parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        and parameter.default is parameter.empty
+        for parameter in parameters
+    )
+    return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
+
+
 def check_call(function: Callable[..., object], owner: str, *arguments: str, **keywords: object) -> None:
     """Refuse a function of a user that cannot be called with these arguments.
 

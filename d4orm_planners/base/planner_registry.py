@@ -247,10 +247,8 @@ def _configured(
 
 def _planner_class(name: object) -> type[Planner]:
     if isinstance(name, str) and name in POLICIES and name not in PLANNERS:
-        raise ValueError(
-            f"{name!r} is no planner but a policy, which acts step by step; use make_policy({name!r}), or "
-            f"d4orm run --policy {name}"
-        )
+        remedy = f"use make_policy({name!r}), or d4orm run --policy {name}"
+        raise ValueError(f"{name!r} is no planner but a policy, which acts step by step; {remedy}")
     kind = name if is_planner_class(name) else PLANNERS.find(name)
     if inspect.isabstract(kind):
         raise ValueError(f"planner {called(name)!r} lacks iterate; define it in the class")

@@ -12,7 +12,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, usable
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.registry import check_call
+from d4orm_env.core.registry import check_call, required_parameters
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.plan import Plan
@@ -293,17 +293,3 @@ def as_policy(thing: Any, owner: str) -> Policy:
             remedy = "give it as from_torch(module), from d4orm_planners.base.adapters"
         raise ValueError(f"{owner} is {short_repr(thing)}, which does not act; {remedy}")
     return TeamFunction(thing) if count == 2 else RobotFunction(thing)
-
-
-def required_parameters(function: Callable[..., object]) -> int | None:
-    """Return the number of positional parameters that a function requires; ``None`` if that says nothing about it."""
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return None
-    count = sum(
-        parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-        and parameter.default is parameter.empty
-        for parameter in parameters
-    )
-    return None if not count and any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters) else count
