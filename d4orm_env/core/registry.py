@@ -187,6 +187,8 @@ def _load_file(path: Path) -> ModuleType:
         assert spec.loader is not None
         module = module_from_spec(spec)
         sys.modules[name] = module  # dataclasses look their module up there while it is executed
+        if (folder := str(path.resolve().parent)) not in sys.path:
+            sys.path.append(folder)  # its neighbours are found, as when Python runs it
         try:
             spec.loader.exec_module(module)
         except BaseException:

@@ -172,6 +172,13 @@ def test_what_does_not_act_is_refused(policy: Any, settings: dict[str, Any], mes
         make_policy(policy, **settings)
 
 
+def test_a_file_finds_its_neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "neighbour_of_mine.py").write_text("def push(observations, state): return {}\n")
+    (tmp_path / "mine.py").write_text("from neighbour_of_mine import push\n")
+    assert make_policy(f"{tmp_path / 'mine.py'}:push").function({}, None) == {}  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("policy", [Push, make_push, Pull, "test_own:Ahead", push, Push()])
 def test_unknown_settings_are_refused(policy: Any) -> None:
     with pytest.raises(UnknownKeywordError, match="speed"):
