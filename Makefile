@@ -19,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all integrations portability wheel warm-wheel wheel-test lint docs bench bench-compare results format clean
+.PHONY: help demo test test-all integrations portability wheel warm-wheel wheel-test lint docs bench bench-compare reproduce format clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -74,8 +74,8 @@ bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 bench-compare: $(CORE_STAMP) ## Print what got slower since a commit: make bench-compare BASE=main BENCH_ARGS='--quick'
 	$(BIN)/python tests/release/bench_compare.py $(BASE) $(BENCH_ARGS)
 
-results: $(DEV_STAMP) ## Make the tables and figures in docs/tables from the trials in examples/studies/data/
-	$(BIN)/python -m examples.studies all --out docs/tables
+reproduce: $(DEV_STAMP) ## Make the tables of docs/tables from examples/studies/data; make reproduce FIGURE=robustness SEEDS=3 runs one anew
+	$(BIN)/python -m examples.studies $(if $(FIGURE),paper $(FIGURE) $(if $(SEEDS),--seeds $(SEEDS)),all --out docs/tables)
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can
 	$(BIN)/ruff check --fix .

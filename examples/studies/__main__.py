@@ -2,7 +2,7 @@
 
     python -m examples.studies                        # what there is
     python -m examples.studies lifelong --minutes 1   # a study; --help tells its options
-    python -m examples.studies all --out docs/tables  # what `make results` runs
+    python -m examples.studies all --out docs/tables  # what `make reproduce` runs
 
 All tables are made in one process: to import what a study needs takes longer than most of them.
 """

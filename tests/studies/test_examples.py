@@ -477,7 +477,7 @@ def test_policies_meet_every_disturbance(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_tables_of_the_docs_are_those_of_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What ``make results`` does, measured times left out: those of ``bench`` are of one machine.
+    """What ``make reproduce`` does, measured times left out: those of ``bench`` are of one machine.
 
     Pictures are not painted: there is nothing to compare them with, and the quick versions of the studies paint theirs.
     """
