@@ -127,7 +127,7 @@ class Controller:
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = tracker
         self._looks = mode == "measured" and not isinstance(self.policy, OpenLoop)
-        self._lag, self._leads = check_lag(lag), tracker or not self._looks
+        self.lag, self._leads = check_lag(lag), tracker or not self._looks
         self._background: Background[Actions] = Background()
         self._env: Any = None
         self._ending: JointState | None = None  # the reference once the episode is over
@@ -163,7 +163,7 @@ class Controller:
             raise
 
     def _begin(self, problem: Problem, states: ArrayLike, time: float, seed: int) -> None:
-        self._observer, self._robots = DisturbanceObserver(problem, self._lag), problem
+        self._observer, self._robots = DisturbanceObserver(problem, self.lag), problem
         self._lags = self._observer.lags & self._leads  # elsewhere the measured states are taken as without a lag
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
@@ -242,7 +242,7 @@ class Controller:
         if self.tracker:
             self._shift(measured, known)
         if self._looks:
-            seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured)
+            seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured, known)
             if not self.over:
                 states = self._possible(seen)
                 self._observations, _ = self._env.set_state(np.where(at_rest[:, None], self._joint.states, states))

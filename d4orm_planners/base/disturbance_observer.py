@@ -87,16 +87,18 @@ class DisturbanceObserver:
             self.bias = np.where(self._observed[:, None] & np.isfinite(left), better, self.bias)
         self._before = now
 
-    def undelayed(self, states: FloatArray) -> FloatArray:
-        """``(K, n)`` states that obey the models as if there were no lag; those of other models as they are.
+    def undelayed(self, states: FloatArray, known: BoolArray) -> FloatArray:
+        """``(K, n)`` states that obey the models as if there were no lag; those of other models, and of robots that are
+        not ``known`` ``(K,)``, as they are.
 
         With a lag ``tau`` after which an acceleration ``a`` is the control's, ``p + tau v`` and ``v + tau a`` move as a
         double integrator under the control itself; so does ``p + tau v`` of first-order models.
         """
         d, ahead = self.problem.dimension, states.copy()
-        rate = self._lag * (self._applied[:, :d] + self.bias)
+        lag = np.where(known[:, None], self._lag, 0.0)
+        rate = lag * (self._applied[:, :d] + self.bias)
         velocity = states[:, d : 2 * d] if states.shape[1] >= 2 * d else 0.0
-        ahead[:, :d] += np.where(self._second_order, self._lag * velocity, rate).astype(np.float32)
+        ahead[:, :d] += np.where(self._second_order, lag * velocity, rate).astype(np.float32)
         if self._second_order.any():
             ahead[:, d : 2 * d] += np.where(self._second_order, rate, 0.0).astype(np.float32)
         return ahead

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.controller import Controller, ControlSetpoint
 from d4orm_planners.serve import wire
+from d4orm_planners.serve.fleet_robot import FleetRobot
 from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
 from d4orm_planners.tracking import ros_messages as ros
 from d4orm_planners.tracking.steering import braking_share
@@ -27,32 +27,10 @@ LEVELS = {DRIVING: 0, BRAKING: 0, PLANNING: 0, WAITING: 1, STOPPED: 2}
 """Levels of diagnostics: well, warning, error."""
 BASE = 0.5
 """Share of a period over which velocities are taken from poses."""
+AT_REST = 0.05
+"""Share of its largest speed up to which a robot that was stopped counts as at rest."""
 TELL = 1.0
 """Time between two diagnostics of the same state [s]."""
-
-
-@dataclass
-class FleetRobot:
-    """A robot as it was last heard."""
-
-    name: str  #: Name of its topics
-    state: FloatArray  #: ``(n,)`` as last heard; not a number before, and what no message says
-    heard: float = -np.inf  #: When it was last heard, by this process's clock [s]
-    heading: float = 0.0  #: As last heard [rad]
-    stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]
-    #: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s]
-    velocity: Floats = field(default_factory=lambda: np.zeros(3))
-    #: Time by the robot's clock [s] and ``(3,)`` position of the later one [m]
-    posed: tuple[float, Floats] | None = None
-
-    def take_pose(self, stamped: Any, base: float) -> None:
-        """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by ``base`` seconds at least."""
-        now, position = wire.time_of(stamped.header), position_of(stamped.pose.position)
-        passed = np.inf if self.posed is None else now - self.posed[0]
-        if passed < base and passed >= 0:
-            return
-        self.velocity = (position - self.posed[1]) / passed if self.posed and 0 < passed < np.inf else np.zeros(3)
-        self.posed = now, position
 
 
 class Period(NamedTuple):
@@ -119,7 +97,8 @@ class FleetServer:
         self._begun: Future[None] | None = None
         self._period: Period | None = None
         self._pace = self._passed = 1.0  # pace while braking, and share of the period that is over
-        self._emergency = self._replan = False
+        self._twists: Floats = np.zeros((len(names), 4))  # as told last
+        self._emergency, self._replan, self._stops, self._stopped = False, False, 0, -np.inf
         self._commanding = threading.RLock()
         self._e_stop = session.subscriber("e_stop", wire.BOOL, self._mind)
         self._inputs = *self._odometry, *self._poses, *self._goals, self._e_stop
@@ -158,7 +137,7 @@ class FleetServer:
 
     def _next_state(self, now: float) -> str:
         if self._emergency or self._silent(now):
-            self._replan = True
+            self._replan, self._stopped = True, now
             return STOPPED if self._emergency else WAITING
         if self._begun is not None and self._begun.done():
             self._begun.result()
@@ -168,6 +147,8 @@ class FleetServer:
         if self._begun is None and (self._replan or self.state != DRIVING):
             if self.state in (DRIVING, BRAKING) and self._pace > 0:
                 return BRAKING
+            if self._still_stops(now):
+                return PLANNING
             self._replan = False
             states = np.stack([robot.state for robot in self._robots])
             self._begun = self._planner.submit(self._controller.begin, self._problem, states, now, self._seed)
@@ -194,13 +175,14 @@ class FleetServer:
             for message in e_stop.take():
                 self._emergency = bool(message.data)
                 if self._emergency:
-                    self._replan, self._pace = True, 0.0
+                    self._replan, self._pace, self._stops = True, 0.0, self._stops + 1
                     self._stand()
 
     def _hear(self, number: int, pose: Any, now: float, velocity: Floats, turn_rate: float = np.nan) -> None:
         state, robot = wire.state_from(self._problem, number, pose, velocity, turn_rate), self._robots[number]
         heading = wire.heading_of(pose.orientation)
         if np.isfinite(heading) and np.isfinite(state[: self._problem.dimension]).all():
+            robot.yaw = robot.yaw if np.isfinite(robot.heard) else heading
             robot.state, robot.heading, robot.heard = state, heading, now
         else:
             self._unusable += 1
@@ -230,20 +212,29 @@ class FleetServer:
     def _silent(self, now: float) -> list[str]:
         return [robot.name for robot in self._robots if now - robot.heard > self.deadline]
 
+    def _still_stops(self, now: float) -> bool:
+        """Whether a robot that was stopped at full speed is not at rest yet."""
+        team = self._problem.team
+        speeds = [robot.state[list(model.speed_indices)] for robot, model in zip(self._robots, team.robot_models)]
+        fast = [np.linalg.norm(np.nan_to_num(own)) for own in speeds] > AT_REST * team.max_speed
+        return bool((fast & (now - self._stopped < team.max_speed / team.max_acceleration)).any())
+
     def _next_period(self, states: FloatArray, now: float) -> Period:
         setpoint = self._controller.step(states, now)
-        rows = zip(self._controller.states, setpoint.control, self._robots)
-        twists = [wire.twist(self._problem, number, x, u, robot.heading) for number, (x, u, robot) in enumerate(rows)]
+        lags = np.broadcast_to(self._controller.lag, len(self._robots))
+        headings = [robot.heading for robot in self._robots]
+        rows = zip(self._controller.states, setpoint.control, headings, self._twists, lags)
+        twists = [wire.twist(self._problem, number, *row) for number, row in enumerate(rows)]
         begin = setpoint if self._period is None else self._period.setpoint
         return Period(begin.position, setpoint, np.array(twists))
 
     def _drive(self, now: float) -> None:
         missing = [now - robot.heard > 2 * self._problem.dt for robot in self._robots]  # for the last two periods
         states = np.where(np.array(missing)[:, None], np.float32(np.nan), [robot.state for robot in self._robots])
-        period = self._next_period(states, now)
+        stops, period = self._stops, self._next_period(states, now)
         _, setpoint, twists = period
         with self._commanding:
-            if self._emergency:  # it came while these were thought out
+            if self._stops != stops:  # an emergency came while these were thought out
                 return
             self._period, self._pace, self._passed = period, 1.0, 1.0
             for robot in self._robots:
@@ -252,7 +243,7 @@ class FleetServer:
 
     def _brake(self, now: float) -> None:
         """Slow all robots down on the controller's reference, by the same share."""
-        period, before, dt = self._period, self._pace, self._problem.dt
+        period, before, dt, stops = self._period, self._pace, self._problem.dt, self._stops
         assert period is not None  # braking comes after driving
         pace = max(before - braking_share(self._problem, period.setpoint.velocity, period.setpoint.acceleration), 0.0)
         twists, passed = min(pace, 1.0 - self._passed) * period.twists, self._passed + pace
@@ -263,7 +254,7 @@ class FleetServer:
         position = period.begin + passed * (setpoint.position - period.begin)
         acceleration = pace * pace * setpoint.acceleration + (pace - before) / dt * setpoint.velocity
         with self._commanding:
-            if self._emergency:
+            if self._stops != stops:
                 return
             self._period, self._pace, self._passed = period, pace, passed
             for robot, stand in zip(self._robots, position):
@@ -272,21 +263,29 @@ class FleetServer:
 
     def _command(self, period: Period, twists: Floats, *points: Floats) -> None:
         """Publish twists ``(K, 4)``, and positions, velocities and accelerations ``(K, d)`` with the headings."""
-        rows = zip(self._robots, twists, *points, period.setpoint.heading)
+        self._twists = twists
+        rows = zip(self._robots, twists, *points, self._facing(period.setpoint.heading))
         for number, (robot, twist, *point) in enumerate(rows):
             self._commands[number].publish(ros.twist(twist[:3], float(twist[3])))
             self._setpoints[number].publish(wire.full_state(robot.name, *point))
 
+    def _facing(self, headings: Floats) -> list[float]:
+        """Headings of robots whose model has one, and the yaw of the others."""
+        models = zip(self._problem.team.robot_models, headings, self._robots)
+        return [robot.yaw if model.heading_index is None else float(own) for model, own, robot in models]
+
     def _stand(self) -> None:
         """Hold all robots where they were when they were stopped."""
         still, d = np.zeros(self._problem.dimension), self._problem.dimension
+        facing = self._facing(np.array([robot.heading for robot in self._robots]))
         with self._commanding:
-            for robot, command, setpoint in zip(self._robots, self._commands, self._setpoints):
+            self._twists = np.zeros_like(self._twists)
+            for robot, command, setpoint, heading in zip(self._robots, self._commands, self._setpoints, facing):
                 command.publish(ros.twist(np.zeros(3)))
                 if robot.stand is None and np.isfinite(robot.heard):
                     robot.stand = robot.state[:d].astype(np.float64)
                 if robot.stand is not None:
-                    setpoint.publish(wire.full_state(robot.name, robot.stand, still, still, robot.heading))
+                    setpoint.publish(wire.full_state(robot.name, robot.stand, still, still, heading))
 
     def _diagnosis(self, now: float) -> Any:
         silent, refused = self._silent(now), self._unusable + sum(topic.refused for topic in self._inputs)

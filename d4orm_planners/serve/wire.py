@@ -202,8 +202,13 @@ def turned(vector: Floats, angle: float) -> Floats:
     return np.array([cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]])
 
 
-def twist(problem: Problem, robot: int, state: FloatArray, control: FloatArray, heading: float) -> Floats:
+def twist(
+    problem: Problem, robot: int, state: FloatArray, control: FloatArray, heading: float, told: Floats, lag: float
+) -> Floats:
     """``(4,)`` velocity [m/s] that a control leads to in a step, in the robot's own frame, and turn rate [rad/s].
+
+    It goes on from the speed that the robot was told last, as far as its lag explains that it drives at another: speeds
+    that follow commands with a lag are accelerations that do.
 
     Args:
         problem: The team.
@@ -211,15 +216,21 @@ def twist(problem: Problem, robot: int, state: FloatArray, control: FloatArray, 
         state: ``(n,)`` where it is.
         control: ``(m,)``.
         heading: Of a robot whose model has none [rad].
+        told: ``(4,)`` the last twist.
+        lag: Time constant of its speed [s].
     """
     model, limits = problem.team.robot_models[robot], tuple(problem.team.limits[robot])
+    speeds, room = list(model.speed_indices), problem.team.max_acceleration[robot] * lag
+    last = told[:1] if model.heading_index is not None else turned(told[:3], heading)[: len(speeds)]
+    state = state.copy()
+    state[speeds] += np.clip(last[: len(speeds)] - state[speeds], -room, room).astype(np.float32)
     x, u = tuple(state[: model.state_size]), tuple(control[: model.control_size])
     functions, step = model.functions, TimeStep(*problem.arrays.time_step)
     after = functions.limit_state(functions.integrate(x, u, limits, step, NUMPY_OPS), limits, NUMPY_OPS)
     velocity = np.array([*map(float, functions.velocity(after, u, limits, NUMPY_OPS)), 0.0])[:3]
     turn_rate = 0.0
     if model.heading_index is not None:
-        turn_rate = (float(after[model.heading_index]) - float(state[model.heading_index])) / problem.dt
+        turn_rate = float(functions.derivative(after, u, limits, NUMPY_OPS)[model.heading_index])
         heading = float(after[model.heading_index])
     return np.append(turned(velocity, -heading), turn_rate)
 

@@ -6,17 +6,27 @@ Control: Linear Quadratic Methods, 1990): what cannot be corrected, as the way a
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
-from d4orm_planners.tracking.steering import integrated, limit_controls, short_way_round
+from d4orm_planners.tracking.steering import (
+    integrated,
+    limit_controls,
+    preferred_velocities,
+    short_way_round,
+    track_velocities,
+)
 
-HORIZON = 20
-"""Steps that the regulator looks ahead."""
+HORIZON = 2.0
+"""Time that the regulator looks ahead, in times in which the slowest robot gets to full speed."""
+LOST = 1.0
+"""Difference of a heading from the reference's beyond which its slopes say nothing [rad]."""
+FAR = 2.0
+"""Distance from the reference, in radii, from which on robots that are lost drive to it; nearer ones stand."""
 DIFFERENCE = 1e-2
 """Share of a unit by which states and controls are varied to find the slopes of the motion."""
 
@@ -42,7 +52,8 @@ def regulated(
 ) -> FloatArray:
     """``(K, m)`` controls within the limits that lead robots from ``states`` ``(K, n)`` back to a reference.
 
-    Full control is worth a distance of a radius, or a radian.
+    Full control is worth a distance of a radius, or a radian. Who is lost drives to where the reference
+    will be, or stands.
 
     Args:
         problem: The robots.
@@ -63,8 +74,32 @@ def regulated(
     by_state, by_control = np.dstack([_widened(by_state, off.shape[1]), missed]), _widened(by_control, off.shape[1])
     by_state[:, -1, -1] = 1.0
     weights = _widened(_weights(problem.team), off.shape[1])
-    controls += np.einsum("kmn,kn->km", _gains(weights, limits, by_state, by_control), off)
-    return limit_controls(problem, controls.astype(np.float32))
+    horizon = HORIZON * float((problem.team.max_speed / problem.team.max_acceleration).max()) / problem.dt
+    controls += np.einsum("kmn,kn->km", _gains(weights, limits, by_state, by_control, max(horizon, 2.0)), off)
+    controls, lost = limit_controls(problem, controls.astype(np.float32)), _lost(problem, states, reference)
+    return np.where(lost[:, None], _found_again(problem, states, reference), controls) if lost.any() else controls
+
+
+def _lost(problem: Problem, states: FloatArray, reference: Reference) -> BoolArray:
+    """``(K,)`` robots with a heading that no small correction leads back: they face elsewhere, or have stopped far
+    beside a reference that stands.
+    """
+    turns = np.array([model.heading_index is not None for model in problem.team.robot_models])
+    facing = np.abs(problem.team.headings(short_way_round(problem, reference.states - states)))
+    stands = (reference.after == reference.states).all(axis=1)
+    return turns & ((facing > LOST) | (_is_far(problem, states, reference) & stands))
+
+
+def _is_far(problem: Problem, states: FloatArray, reference: Reference) -> BoolArray:
+    off = (reference.after - states)[:, : problem.dimension]
+    return np.linalg.norm(off, axis=1) > FAR * problem.team.radius
+
+
+def _found_again(problem: Problem, states: FloatArray, reference: Reference) -> FloatArray:
+    """``(K, m)`` controls of robots that drive to where the reference will be, or stand where that is near."""
+    goals = reference.after[:, : problem.dimension]
+    wanted = preferred_velocities(problem, states, goals) * _is_far(problem, states, reference)[:, None]
+    return track_velocities(problem, states, wanted.astype(np.float32))
 
 
 def _widened(rows: Floats, size: int) -> Floats:
@@ -113,12 +148,19 @@ def _weights(team: Team) -> Floats:
     return weights
 
 
-def _gains(weights: Floats, limits: FloatArray, by_state: Floats, by_control: Floats) -> Floats:
-    """``(K, m, n)`` of the regulator for the motion's slopes by states ``(K, n, n)`` and controls ``(K, n, m)``."""
+def _gains(weights: Floats, limits: FloatArray, by_state: Floats, by_control: Floats, horizon: float) -> Floats:
+    """``(K, m, n)`` of the regulator for the motion's slopes by states ``(K, n, n)`` and controls ``(K, n, m)``.
+
+    It looks ahead by a power of two of steps, at least ``horizon``, found by doubling (E. K.-W. Chu, H.-Y. Fan, W.-W.
+    Lin and C.-S. Wang, International Journal of Control, 2004).
+    """
     cost, price = (rows[:, None] * np.eye(rows.shape[1]) for rows in (weights, 1 / limits.astype(np.float64) ** 2))
-    value, gains = cost, np.zeros(by_control.transpose(0, 2, 1).shape)
-    for _ in range(HORIZON):
-        left = by_control.transpose(0, 2, 1) @ value
-        gains[:] = np.linalg.solve(price + left @ by_control, left @ by_state)
-        value = cost + by_state.transpose(0, 2, 1) @ value @ (by_state - by_control @ gains)
+    turned: Any = by_control.transpose(0, 2, 1)
+    effect, a, value = by_control @ np.linalg.solve(price, turned), by_state, cost
+    for _ in range(int(np.ceil(np.log2(horizon)))):
+        halves = np.linalg.inv(np.eye(a.shape[1]) + effect @ value)
+        once, back = halves @ a, a.transpose(0, 2, 1)
+        value, effect, a = value + back @ value @ once, effect + a @ halves @ effect @ back, a @ once
+    left = turned @ value
+    gains: Floats = np.linalg.solve(price + left @ by_control, left @ by_state)
     return gains

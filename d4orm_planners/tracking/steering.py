@@ -174,7 +174,7 @@ def must_brake(problem: Problem, states: FloatArray, controls: FloatArray, goals
 
 
 def braking_share(problem: Problem, velocities: Floats, accelerations: Floats) -> float:
-    """Share of its pace that a team on its way can give up in a step: what its weakest robot brakes from full speed.
+    """Share of its pace that a team on its way can give up in a step, so that no robot need brake harder than it can.
 
     Where a robot brakes anyway, it is down to half of that. Models without inertia stop at once.
 
@@ -184,9 +184,10 @@ def braking_share(problem: Problem, velocities: Floats, accelerations: Floats) -
         accelerations: ``(K, d)`` likewise [m/s^2].
     """
     team, inertia = problem.team, [not model.first_order for model in problem.team.robot_models]
-    along = (velocities * accelerations).sum(axis=1) / np.maximum(np.linalg.norm(velocities, axis=1), 1e-9)
+    speeds, can = np.linalg.norm(velocities, axis=1), team.max_acceleration * problem.dt
+    along = (velocities * accelerations).sum(axis=1) / np.maximum(speeds, 1e-9)
     brakes = np.clip(-along / team.max_acceleration, 0.0, 1.0)[inertia]
-    shares = team.max_acceleration[inertia] / team.max_speed[inertia] * problem.dt
+    shares = (can / np.maximum(speeds, can))[inertia]
     return float(min(shares, default=1.0) * (1 - max(brakes, default=0.0) / 2))
 
 

@@ -150,7 +150,7 @@ def test_undelayed_states_obey_the_model(model: str) -> None:
     state, applied = problem.start.astype(np.float64).copy(), np.zeros(2)
     before = None
     for control in np.float32([[0.5, 0.1], [-0.3, 0.4], [0.2, 0.0]]):
-        now = observer.undelayed(state.astype(np.float32))
+        now = observer.undelayed(state.astype(np.float32), np.ones(1, bool))
         if before is not None:
             np.testing.assert_allclose(now, before, atol=2e-3)
         observer.compensated(control[None], np.array([False]))
@@ -556,6 +556,55 @@ def test_robots_stay_on_their_reference_and_come_to_rest(model: str, noise: floa
             late.append(np.abs(setpoint.control).max())
     assert setpoint.arrived.all()
     assert max(late[-20:]) < (0.3 if noise else 0.02)
+
+
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+@pytest.mark.parametrize("model", ["car", "differential_drive", "unicycle", "unicycle2"])
+@pytest.mark.parametrize(("turned", "moved"), [(2.0, 0.0), (2.6, 1.0)])
+def test_who_is_turned_or_put_aside_by_hand_comes_back_or_stands(
+    mode: Any, model: str, turned: float, moved: float
+) -> None:
+    """Slopes at the reference lead a robot that faces elsewhere away."""
+    problem = make_problem("circle", num_robots=1, model=model, diameter=3.0)
+    states = problem.start.copy()
+    with Controller("go-to-goal", mode=mode) as controller:
+        controller.begin(problem, states)
+        for step in range(320):
+            if step == 120:
+                states[0, :3] += [0.0, moved, turned]
+            states = advanced(problem, states, controller.step(states, step * problem.dt).control)
+    off = np.linalg.norm(states[0, :2] - problem.goal[0])
+    assert off < problem.goal_radius + 2 * problem.team.radius[0]
+    np.testing.assert_allclose(advanced(problem, states, np.zeros((1, 2), np.float32))[0, :2], states[0, :2], atol=2e-3)
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.01])
+def test_who_is_pushed_comes_back_alike_whatever_the_time_step(dt: float) -> None:
+    problem = make_problem("circle", num_robots=1, diameter=3.0, dt=dt, horizon=round(10 / dt))
+    states, seen = problem.start.copy(), []
+    with Controller("go-to-goal") as controller:
+        controller.begin(problem, states)
+        for step in range(round(9 / dt)):
+            if step == round(5 / dt):
+                states[0, :2] += [0.3, 0.0]
+            setpoint = controller.step(states, step * dt)
+            states = advanced(problem, states, setpoint.control)
+            seen.append(float(states[0, 0] - setpoint.position[0, 0]))
+    assert min(seen[round(5 / dt) :]) > -0.03
+    assert abs(np.array(seen[round(8 / dt) :])).max() < 0.01
+
+
+def test_the_reference_of_a_robot_that_is_lost_keeps_its_speed() -> None:
+    """What a lag explains of a measured state is no part of the reference."""
+    problem = Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[8, 0]], horizon=200)
+    states, setpoints = problem.start.copy(), []
+    with Controller("go-to-goal", mode="measured", lag=0.2) as controller:
+        controller.begin(problem, states)
+        for step in range(40):
+            setpoints.append(controller.step(states if step < 20 else states * np.nan, step * problem.dt))
+            states = advanced(problem, states, setpoints[-1].control)
+    passed = np.diff([s.position[0, 0] for s in setpoints[20:]])
+    assert passed.max() < 1.1 * problem.dt
 
 
 def test_a_reference_that_turns_as_fast_as_robots_may_is_followed() -> None:

@@ -283,15 +283,14 @@ def test_for_a_new_goal_robots_brake_as_they_can_and_stand() -> None:
     speeds = np.array([command.linear.x for command in commands[1]])
     braking = states.count("braking")
     assert states[begun:][: braking + 1] == ["braking"] * braking + ["planning"]
-    # A period of 0.05 s takes a tenth of the pace: at 2 m/s² that of the largest speed, 1 m/s. The reference goes on
-    # to speed up meanwhile.
-    assert braking == 10
-    changes = np.diff(speeds[begun - 1 : begun + 10])
-    assert speeds[begun + 9] == 0
+    # At 2 m/s² a period of 0.05 s takes 0.1 m/s, of a reference that goes on to speed up meanwhile.
+    changes = np.diff(speeds[begun - 1 : begun + braking])
+    assert 4 <= braking <= 10
+    assert speeds[begun + braking - 1] == 0
     assert np.abs(changes).max() <= 2.0 * DT * (1 + 1e-6)
     said = [sent.points[0].transforms[0].translation.x for sent in session.sent["robot_1/setpoint"]]
-    assert said[begun - 1] < said[begun] < said[begun + 5] < said[begun + 8]
-    assert said[-1] == said[begun + 9]
+    assert said[begun - 1] < said[begun] < said[begun + 1] < said[begun + braking - 1]
+    assert said[-1] == said[begun + braking - 1]
 
 
 def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
@@ -473,8 +472,10 @@ def test_states_and_velocities_are_in_the_robots_own_frame(model: str) -> None:
     }  # fmt: skip
     np.testing.assert_allclose(sorted(state), sorted(expected[model]), atol=1e-6)
     control = {"velocity2d": [0, 0.4], "unicycle": [0.4, 0], "holonomic3d": [0, 0, 0]}.get(model, [0, 0])
-    command = twist(alone, 0, state, np.float32(control), math.pi / 2)
-    assert command == pytest.approx((0.4, 0, 0, 0), abs=1e-6)
+    slower = np.where(state == np.float32(0.4), np.float32(0.3), state)  # as a lag of 0.1 s explains
+    for lag, measured in ((0.0, state), (0.1, slower)):
+        command = twist(alone, 0, measured, np.float32(control), math.pi / 2, np.array([0.4, 0.0, 0.0, 0.0]), lag)
+        assert command == pytest.approx((0.4, 0, 0, 0), abs=1e-6)
 
 
 def test_strangers_bytes_are_counted(endpoint: str) -> None:
