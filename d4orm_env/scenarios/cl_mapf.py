@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import number_list, positive_number
+from d4orm_env.core.arrays import number_list, positive_number, short_repr
 from d4orm_env.core.errors import did_you_mean, first_line, unknown
 from d4orm_env.core.files import naming, read_yaml
 from d4orm_env.core.problem import Problem
@@ -53,8 +53,8 @@ def load_cl_mapf(
         margin; cars may leave their goals for others (``arrival="stay"``).
 
     Raises:
-        ValueError: If the file cannot be read or is no such problem, or an entry of the vehicle is unknown or not
-            positive; the message names the file, or the entry.
+        ValueError: If the file cannot be read or is no such problem, ``clockwise`` is no truth value, or an entry of
+            the vehicle is unknown or not positive; the message names the file, or the entry.
     """
     given = {} if vehicle is None else vehicle
     if not isinstance(given, Mapping):
@@ -62,6 +62,8 @@ def load_cl_mapf(
     for name in given:
         if name not in VEHICLE:
             raise unknown("vehicle's entry", name, VEHICLE)
+    if not isinstance(clockwise, bool):
+        raise ValueError(f"clockwise is {short_repr(clockwise)}; it must be True or False")
     own = VEHICLE | {name: positive_number(value, f"{name} of vehicle") for name, value in given.items()}
     with naming(path):
         try:

@@ -88,7 +88,8 @@ def parse_scenario(content: bytes, shape: tuple[int, int], count: int) -> list[M
         if len(tasks) < count and line.strip():
             tasks.append(_task(line, number, shape))
     if len(tasks) < count:
-        raise ValueError(f"has {len(tasks)} rows for {count} robots; use num_robots={len(tasks)} or another file")
+        fewer = f"num_robots={len(tasks)} or " if tasks else ""
+        raise ValueError(f"has {len(tasks)} rows for {count} robots; use {fewer}another file")
     return tasks
 
 

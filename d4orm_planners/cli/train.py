@@ -77,7 +77,7 @@ class TrainOptions:
     learner_settings: Annotated[
         list[str] | None,
         typer.Option(
-            "--learner-set", help="A setting of ppo or sac in Stable-Baselines3, as gradient_steps=8; repeatable."
+            "--learner-set", help="Some settings of ppo or sac in Stable-Baselines3, as gradient_steps=8; repeatable."
         ),
     ] = None
     reward_settings: Annotated[

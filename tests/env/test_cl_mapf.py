@@ -101,3 +101,5 @@ def test_what_is_wrong_is_told(instance: Path, old: str, new: str, message: str)
 def test_entries_of_a_vehicle_are_checked(vehicle: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load_cl_mapf(EXAMPLE, vehicle=vehicle)
+    with pytest.raises(ValueError, match="clockwise is 'no'; it must be True or False"):
+        load_cl_mapf(EXAMPLE, clockwise="no")  # type: ignore[arg-type]

@@ -379,7 +379,7 @@ class TestMovingAiScenario:
         ("content", "message"),
         [
             ("", "is not a Moving AI scenario; it must begin with a line 'version 1'"),
-            ("version 1\n", "has 0 rows for 1 robots; use num_robots=0 or another file"),
+            ("version 1\n", "has 0 rows for 1 robots; use another file"),
             ("version 1\n" + ROW.format(1, 1, 0, 0), r"has a start at \(1, 1\) in line 2, a blocked cell"),
             (
                 "version 1\n" + ROW.format(0, 0, 1, 1),
