@@ -213,7 +213,7 @@ class FleetServer:
         return [robot.name for robot in self._robots if now - robot.heard > self.deadline]
 
     def _still_stops(self, now: float) -> bool:
-        """Whether a robot that was stopped at full speed is not at rest yet."""
+        """Return whether a robot that was stopped, maybe at full speed, is not at rest yet."""
         team = self._problem.team
         speeds = [robot.state[list(model.speed_indices)] for robot, model in zip(self._robots, team.robot_models)]
         fast = [np.linalg.norm(np.nan_to_num(own)) for own in speeds] > AT_REST * team.max_speed
@@ -221,7 +221,7 @@ class FleetServer:
 
     def _next_period(self, states: FloatArray, now: float) -> Period:
         setpoint = self._controller.step(states, now)
-        lags = np.broadcast_to(self._controller.lag, len(self._robots))
+        lags = self._controller.lag * np.isfinite(states[:, 0])  # a reference has none
         headings = [robot.heading for robot in self._robots]
         rows = zip(self._controller.states, setpoint.control, headings, self._twists, lags)
         twists = [wire.twist(self._problem, number, *row) for number, row in enumerate(rows)]
@@ -234,7 +234,7 @@ class FleetServer:
         stops, period = self._stops, self._next_period(states, now)
         _, setpoint, twists = period
         with self._commanding:
-            if self._stops != stops:  # an emergency came while these were thought out
+            if self._emergency or self._stops != stops:  # it came while these were thought out
                 return
             self._period, self._pace, self._passed = period, 1.0, 1.0
             for robot in self._robots:
@@ -254,7 +254,7 @@ class FleetServer:
         position = period.begin + passed * (setpoint.position - period.begin)
         acceleration = pace * pace * setpoint.acceleration + (pace - before) / dt * setpoint.velocity
         with self._commanding:
-            if self._stops != stops:
+            if self._emergency or self._stops != stops:
                 return
             self._period, self._pace, self._passed = period, pace, passed
             for robot, stand in zip(self._robots, position):

@@ -185,7 +185,7 @@ def braking_share(problem: Problem, velocities: Floats, accelerations: Floats) -
     """
     team, inertia = problem.team, [not model.first_order for model in problem.team.robot_models]
     speeds, can = np.linalg.norm(velocities, axis=1), team.max_acceleration * problem.dt
-    along = (velocities * accelerations).sum(axis=1) / np.maximum(speeds, 1e-9)
+    along = (velocities * accelerations).sum(axis=1) / np.maximum(speeds, np.finfo(float).tiny)
     brakes = np.clip(-along / team.max_acceleration, 0.0, 1.0)[inertia]
     shares = (can / np.maximum(speeds, can))[inertia]
     return float(min(shares, default=1.0) * (1 - max(brakes, default=0.0) / 2))

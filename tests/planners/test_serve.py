@@ -330,34 +330,40 @@ def test_an_emergency_stop_does_not_wait_for_the_controller() -> None:
 
 @contextlib.contextmanager
 def in_memory(
-    team_problem: Problem, mode: Mode = "measured", policy: str = "go-to-goal"
+    team_problem: Problem, mode: Mode = "measured", policy: str = "go-to-goal", lag: float = 0.0
 ) -> Iterator[tuple[Memory, FleetServer]]:
     session, names = Memory(), [f"robot_{number}" for number in range(team_problem.num_robots)]
-    with Controller(policy, mode=mode) as controller:
+    with Controller(policy, mode=mode, lag=lag) as controller:
         yield session, FleetServer(session, team_problem, controller, tuple(names), DEADLINE)  # type: ignore[arg-type]
 
 
 class RollingFleet:
-    """Robots on wheels that do as ``cmd_vel`` says, without a network."""
+    """Robots on wheels that do as ``cmd_vel`` says, without a network; their speed follows with a lag [s]."""
 
-    def __init__(self, session: Memory, server: FleetServer, team_problem: Problem) -> None:
+    def __init__(self, session: Memory, server: FleetServer, team_problem: Problem, lag: float = 0.0) -> None:
         self.session, self.server, self.dt = session, server, team_problem.dt
+        self.follows, self.speeds = 1 - math.exp(-self.dt / lag) if lag else 1.0, np.zeros(team_problem.num_robots)
         self.poses, self.period = team_problem.start[:, :3].astype(float), 0
         self.commands = [session.sent[f"robot_{number}/cmd_vel"] for number in range(team_problem.num_robots)]
 
     def tick(self) -> None:
         self.period += 1
         for number, (pose, told) in enumerate(zip(self.poses, self.commands, strict=True)):
-            odometry, half = odometry_of(pose[:2], told[-1] if told else None), pose[2] / 2
+            turn_rate = told[-1].angular.z if told else 0.0
+            odometry, half = (
+                odometry_of(pose[:2], ros.twist(np.array([self.speeds[number], 0, 0]), turn_rate)),
+                pose[2] / 2,
+            )
             odometry.pose.pose.orientation.z, odometry.pose.pose.orientation.w = np.sin(half), np.cos(half)
             self.session.say(f"robot_{number}/odom", odometry)
         self.server.tick(self.dt * self.period)
 
     def drive(self) -> None:
         """A period on the last commands, and the next."""
-        for pose, (*_, told) in zip(self.poses, self.commands, strict=True):
-            middle = pose[2] + told.angular.z * self.dt / 2
-            pose += self.dt * np.array([told.linear.x * np.cos(middle), told.linear.x * np.sin(middle), told.angular.z])
+        for number, (pose, (*_, told)) in enumerate(zip(self.poses, self.commands, strict=True)):
+            self.speeds[number] += self.follows * (told.linear.x - self.speeds[number])
+            speed, middle = self.speeds[number], pose[2] + told.angular.z * self.dt / 2
+            pose += self.dt * np.array([speed * np.cos(middle), speed * np.sin(middle), told.angular.z])
         self.tick()
 
 
@@ -374,6 +380,18 @@ def test_robots_whose_odometry_does_not_say_all_arrive(model: str, mode: Mode) -
     x, y, _ = fleet.poses[0]
     assert math.hypot(x - 2.0, y - 1.5) < alone.goal_radius + 0.02
     assert abs(fleet.commands[0][-1].linear.x) < 0.05
+
+
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+def test_robots_that_follow_commands_with_a_lag_do_not_overshoot(mode: Mode) -> None:
+    alone = Problem(Team(("differential_drive",)), [[0.0, 0.0, 0.0, 0.0]], [[3.0, 0.0]], horizon=150)
+    with in_memory(alone, mode, lag=0.2) as (session, server):
+        fleet, farthest = RollingFleet(session, server, alone, lag=0.2), 0.0
+        planned(fleet.tick, server)
+        for _ in range(120):
+            fleet.drive()
+            farthest = max(farthest, float(fleet.poses[0, 0]))
+    assert 3.0 - alone.goal_radius < farthest < 3.0 + 2 * alone.goal_radius
 
 
 def test_robots_that_brake_for_new_goals_stay_on_their_ways() -> None:
