@@ -55,7 +55,7 @@ def compile_for_planning(planner: Planner, problem: Problem, announce: Callable[
         spread_waves()
         drive_once(models)
     elif planner.drives_straight:
-        other = in_another_process(f"drive_once({models!r}, {planner.name!r}); average_once({models!r})")
+        other = in_another_process(f"drive_once({models!r}, {planner.name!r})")
         index_paths(models)
         if _samples_first(planner, problem):
             sample_once((models,))
