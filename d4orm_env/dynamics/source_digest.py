@@ -97,7 +97,7 @@ def check_formulas(owner: str, function: FunctionType) -> None:
     for name, value in sorted(_named(function).items()):
         if name in named and isinstance(value, ModuleType):
             raise ValueError(f"{owner} names the module {name}; take mathematics from ops, as ops.cos")
-        if name in named and callable(value) and not value.__module__.startswith("d4orm_env."):
+        if name in named and callable(value) and not str(getattr(value, "__module__", "")).startswith("d4orm_env."):
             raise ValueError(f"{owner} names {name}, which engines cannot compile; write its formula into the function")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from engine_support import ENGINE_NAMES, PYTHON_OPS, observe_team, random_controls
 from env_support import slow
+from numpy import tanh
 from registry_support import forgetting
 
 from d4orm_env import Problem, Team, load_problem, make_problem, register_model, rollout, save_problem, verify
@@ -108,6 +109,7 @@ def with_function(**functions: Any) -> Model:
         (with_function(rest=lambda x, zero: tuple([part for part in x])), "rest has a loop .* write its terms out"),  # noqa: C416
         (with_function(rest=lambda x, zero: (np.abs(x[0]), x[1])), "rest names the module np; take .* from ops"),
         (with_function(rest=lambda x, zero: (doubled(x[0]), x[1])), "rest names doubled, which engines cannot compile"),
+        (with_function(rest=lambda x, zero: (tanh(x[0]), x[1])), "rest names tanh, which engines cannot compile"),
         (with_function(rest=lambda x, zero: (ONE * x[0], x[1])), "rest computes with a whole number that it names"),
         (with_function(rest=lambda x, zero, one=1: (one * x[0], x[1])), "rest computes with a whole number"),
         (replace(BOAT, own_limits=Limit("drag", 0.3)), r"own_limits is Limit\(.*; give a tuple of Limit"),
