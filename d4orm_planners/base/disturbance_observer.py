@@ -105,7 +105,7 @@ class DisturbanceObserver:
 
     @property
     def actuators(self) -> Actuators:
-        """What the robots' actuators apply now, and how they go on."""
+        """The robots' actuators as they are now."""
         return Actuators(self._applied, self._remains, self._share)
 
     def executed(self, before: FloatArray, after: FloatArray, controls: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_planners.tracking.steering import (
@@ -25,8 +25,8 @@ HORIZON = 2.0
 """Time that the regulator looks ahead, in times in which the slowest robot gets to full speed."""
 LOST = 1.0
 """Difference of a heading from the reference's beyond which its slopes say nothing [rad]."""
-FAR = 2.0
-"""Distance from the reference, in radii, from which on robots that are lost drive to it; nearer ones stand."""
+NEAR = 2.0
+"""Distance from the reference, in radii, up to which robots that are lost stand; from further off they drive to it."""
 DIFFERENCE = 1e-2
 """Share of a unit by which states and controls are varied to find the slopes of the motion."""
 
@@ -66,45 +66,29 @@ def regulated(
     made_good = np.einsum("kmn,kn->km", np.linalg.pinv(by_control), missed)
     missed -= np.einsum("knm,km->kn", by_control, made_good)
     controls, off = reference.controls + made_good, short_way_round(problem, (reference.states - states).astype(float))
-    if actuators is not None:
-        off = np.hstack([off, controls - actuators.applied])
-        by_state, by_control = _lagging(by_state, by_control, actuators)
-    # One more state, which is always one, has the reference go on to depart from its own controls as it does now.
-    off, missed = np.pad(off, ((0, 0), (0, 1)), constant_values=1.0), _widened(missed[..., None], off.shape[1] + 1)
-    by_state, by_control = np.dstack([_widened(by_state, off.shape[1]), missed]), _widened(by_control, off.shape[1])
-    by_state[:, -1, -1] = 1.0
-    weights = _widened(_weights(problem.team), off.shape[1])
+    by_state, by_control = _augmented(by_state, by_control, missed, actuators)
+    lags = np.zeros((len(off), 0)) if actuators is None else controls - actuators.applied
+    off = np.hstack([off, lags, np.ones((len(off), 1))])
+    weights = np.hstack([_weights(problem.team), np.zeros((len(off), lags.shape[1] + 1))])
     horizon = HORIZON * float((problem.team.max_speed / problem.team.max_acceleration).max()) / problem.dt
     controls += np.einsum("kmn,kn->km", _gains(weights, limits, by_state, by_control, max(horizon, 2.0)), off)
-    controls, lost = limit_controls(problem, controls.astype(np.float32)), _lost(problem, states, reference)
-    return np.where(lost[:, None], _found_again(problem, states, reference), controls) if lost.any() else controls
+    return _unless_lost(problem, states, reference, limit_controls(problem, controls.astype(np.float32)))
 
 
-def _lost(problem: Problem, states: FloatArray, reference: Reference) -> BoolArray:
-    """``(K,)`` robots with a heading that no small correction leads back: they face elsewhere, or have stopped far
-    beside a reference that stands.
+def _unless_lost(problem: Problem, states: FloatArray, reference: Reference, controls: FloatArray) -> FloatArray:
+    """``controls`` ``(K, m)``, but of robots with a heading that no small correction leads back, as they face elsewhere
+    or have stopped far beside a reference that stands: those drive to where it will be, and stand where that is near.
     """
+    goals = reference.after[:, : problem.dimension]
+    far = np.linalg.norm(goals - states[:, : problem.dimension], axis=1) > NEAR * problem.team.radius
     turns = np.array([model.heading_index is not None for model in problem.team.robot_models])
     facing = np.abs(problem.team.headings(short_way_round(problem, reference.states - states)))
     stands = (reference.after == reference.states).all(axis=1)
-    return turns & ((facing > LOST) | (_is_far(problem, states, reference) & stands))
-
-
-def _is_far(problem: Problem, states: FloatArray, reference: Reference) -> BoolArray:
-    off = (reference.after - states)[:, : problem.dimension]
-    return np.linalg.norm(off, axis=1) > FAR * problem.team.radius
-
-
-def _found_again(problem: Problem, states: FloatArray, reference: Reference) -> FloatArray:
-    """``(K, m)`` controls of robots that drive to where the reference will be, or stand where that is near."""
-    goals = reference.after[:, : problem.dimension]
-    wanted = preferred_velocities(problem, states, goals) * _is_far(problem, states, reference)[:, None]
-    return track_velocities(problem, states, wanted.astype(np.float32))
-
-
-def _widened(rows: Floats, size: int) -> Floats:
-    """``(K, size, ...)`` rows with zeros behind their own ``(K, n, ...)``."""
-    return np.pad(rows, ((0, 0), (0, size - rows.shape[1]), *[(0, 0)] * (rows.ndim - 2)))
+    lost = turns & ((facing > LOST) | (far & stands))
+    if not lost.any():
+        return controls
+    wanted = preferred_velocities(problem, states, goals) * far[:, None]
+    return np.where(lost[:, None], track_velocities(problem, states, wanted.astype(np.float32)), controls)
 
 
 def _linearised(problem: Problem, reference: Reference, limits: FloatArray) -> tuple[Floats, Floats, Floats]:
@@ -128,14 +112,24 @@ def _linearised(problem: Problem, reference: Reference, limits: FloatArray) -> t
     return short_way_round(problem, missed), slopes[..., :n], slopes[..., n:]
 
 
-def _lagging(by_state: Floats, by_control: Floats, actuators: Actuators) -> tuple[Floats, Floats]:
-    """Slopes ``(K, n+m, n+m)`` and ``(K, n+m, m)`` of states and of what actuators apply."""
-    (_, remains, share), (count, n, m) = actuators, by_control.shape
-    kept = np.broadcast_to(np.eye(m), (count, m, m))
-    states = np.concatenate([by_state, share[..., None] * by_control], axis=2)
-    applied = np.concatenate([np.zeros((count, m, n)), remains[..., None] * kept], axis=2)
-    controls = np.concatenate([(1 - share[..., None]) * by_control, (1 - remains[..., None]) * kept], axis=1)
-    return np.concatenate([states, applied], axis=1), controls
+def _augmented(
+    by_state: Floats, by_control: Floats, missed: Floats, actuators: Actuators | None
+) -> tuple[Floats, Floats]:
+    """Slopes ``(K, N, N)`` and ``(K, N, m)`` of the states, of what actuators with a lag apply, and of a last one.
+
+    That is always one: it has the reference go on to depart from its own controls as it does now, by ``missed``.
+    """
+    count, n, m = by_control.shape
+    if actuators is not None:
+        (_, remains, share), kept = actuators, np.broadcast_to(np.eye(m), (count, m, m))
+        missed = np.pad(missed, ((0, 0), (0, m)))
+        rows = [np.dstack([by_state, share[..., None] * by_control])]
+        rows.append(np.dstack([np.zeros((count, m, n)), remains[..., None] * kept]))
+        by_state = np.concatenate(rows, axis=1)
+        by_control = np.concatenate([(1 - share[..., None]) * by_control, (1 - remains[..., None]) * kept], axis=1)
+    last = np.broadcast_to(np.append(np.zeros(by_state.shape[1]), 1.0), (count, 1, by_state.shape[1] + 1))
+    slopes = np.concatenate([np.dstack([by_state, missed[..., None]]), last], axis=1)
+    return slopes, np.pad(by_control, ((0, 0), (0, 1), (0, 0)))
 
 
 def _weights(team: Team) -> Floats:

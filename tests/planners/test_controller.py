@@ -54,7 +54,8 @@ def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> 
     positions = np.stack([s.position for s in said])
     states = episode.trajectory.positions[1:]
     steps = min(len(positions), len(states))
-    assert abs(len(positions) - len(states)) <= 1
+    # In mode nominal a robot is some millimetres off its reference, and may arrive a step later.
+    assert (0 if mode == "nominal" else -1) <= len(positions) - len(states) <= 1
     # What float32 leaves of a measured velocity is a push, but a small one. At the speed limit a model gains half of
     # dt^2 times the control a step, which the controller does not ask of a robot.
     gained = 0.2 if model.startswith("holonomic") else 0.02

@@ -290,14 +290,14 @@ def test_a_jerk_limit_of_the_model_is_kept_and_named() -> None:
         plan.sample(max_jerk=0.001)
 
 
-# Files.
-
-
 def test_what_makes_good_the_drag_is_within_the_limit() -> None:
     problem = make_problem("circle", num_robots=2, model="holonomic3d_drag", own_limits={"drag": 2.0}, horizon=300)
     setpoints = make_planner().solve(problem, seed=0).sample(100.0)
     pushed = np.linalg.norm(setpoints.acceleration + 2.0 * setpoints.velocity, axis=2).max()
     assert 0.9 * problem.team.max_acceleration[0] < pushed <= problem.team.max_acceleration[0]
+
+
+# Files.
 
 
 def test_tables_hold_the_setpoints(plans: dict[str, Plan], tmp_path: Path) -> None:
