@@ -116,10 +116,7 @@ def tell(what: str, done: int, total: int) -> None:
 
 
 def steps_to_solution(trial: Trial) -> int | None:
-    """Denoising steps of a sampling planner until its first solution; ``None`` if it found none.
-
-    Rows that older versions wrote tell it of solves that ended with the first solution only.
-    """
+    """Denoising steps until the first solution; ``None`` if there is none or, in rows of older versions, not told."""
     first = next((best for best in trial.progress if best.solved), None)
     if first is not None and first.steps is not None:
         return first.steps
@@ -128,13 +125,15 @@ def steps_to_solution(trial: Trial) -> int | None:
 
 def is_solved(trial: Trial) -> bool:
     """Check whether a sampling planner found a solution: all arrive, the margin is kept and ``verify()`` agrees."""
-    return steps_to_solution(trial) is not None
+    return trial.status == "solved" or any(best.solved for best in trial.progress)
 
 
 def steps_spent(trial: Trial) -> int | None:
-    """Denoising steps of a whole trial; ``None`` where they are not known."""
-    steps = _iteration_steps(json.loads(trial.config))
-    return None if steps is None or not trial.iterations else trial.iterations * steps
+    """Denoising steps of a whole trial, 0 of planners that make none; ``None`` where they are not known."""
+    config = json.loads(trial.config)
+    if not trial.iterations or "repair_steps" in config:  # whose iterations are of two lengths
+        return None
+    return trial.iterations * (_iteration_steps(config) or 0)
 
 
 def penalised_steps(trial: Trial, factor: int = 2) -> int:

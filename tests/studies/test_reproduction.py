@@ -289,12 +289,17 @@ def test_the_best_reward_is_a_staircase() -> None:
 
 def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> None:
     known = [trial(seed, history=f"[[0.1,0,0.4,50],[0.5,1,0.5,{steps}]]") for seed, steps in enumerate((100, 200, 300))]
-    never = [trial(seed, history="[[0.1,0,0.4,50]]", status="iteration_limit", success=False) for seed in (3, 4)]
+    spent = {"history": "[[0.1,0,0.4,50]]", "status": "iteration_limit", "success": False, "iterations": 3}
+    never = [trial(seed, config='{"num_steps": 100}', **spent) for seed in (3, 4)]
     assert [steps_to_solution(one) for one in [*known, *never]] == [100, 200, 300, None, None]
-    assert steps_to_solution(trial(policy="ipopt", iterations=3)) is None, "it denoises nothing"
+    assert steps_to_solution(trial(policy="ipopt", iterations=3, config="{}")) == 0, "it denoises nothing"
     row = measured(Group("Circle", "d4orm", [*known, *never]))
     assert (row.first_steps_lower, row.first_steps, row.first_steps_upper) == (200, 300, None)
     assert METRICS["first_steps"].text(row) == "300 (200-∞)"
+    assert METRICS["first_steps_restricted"].text(row) == "240", "the mean of 100, 200, 300 and twice 3 times 100"
+    repaired = [replace(one, config='{"num_steps": 100, "repair_steps": 50}') for one in never]
+    unknown = measured(Group("Circle", "d4orm-d", [*known, *repaired]))
+    assert METRICS["first_steps"].text(unknown) == METRICS["first_steps_restricted"].text(unknown) == "-"
     assert best_reward(known[0], np.array([49, 50, 100]), counted=True) == pytest.approx(
         [np.nan, 0.4, 0.5], nan_ok=True
     )

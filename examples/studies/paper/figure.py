@@ -31,7 +31,7 @@ QUICK_SETTINGS: Mapping[str, Mapping[str, object]] = MappingProxyType({
 })  # fmt: skip
 """Settings of the quick version by policy: enough to go through every step, not to solve much."""
 QUICK_TIME_LIMIT = 5.0
-TIMES = frozenset({"runtime", "mean_runtime", "step_time", "waiting_share"})
+TIMES = frozenset({"runtime", "runtime_restricted", "mean_runtime", "step_time", "waiting_share"})
 """Metrics and plots of seconds, which depend on what else a machine does."""
 EFFORTS = frozenset({"survival", "anytime"})
 """Plots over denoising steps where these are compared, else over seconds."""

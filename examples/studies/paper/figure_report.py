@@ -18,7 +18,8 @@ from d4orm_planners.evaluation.tables import deadline_table, errors, table, targ
 
 INTRODUCTION = """\
 Success with its 95% interval (Wilson); runtime and denoising steps to the first solution: median and quartiles over
-all trials, of which those without a solution count as never (∞), or mean ± standard deviation over the successes.
+all trials, of which those without a solution count as never (∞), or mean ± standard deviation over the successes;
+in restricted means those without a solution count all that they spent.
 Travel time, makespan and jerk are over the successes; the reward is that of the best plan in the end, over all
 trials."""
 

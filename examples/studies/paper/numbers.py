@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from examples.common import steps_to_solution
+from examples.common import steps_spent, steps_to_solution
 from examples.studies.paper.figure import TIMES, Figure, Group
 
 from d4orm_planners.evaluation.store import Trial
@@ -30,9 +30,11 @@ class Measured(Compared):
     runtime_upper: float | None
     runtime_mean: float | None
     runtime_deviation: float | None  # standard deviation; 0 for one success
-    first_steps: float | None  # denoising steps to the first solution, median
+    runtime_restricted: float | None  # mean over all trials, of which those that failed count all the time they took
+    first_steps: float | None  # denoising steps to the first solution, median; none of policies that execute no plan
     first_steps_lower: float | None  # and quartiles
     first_steps_upper: float | None
+    first_steps_restricted: float | None  # mean over all trials, of which those that failed count all their steps
     iterations: float | None  # none of policies that execute no plan
     reward: float | None  # of the last best plan, per step of the horizon and robot, over all trials
     travel_time: float | None  # mean arrival time [s]
@@ -72,7 +74,8 @@ def measured(group: Group) -> Measured:
     solved = [(trial, seconds) for trial, seconds in zip(trials, times) if seconds is not None]
     rewards = [progress[-1].reward for trial in trials if (progress := trial.progress)]
     lower, runtime, upper = _quartiles(times)
-    fewer, steps, more = _quartiles([steps_to_solution(trial) for trial in trials])
+    all_steps = [steps_to_solution(trial) for trial in trials]
+    fewer, steps, more = _quartiles(all_steps)
     average, deviation = _mean_and_deviation([seconds for _, seconds in solved])
 
     def mean(name: str) -> float | None:
@@ -84,7 +87,9 @@ def measured(group: Group) -> Measured:
         **vars(Compared.of(trials, len(solved), group.label)),
         section=group.section,
         runtime=runtime, runtime_lower=lower, runtime_upper=upper, runtime_mean=average, runtime_deviation=deviation,
+        runtime_restricted=_restricted(times, [trial.wall_time for trial in trials]),
         first_steps=steps, first_steps_lower=fewer, first_steps_upper=more,
+        first_steps_restricted=_restricted(all_steps, [steps_spent(trial) for trial in trials]),
         reward=float(np.mean(rewards)) if rewards else None,
         jerk=mean("mean_squared_jerk"),
         nodes=_nodes(trials[0]),
@@ -99,6 +104,12 @@ def _quartiles(times: Sequence[float | None]) -> tuple[float | None, ...]:
     never = 1e300
     quartiles = np.percentile([never if time is None else time for time in times], (25, 50, 75))
     return tuple(float(time) if time < 1e-9 * never else None for time in quartiles)
+
+
+def _restricted(costs: Sequence[float | None], spent: Sequence[float | None]) -> float | None:
+    """Mean cost, where a trial that found none counts what it spent; ``None`` where that is not known of one."""
+    values = [own if cost is None else cost for cost, own in zip(costs, spent)]
+    return float(np.mean(values)) if None not in values else None  # type: ignore[arg-type]
 
 
 def _mean_and_deviation(seconds: Sequence[float]) -> tuple[float | None, float | None]:
@@ -145,6 +156,10 @@ def _spread(name: str, digits: int) -> Callable[[Measured], str]:
     return text
 
 
+def _steps(row: Measured) -> str:
+    return "-" if row.first_steps_restricted is None else _spread("first_steps", 0)(row)
+
+
 def _mean_runtime(row: Measured) -> str:
     return "-" if row.runtime_mean is None else f"{row.runtime_mean:.2f} ± {row.runtime_deviation:.3f}"
 
@@ -152,8 +167,10 @@ def _mean_runtime(row: Measured) -> str:
 METRICS: Mapping[str, Metric] = MappingProxyType({
     "success": Metric("success", _success),
     "runtime": Metric("runtime, s", _spread("runtime", 2)),
+    "runtime_restricted": Metric("runtime, restricted mean, s", _number("runtime_restricted", 2)),
     "mean_runtime": Metric("runtime, s", _mean_runtime),
-    "first_steps": Metric("denoising steps", _spread("first_steps", 0)),
+    "first_steps": Metric("denoising steps", _steps),
+    "first_steps_restricted": Metric("denoising steps, restricted mean", _number("first_steps_restricted", 0)),
     "iterations": Metric("iterations", _number("iterations", 1)),
     "reward": Metric("reward", _number("reward", 3)),
     "travel_time": Metric("travel time, s", _number("travel_time", 2)),
