@@ -19,13 +19,11 @@ from d4orm_planners.base.measured_states import completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, OpenLoop, Policy
 from d4orm_planners.base.policy_threads import Background, check_episode
-from d4orm_planners.tracking.reference_feedback import Reference, regulated
+from d4orm_planners.tracking.reference_feedback import Lag, LaggedReference, Reference, regulated
 from d4orm_planners.tracking.steering import (
     advanced,
-    by_model,
     limited_states,
     present_velocities,
-    short_way_round,
     track_velocities,
     weaker,
 )
@@ -88,8 +86,9 @@ class Controller:
         timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
             meanwhile, and its late answer is not used. ``None`` waits. A policy that is named and has a ``deadline``,
             as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
-        lag: Time constant of the robots' actuators [s], one or one per robot. Controls and the estimate of that allow
-            for it; in mode ``"measured"`` the policy sees holonomic robots as they would be without it.
+        lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
+            setpoints come later by the largest: with it robots can drive as the reference does. In mode ``"measured"``
+            the policy sees robots as they would be without it.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
             are shifted against a lasting distance from the reference, as a thrust that is too weak causes, up to the
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
@@ -130,6 +129,8 @@ class Controller:
         self.lag, self._leads = check_lag(lag), tracker or not self._looks
         self._background: Background[Actions] = Background()
         self._env: Any = None
+        self._observer: DisturbanceObserver
+        self._time, self._lead = np.inf, np.zeros(0)
         self._ending: JointState | None = None  # the reference once the episode is over
 
     def __enter__(self) -> Self:
@@ -144,6 +145,8 @@ class Controller:
 
     def begin(self, problem: Problem, states: ArrayLike, time: float = 0.0, seed: int = 0) -> None:
         """Take over a team; policies that plan do so now, however long it takes.
+
+        What was learned of pushes is kept where the same team (``problem.team``) goes on in time.
 
         Args:
             problem: The team, its goals and its world.
@@ -163,8 +166,10 @@ class Controller:
             raise
 
     def _begin(self, problem: Problem, states: ArrayLike, time: float, seed: int) -> None:
-        self._observer, self._robots = DisturbanceObserver(problem, self.lag), problem
-        self._lags = self._observer.lags & self._leads  # elsewhere the measured states are taken as without a lag
+        observer, lead = DisturbanceObserver(problem, self.lag), np.zeros_like(problem.goal, np.float64)
+        if time >= self._time and self._observer.problem.team is problem.team:
+            observer.bias, lead = self._observer.bias, self._lead
+        self._observer, self._lead, self._robots = observer, lead, problem
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
         self._bounds = tuple(bound[: problem.start.size].reshape(shape) for bound in (space.low, space.high))
@@ -173,8 +178,10 @@ class Controller:
         team = weaker(problem.team, 1 - self.reserve)
         self._open(problem.with_state(start, problem.goal, team=team), seed)
         self.policy.reset(self._env, seed=seed)
-        self._time, self._lead = time - problem.dt, np.zeros_like(problem.goal, np.float64)
-        self._setpoint = self._described(self._joint, self._joint.controls, held=False)
+        # A tracker follows by itself, and what a policy looks at is as without a lag.
+        lag = Lag(self._observer.lag.constants * (not (self.tracker or self._looks)), problem.dt)
+        self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, lag)
+        self._setpoint = self._described(Reference(start, start, *2 * (self._joint.controls,)), held=False)
 
     def step(self, states: ArrayLike, time: float) -> ControlSetpoint:
         """Return the setpoint for the period that begins now.
@@ -236,46 +243,45 @@ class Controller:
         return limited_states(self.problem, np.clip(states, *self._bounds))
 
     def _advance(self, measured: FloatArray, known: BoolArray) -> ControlSetpoint:
-        at_rest = self.arrived if self.problem.docks else np.zeros_like(self.arrived)
+        rests = self.arrived & self.problem.docks
         self.states = measured
         self._observer.observe(measured, known)
         if self.tracker:
             self._shift(measured, known)
         if self._looks:
-            seen = self._blended(measured) if self.tracker else self._observer.undelayed(measured, known)
+            observer, joint = self._observer, self._joint
+            seen = observer.blended(measured, joint.states) if self.tracker else observer.undelayed(measured, known)
             if not self.over:
-                states = self._possible(seen)
-                self._observations, _ = self._env.set_state(np.where(at_rest[:, None], self._joint.states, states))
-            measured = measured if self.tracker else seen
+                self._observations, _ = self._env.set_state(
+                    np.where(rests[:, None], joint.states, self._possible(seen))
+                )
+            if not self.tracker:
+                self._lead, measured = (measured - seen)[:, : self.problem.dimension].astype(np.float64), seen
         before, actions = self._joint, self._actions()
-        moving = before.states if self._leads else measured
         brakes = track_velocities(self.problem, before.states, np.zeros_like(before.goals))
-        controls, held, led = brakes, not self.over and actions is None, self._leads or self.over | at_rest
+        controls, held, led = brakes, not self.over and actions is None, self._leads or self.over | rests
         if self.over:
             states = advanced(self.problem, before.states, brakes)
             self._ending = before._replace(states=states, controls=brakes)
         else:
             actions = dict(zip(self._env.possible_agents, brakes)) if actions is None else actions
             self._observations, *_ = self._env.step({agent: actions[agent] for agent in self._env.agents})
+            moving = before.states if self._leads else measured
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
-        error = self._setpoint.position - measured[:, : self.problem.dimension]
-        off = (np.linalg.norm(error, axis=1) > self.problem.rounding) | self._lags
-        follows, reference = (known & led & off)[:, None], Reference(before.states, self._joint.states, controls)
+        reference = self._lagged.follow(before.states, self._joint.states, controls)
+        error, lag = self._setpoint.position - measured[:, : self.problem.dimension], self._lagged.lag
+        follows = known & led & ((np.linalg.norm(error, axis=1) > self.problem.rounding) | (lag.constants > 0))
+        controls = reference.controls
         if follows.any():
-            actuators = self._observer.actuators if self._lags.any() else None
-            controls = np.where(follows, regulated(self._robots, measured, reference, actuators), controls)
-        return self._described(before, self._observer.compensated(controls, self.arrived), held)
+            back = regulated(self._robots, measured, reference, self._observer.applied, lag)
+            controls = np.where(follows[:, None], back, controls)
+        return self._described(reference._replace(controls=self._observer.compensated(controls, self.arrived)), held)
 
     def _shift(self, measured: FloatArray, known: BoolArray) -> None:
         """Shift setpoints against a lasting distance from the reference, at most by the margin."""
         d, margin = self.problem.dimension, self.problem.margin
         error = np.where(known[:, None], self._joint.states[:, :d] - measured[:, :d], 0.0)
         self._lead = np.clip(self._lead + GAIN * error, -margin, margin)
-
-    def _blended(self, measured: FloatArray) -> FloatArray:
-        """``(K, n)`` the reference, moved towards what was measured by a share that the lag allows."""
-        off = short_way_round(self.problem, measured - self._joint.states)
-        return self._joint.states + (self._observer.trust * off).astype(np.float32)
 
     def _actions(self) -> Actions | None:
         """Return the policy's actions; ``None`` if they do not come in time, or the episode is over."""
@@ -285,16 +291,11 @@ class Controller:
         acting = {agent: self._observations[agent] for agent in self._env.agents}
         return self._background.run(partial(self.policy.act, acting, self._env.state()), self.timeout)
 
-    def _velocities(self, joint: JointState) -> Floats:
-        """``(K, d)`` velocities; of first-order models those that were commanded."""
-        return present_velocities(self.problem, joint.states, joint.controls).astype(np.float64)
-
-    def _described(self, before: JointState, controls: FloatArray, held: bool) -> ControlSetpoint:
-        joint, heading = self._joint, np.zeros(self.problem.num_robots)
-        for model, robots in by_model(self.problem):
-            if model.heading_index is not None:
-                heading[robots] = joint.states[robots, model.heading_index]
-        velocity, position = self._velocities(joint), joint.states[:, : self.problem.dimension] + self._lead
-        acceleration = (velocity - self._velocities(before)) / self.problem.dt
-        arrays = read_only((position, velocity, acceleration, heading, controls.copy(), joint.arrived.copy()))
-        return ControlSetpoint(*arrays, held)
+    def _described(self, reference: Reference, held: bool) -> ControlSetpoint:
+        """Return the setpoint of a reference, whose controls are those of the robots."""
+        before, after, controls, applied = reference
+        position, heading = after[:, : self.problem.dimension] + self._lead, self.problem.team.headings(after)
+        velocity = present_velocities(self.problem, after, self._lagged.applied.astype(np.float32)).astype(np.float64)
+        change = velocity - present_velocities(self.problem, before, applied)
+        rest = (change / self.problem.dt, heading.astype(np.float64), controls, self.arrived.copy())
+        return ControlSetpoint(*read_only((position, velocity, *rest)), held)

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, short_repr
 from d4orm_env.core.problem import Problem
-from d4orm_planners.tracking.reference_feedback import Actuators
-from d4orm_planners.tracking.steering import limit_controls
+from d4orm_planners.tracking.reference_feedback import Lag
+from d4orm_planners.tracking.steering import limit_controls, rates, short_way_round
 
 GAIN = 0.1
 """Share of a step's residual that goes into the estimate."""
@@ -42,8 +42,8 @@ class DisturbanceObserver:
         lag: Time constant of the actuators [s], one or ``K``.
 
     Attributes:
-        lags: ``(K,)`` bool: robots whose actuators have a lag, of whatever model.
-        trust: ``(K, 1)`` share of a robot's distance from its reference that its lag does not explain.
+        lag: That of the actuators, of whatever model.
+        applied: ``(K, m)`` what the actuators apply now, but for the disturbance.
         bias: ``(K, d)`` the estimate, in units of the controls; zero for other models.
 
     Raises:
@@ -60,17 +60,13 @@ class DisturbanceObserver:
         columns = {"holonomic2d": range(d, 2 * d), "holonomic3d": range(d, 2 * d), "velocity2d": range(d)}
         self._observed: BoolArray = np.array([name in columns for name in names])
         self._second_order = np.isin(names, ("holonomic2d", "holonomic3d"))[:, None]
-        self._lag = np.where(self._observed, constants, 0.0)[:, None]
         self._columns = np.array([columns.get(name, range(d)) for name in names])
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
         self._fastest = fastest[:, None]
-        self.lags: BoolArray = constants > 0
-        self._remains = np.where(self.lags, np.exp(-problem.dt / np.maximum(constants, 1e-12)), 0.0)[:, None]
-        # Mean over a step of exp(-t / lag).
-        self._share = (constants / problem.dt)[:, None] * (1 - self._remains)
-        self.trust = problem.dt / (problem.dt + 2 * constants[:, None])
-        self.bias, self._applied = np.zeros((count, d)), np.zeros((count, problem.control_size))
+        self.lag = Lag(constants, problem.dt)
+        self._trust = problem.dt / (problem.dt + 2 * constants[:, None])
+        self.bias, self.applied = np.zeros((count, d)), np.zeros((count, problem.control_size))
         self._explained: Floats | None = None
         self._before: Floats | None = None
 
@@ -88,25 +84,22 @@ class DisturbanceObserver:
         self._before = now
 
     def undelayed(self, states: FloatArray, known: BoolArray) -> FloatArray:
-        """``(K, n)`` states that obey the models as if there were no lag; those of other models, and of robots that are
-        not ``known`` ``(K,)``, as they are.
+        """``(K, n)`` states that obey the models as if there were no lag; those of robots that are not ``known``
+        ``(K,)`` as they are.
 
-        With a lag ``tau`` after which an acceleration ``a`` is the control's, ``p + tau v`` and ``v + tau a`` move as a
-        double integrator under the control itself; so does ``p + tau v`` of first-order models.
+        With a lag ``tau`` these are ``x + tau dx/dt``: where models are linear they move as the control itself has it.
         """
-        d, ahead = self.problem.dimension, states.copy()
-        lag = np.where(known[:, None], self._lag, 0.0)
-        rate = lag * (self._applied[:, :d] + self.bias)
-        velocity = states[:, d : 2 * d] if states.shape[1] >= 2 * d else 0.0
-        ahead[:, :d] += np.where(self._second_order, lag * velocity, rate).astype(np.float32)
-        if self._second_order.any():
-            ahead[:, d : 2 * d] += np.where(self._second_order, rate, 0.0).astype(np.float32)
-        return ahead
+        driven = self.applied.copy()
+        driven[:, : self.problem.dimension] += self.bias
+        ahead = np.where(known, self.lag.constants, 0.0)[:, None] * rates(
+            self.problem, states, driven.astype(np.float32)
+        )
+        return states + ahead.astype(np.float32)
 
-    @property
-    def actuators(self) -> Actuators:
-        """The robots' actuators as they are now."""
-        return Actuators(self._applied, self._remains, self._share)
+    def blended(self, states: FloatArray, reference: FloatArray) -> FloatArray:
+        """``(K, n)`` the states of a reference, moved towards measured ones by the share that no lag explains."""
+        off = short_way_round(self.problem, states - reference)
+        return reference + (self._trust * off).astype(np.float32)
 
     def executed(self, before: FloatArray, after: FloatArray, controls: FloatArray) -> FloatArray:
         """``(K, m)`` controls that take double integrators from one velocity to the other; of other models unchanged.
@@ -128,7 +121,7 @@ class DisturbanceObserver:
         d, wanted = self.problem.dimension, controls.copy()
         wanted[:, :d] -= np.where(resting[:, None], 0.0, self.bias).astype(np.float32)
         sent = limit_controls(self.problem, wanted)
-        self._explained = (sent + self._share * (self._applied - sent))[:, :d]
+        self._explained = self.lag.mean(sent.astype(float), self.applied)[:, :d]
         self._explained[resting] = np.nan
-        self._applied = sent + self._remains * (self._applied - sent)
+        self.applied = self.lag.after(sent.astype(float), self.applied)
         return sent

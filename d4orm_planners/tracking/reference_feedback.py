@@ -17,6 +17,7 @@ from d4orm_planners.tracking.steering import (
     integrated,
     limit_controls,
     preferred_velocities,
+    present_velocities,
     short_way_round,
     track_velocities,
 )
@@ -36,20 +37,71 @@ class Reference(NamedTuple):
 
     states: FloatArray  #: ``(K, n)`` now
     after: FloatArray  #: ``(K, n)`` at the end of the step
-    controls: FloatArray  #: ``(K, m)``
+    controls: FloatArray  #: ``(K, m)`` what its actuators are told
+    applied: FloatArray  #: ``(K, m)`` what they apply now
 
 
-class Actuators(NamedTuple):
-    """Actuators that approach what they are told, with a lag of first order."""
+class Lag:
+    """Lag of first order with which actuators approach what they are told.
 
-    applied: Floats  #: ``(K, m)`` what they apply now
-    remains: Floats  #: ``(K, 1)`` share of a difference from what they are told that is left after a step
-    share: Floats  #: ``(K, 1)`` of such a difference in the mean over a step
+    Args:
+        constants: ``(K,)`` time constants [s].
+        dt: Time step [s].
+
+    Attributes:
+        constants: ``(K,)`` time constants [s].
+        remains: ``(K, 1)`` share of a difference from what they are told that is left after a step.
+        share: ``(K, 1)`` of such a difference in the mean over a step.
+    """
+
+    def __init__(self, constants: Floats, dt: float) -> None:
+        self.constants = constants
+        self.remains: Floats = np.where(constants > 0, np.exp(-dt / np.maximum(constants, 1e-12)), 0.0)[:, None]
+        self.share: Floats = (constants / dt)[:, None] * (1 - self.remains)
+
+    def mean(self, told: Floats, applied: Floats) -> Floats:
+        """``(K, m)`` what they apply in the mean over a step, and ``applied`` when it begins."""
+        return told + self.share * (applied - told)
+
+    def after(self, told: Floats, applied: Floats) -> Floats:
+        """``(K, m)`` what they apply at the end of such a step."""
+        return told + self.remains * (applied - told)
 
 
-def regulated(
-    problem: Problem, states: FloatArray, reference: Reference, actuators: Actuators | None = None
-) -> FloatArray:
+class LaggedReference:
+    """Another reference, followed as by robots whose actuators lag: those can drive so, and need no control beyond it.
+
+    Its states are that one's by a low-pass filter, which is what linear models do. All of a team lag as the slowest, so
+    that none gets ahead of the others.
+
+    Args:
+        problem: The robots.
+        states: ``(K, n)`` where they begin.
+        lag: That of their actuators.
+    """
+
+    def __init__(self, problem: Problem, states: FloatArray, lag: Lag) -> None:
+        self.lag, self._problem, self._slowest = lag, problem, float(lag.constants.max())
+        self._filter = Lag(np.full_like(lag.constants, self._slowest), problem.dt)
+        self._ratio = (lag.constants / max(self._slowest, 1e-12))[:, None]
+        at_rest, self._behind = np.zeros((len(states), problem.control_size), np.float32), np.zeros(states.shape)
+        self._behind[:, : problem.dimension] -= self._slowest * present_velocities(problem, states, at_rest)
+        self._filtered = self.applied = at_rest.astype(np.float64)
+
+    def follow(self, states: FloatArray, after: FloatArray, controls: FloatArray) -> Reference:
+        """Return what follows a step of the other from states to others ``(K, n)`` by controls ``(K, m)``."""
+        passed: Floats = short_way_round(self._problem, (after - states).astype(np.float64))
+        behind, applied, wanted = self._behind, self.applied, controls.astype(np.float64)
+        self._behind = self._filter.after(-self._slowest / self._problem.dt * passed, behind)
+        # Quicker actuators are told less than the slowest, whose filter is the reference's.
+        mean = self._filter.mean(wanted, self._filtered)
+        told = mean + self._ratio * (wanted - mean)
+        self._filtered, self.applied = self._filter.after(wanted, self._filtered), self.lag.after(told, applied)
+        rows = states + behind, after + self._behind, told, applied
+        return Reference(*(row.astype(np.float32) for row in rows))
+
+
+def regulated(problem: Problem, states: FloatArray, reference: Reference, applied: Floats, lag: Lag) -> FloatArray:
     """``(K, m)`` controls within the limits that lead robots from ``states`` ``(K, n)`` back to a reference.
 
     Full control is worth a distance of a radius, or a radian. Who is lost drives to where the reference
@@ -59,15 +111,17 @@ def regulated(
         problem: The robots.
         states: Those of the robots.
         reference: Motion to go back to.
-        actuators: Those that have a lag; by default none has.
+        applied: ``(K, m)`` what their actuators apply now.
+        lag: Theirs.
     """
     limits = np.where(problem.team.control_limits > 0, problem.team.control_limits, np.float32(1))
-    missed, by_state, by_control = _linearised(problem, reference, limits)
+    mean = lag.mean(reference.controls.astype(np.float64), reference.applied.astype(np.float64))
+    missed, by_state, by_control = _linearised(problem, reference, mean.astype(np.float32), limits)
     made_good = np.einsum("kmn,kn->km", np.linalg.pinv(by_control), missed)
     missed -= np.einsum("knm,km->kn", by_control, made_good)
     controls, off = reference.controls + made_good, short_way_round(problem, (reference.states - states).astype(float))
-    by_state, by_control = _augmented(by_state, by_control, missed, actuators)
-    lags = np.zeros((len(off), 0)) if actuators is None else controls - actuators.applied
+    by_state, by_control = _augmented(by_state, by_control, missed, lag)
+    lags = (reference.applied + made_good - applied)[:, : applied.shape[1] if lag.constants.any() else 0]
     off = np.hstack([off, lags, np.ones((len(off), 1))])
     weights = np.hstack([_weights(problem.team), np.zeros((len(off), lags.shape[1] + 1))])
     horizon = HORIZON * float((problem.team.max_speed / problem.team.max_acceleration).max()) / problem.dt
@@ -91,14 +145,16 @@ def _unless_lost(problem: Problem, states: FloatArray, reference: Reference, con
     return np.where(lost[:, None], track_velocities(problem, states, wanted.astype(np.float32)), controls)
 
 
-def _linearised(problem: Problem, reference: Reference, limits: FloatArray) -> tuple[Floats, Floats, Floats]:
-    """``(K, n)`` what the controls of a reference lack to its end, and the slopes of states a step later by states
-    ``(K, n, n)`` and by controls ``(K, n, m)``, varied by a share of their ``limits`` ``(K, m)``.
+def _linearised(
+    problem: Problem, reference: Reference, controls: FloatArray, limits: FloatArray
+) -> tuple[Floats, Floats, Floats]:
+    """``(K, n)`` what ``controls`` ``(K, m)`` lack to the end of a reference, and the slopes of states a step later by
+    states ``(K, n, n)`` and by controls ``(K, n, m)``, varied by a share of their ``limits`` ``(K, m)``.
 
     Motions are the same everywhere: at the origin positions lose least to rounding. Limits have no part in it: next to
     them slopes would be those of one side.
     """
-    now, after, controls = reference
+    now, after, *_ = reference
     d, n = problem.dimension, now.shape[1]
     here = np.hstack([np.zeros_like(now[:, :d]), now[:, d:], controls])
     sizes = DIFFERENCE * np.hstack([np.ones_like(now), limits])
@@ -112,16 +168,14 @@ def _linearised(problem: Problem, reference: Reference, limits: FloatArray) -> t
     return short_way_round(problem, missed), slopes[..., :n], slopes[..., n:]
 
 
-def _augmented(
-    by_state: Floats, by_control: Floats, missed: Floats, actuators: Actuators | None
-) -> tuple[Floats, Floats]:
+def _augmented(by_state: Floats, by_control: Floats, missed: Floats, lag: Lag) -> tuple[Floats, Floats]:
     """Slopes ``(K, N, N)`` and ``(K, N, m)`` of the states, of what actuators with a lag apply, and of a last one.
 
     That is always one: it has the reference go on to depart from its own controls as it does now, by ``missed``.
     """
     count, n, m = by_control.shape
-    if actuators is not None:
-        (_, remains, share), kept = actuators, np.broadcast_to(np.eye(m), (count, m, m))
+    if lag.constants.any():
+        remains, share, kept = lag.remains, lag.share, np.broadcast_to(np.eye(m), (count, m, m))
         missed = np.pad(missed, ((0, 0), (0, m)))
         rows = [np.dstack([by_state, share[..., None] * by_control])]
         rows.append(np.dstack([np.zeros((count, m, n)), remains[..., None] * kept]))

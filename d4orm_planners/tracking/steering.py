@@ -150,6 +150,13 @@ def present_velocities(problem: Problem, states: FloatArray, controls: FloatArra
     )
 
 
+def rates(problem: Problem, states: FloatArray, controls: FloatArray) -> FloatArray:
+    """``(K, n)`` time derivatives of ``states`` ``(K, n)`` under ``controls`` ``(K, m)``."""
+    return _by_rows(
+        problem, problem.state_size, (states, controls), lambda model, *rows: model.derivative(*rows, NUMPY_OPS)
+    )
+
+
 def _by_rows(problem: Problem, width: int, rows: tuple[FloatArray, ...], law: Callable[..., Columns]) -> FloatArray:
     """``(..., K, width)`` results of ``law(functions, *rows, limits)`` for the rows ``(..., K, n)`` of every robot,
     padded with zeros.

@@ -11,6 +11,7 @@ import pytest
 from env_support import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
 
 from d4orm_env import Problem, Team, make_problem, navigation_v0, rollout
 from d4orm_env.disturbances import Bias, ControlNoise, Gain, Lag, StateNoise
@@ -557,6 +558,62 @@ def test_robots_stay_on_their_reference_and_come_to_rest(model: str, noise: floa
             late.append(np.abs(setpoint.control).max())
     assert setpoint.arrived.all()
     assert max(late[-20:]) < (0.3 if noise else 0.02)
+
+
+def lagging(controller: Controller, problem: Problem, lag: Any, steps: int) -> tuple[float, float, Any]:
+    """Drive robots whose actuators lag; farthest from a setpoint and least gap in radii, and the last setpoint."""
+    states, applied = problem.start.copy(), np.zeros((problem.num_robots, 2), np.float32)
+    lags = np.broadcast_to(np.float32(lag), (problem.num_robots,))[:, None]
+    remains = np.exp(-problem.dt / np.maximum(lags, 1e-9))
+    share, off, gap, radius = lags / problem.dt * (1 - remains), 0.0, np.inf, problem.team.radius[0]
+    controller.begin(problem, states)
+    for step in range(steps):
+        setpoint = controller.step(states, step * problem.dt)
+        told = setpoint.control
+        states = advanced(problem, states, told + share * (applied - told))
+        applied = told + remains * (applied - told)
+        off = max(off, np.linalg.norm(states[:, :2] - setpoint.position, axis=1).max())
+        gap = min(gap, pdist(states[:, :2]).min() - 2 * radius)
+    return off / radius, gap / radius, setpoint
+
+
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+@pytest.mark.parametrize("model", ["car", "differential_drive", "unicycle2", "holonomic2d"])
+def test_robots_whose_actuators_lag_keep_apart_arrive_and_rest(model: str, mode: Any) -> None:
+    problem = make_problem("circle", num_robots=6, model=model, horizon=150)
+    with Controller("d4orm-c2f", mode=mode, lag=0.2, refine="sync") as controller:
+        off, gap, setpoint = lagging(controller, problem, 0.2, 160)
+    assert off < 1
+    assert gap > 0
+    assert setpoint.arrived.all()
+    assert np.abs(setpoint.control).max() < 0.02
+
+
+def test_robots_of_different_lags_follow_one_motion() -> None:
+    lags = [0.0, 0.1, 0.3, 0.3]
+    with Controller("hybrid", lag=lags) as controller:
+        off, gap, setpoint = lagging(controller, make_problem("circle", num_robots=4), lags, 100)
+    assert off < 0.2
+    assert gap > 0
+    assert setpoint.arrived.all()
+
+
+def test_what_was_learned_of_a_push_is_kept_for_new_goals() -> None:
+    problem, push = make_problem("circle", num_robots=2), np.array([0.15, 0.0])
+
+    def pushed(controller: Controller, steps: range) -> float:
+        states, off = problem.start.copy(), 0.0
+        controller.begin(problem.replace(dt=problem.dt), states, steps[0] * problem.dt)
+        for step in steps:
+            setpoint = controller.step(states, step * problem.dt)
+            states = advanced(problem, states, (setpoint.control + push).astype(np.float32))
+            off = max(off, np.linalg.norm(states[:, :2] - setpoint.position, axis=1).max())
+        return float(off)
+
+    with Controller("go-to-goal", mode="nominal") as controller:
+        first, then, anew = (pushed(controller, steps) for steps in (range(40), range(40, 80), range(40)))
+    assert then < 0.2 * first
+    assert anew == first
 
 
 @pytest.mark.parametrize("mode", ["nominal", "measured"])
