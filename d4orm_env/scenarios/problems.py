@@ -43,13 +43,17 @@ class Scenario:
     known: tuple[str, ...] = ()  #: All arguments of a generator that does not name them itself
 
     def __post_init__(self) -> None:
+        wanted = "a callable (seed, num_robots, **settings) that returns a Problem"
         try:
             self._signature.bind_partial(0, DEFAULT_ROBOTS)
         except (TypeError, ValueError):
             raise ValueError(
-                f"scenario {self.name!r} is {short_repr(self.generator)}; it must be a callable "
-                "(seed, num_robots, **settings) that returns a Problem"
+                f"scenario {self.name!r} is {short_repr(self.generator)}; it must be {wanted}, "
+                "the first two by position"
             ) from None
+        names = [parameter.name for parameter in self._parameters[:2]]
+        if names[0] == "num_robots" or "seed" in names[1:]:
+            raise ValueError(f"scenario {self.name!r} takes ({', '.join(names)}); it must be {wanted}, in that order")
 
     @property
     def description(self) -> str:

@@ -129,7 +129,8 @@ def run_study(
     Trials that shards have stored in the folder, see :func:`run_shard`, are taken into the store first.
 
     Returns:
-        Trials, one per seed, for every scenario, model, team size, policy and condition, in that order.
+        Trials, one per seed, for every scenario, model, team size, policy and condition, in that order. Where a
+        scenario's seeds give teams of several sizes or models, each of these is a group.
     """
     groups = _checked_groups(study, trial_timeout, workers)
     if ray is not None:
@@ -139,18 +140,18 @@ def run_study(
     for path in sorted(Path(out).glob(SHARD_STORES)):
         store.add(*TrialStore(path, alone=True).trials())
     _complete(store, [job for group in groups for job in group], workers, ray, trial_timeout, progress)
-    stored = {trial.key: trial for trial in store.trials()}
-    return [
-        TrialGroup(
-            group[0].policy.label,
-            # The same problem may have been stored under another name.
-            [replace(stored[job.key(condition)], scenario=job.scenario) for job in group],
-            condition.name,
-            condition.level,
-        )
-        for group in groups
-        for condition in group[0].conditions
-    ]
+    stored, results = {trial.key: trial for trial in store.trials()}, []
+    for group in groups:
+        for condition in group[0].conditions:
+            teams: dict[tuple[int, str], list[Trial]] = {}
+            for job in group:
+                # The same problem may have been stored under another name.
+                trial = replace(stored[job.key(condition)], scenario=job.scenario)
+                teams.setdefault((trial.num_robots, trial.model), []).append(trial)
+            results += [
+                TrialGroup(group[0].policy.label, trials, condition.name, condition.level) for trials in teams.values()
+            ]
+    return results
 
 
 def run_shard(

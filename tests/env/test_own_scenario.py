@@ -94,6 +94,12 @@ def test_every_environment_takes_a_callable_and_a_file(make: str, tmp_path: Path
         (lambda seed, num_robots: None, "scenario '<lambda>' returned None; it must return a d4orm_env.Problem"),
         (lambda seed, num_robots: lanes(0, 3), "returned a problem of 3 robots where num_robots is 2"),
         (lambda seed: lanes(0, 2), r"must be a callable \(seed, num_robots, \*\*settings\)"),
+        (
+            lambda num_robots=2, seed=0: lanes(seed, num_robots),
+            r"takes \(num_robots, seed\); it must be .* in that order",
+        ),
+        (lambda rows, seed: lanes(seed, 2), r"takes \(rows, seed\); it must be a callable \(seed, num_robots"),
+        (lambda *, seed, num_robots: lanes(seed, num_robots), "the first two by position"),
         ("nothing_here:lanes", "scenario 'nothing_here:lanes' cannot be imported .*nothing_here"),
         ("json:lanes", "'json:lanes' names nothing: json has no 'lanes'"),
         ("json:", "scenario 'json:' is no import path; give package.module:Name"),

@@ -568,6 +568,17 @@ def test_several_models_meet_every_scenario_and_team_size(tmp_path: Path) -> Non
     assert [(row.scenario, row.model, row.num_robots) for row in rows] == expected
 
 
+def test_teams_that_differ_from_seed_to_seed_are_no_one_row(tmp_path: Path) -> None:
+    def crowd(seed: int, num_robots: int | None = None) -> Any:
+        model = "velocity2d" if seed > 2 else "holonomic2d"
+        return make_problem("random", num_robots=num_robots or 2 + seed % 2, seed=seed, model=model)
+
+    rows = evaluate("go-to-goal", [crowd], out=tmp_path, seeds=range(4), workers=1)
+    assert [(row.num_robots, row.model, row.trials) for row in rows] == [
+        (2, "holonomic2d", 2), (3, "holonomic2d", 1), (3, "velocity2d", 1)
+    ]  # fmt: skip
+
+
 # Bad input.
 
 BAD = [
