@@ -247,6 +247,11 @@ class Motion:
         """Steps until it has arrived."""
         return len(self.controls)
 
+    def later(self, steps: int) -> Motion:
+        """The same motion of a robot that stays at its start, at rest, for so many steps before."""
+        poses = np.concatenate([np.repeat(self.poses[:1], steps, axis=0), self.poses])
+        return Motion(poses, np.pad(self.controls, ((steps, 0), (0, 0))))
+
 
 def motion_to(robot: Robot, task: Task, nodes: Nodes, node: int) -> Motion:
     """The motion that ends in a node."""

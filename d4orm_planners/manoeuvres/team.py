@@ -26,6 +26,7 @@ from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, 
 from d4orm_planners.manoeuvres.search import PAUSED, Motion, curve_from, find_motion, motion_to
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
+from d4orm_planners.tracking.steering import advanced
 
 MAX_NODES = 100_000
 """Nodes after which a search gives up, ..."""
@@ -36,7 +37,7 @@ CELLS = ((1.0, MAX_NODES), (0.8, MAX_NODES), (0.6, MAX_NODES), (0.25, 10 * MAX_N
 """Sizes of cells that are tried in turn for a robot alone, as shares of the usual one, and nodes: whether poses that
 count as one leave a way through a tight place is chance."""
 ROUNDS = 200
-"""Neighbourhoods that are replanned to find a motion for everybody."""
+"""Neighbourhoods that are replanned to find a motion for everybody, after a quarter of them with late departures."""
 BETTER_ROUNDS = 16
 """Neighbourhoods that are replanned in an iteration once everybody has one."""
 
@@ -53,6 +54,7 @@ class TeamMotions:
         robots: What the search knows of each.
         motions: Of each robot, ``None`` for those that have none yet.
         alone: Their motions if there were nobody else.
+        late: Whether the first robot of a neighbourhood may set out late, so that others get out of its way.
     """
 
     groups = 1
@@ -65,6 +67,9 @@ class TeamMotions:
         self._poses[:] = np.array([robot.start for robot in self.robots])[:, None]
         self.motions: list[Motion | None] = [None] * size
         self.alone: list[Motion | None] = [None] * size
+        self.late = False
+        still = np.zeros((size, problem.control_size), np.float32)
+        self._rests = (advanced(problem, problem.start, still) == problem.start).all(axis=1)
         nobody, room = self._traffic((), {}), MAX_NODES
 
         def find_alone(part: IntArray) -> None:
@@ -152,20 +157,21 @@ class TeamMotions:
                 order.sort(key=lambda robot: before[robot] is not None)
             longest = max((own.steps for own in self.alone if own is not None), default=0)
             held = {robot: int(longest * random.random() ** 2) * int(random.integers(2)) for robot in order}
+            delay = int(longest * random.random()) if self.late and self._rests[order[0]] else 0
             for robot in order:
                 self._take(robot, None)
-            self._plan_in_turn(order, held)
+            self._plan_in_turn(order, held, delay)
             if self.cost > cost:
                 for robot, motion in enumerate(before):
                     self._take(robot, motion)
 
-    def _plan_in_turn(self, order: list[int], held: dict[int, int]) -> None:
+    def _plan_in_turn(self, order: list[int], held: dict[int, int], delay: int = 0) -> None:
         for position, robot in enumerate(order):
             if self.should_stop():
                 return
             others = [other for other in range(len(self.motions)) if other != robot]
             later = {other: held.get(other, 0) for other in order[position + 1 :]}
-            self._take(robot, self._find(robot, self._traffic(others, later)))
+            self._take(robot, self._find(robot, self._traffic(others, later), 0 if position else delay))
 
     def _take(self, robot: int, motion: Motion | None) -> None:
         self.motions[robot] = motion
@@ -187,9 +193,13 @@ class TeamMotions:
     def _room_for_nodes(self, most: int) -> Nodes:
         return Nodes.of(most, buffer_size(self.problem.team.all_footprint_arrays))
 
-    def _find(self, number: int, traffic: Traffic) -> Motion | None:
-        """A robot's motion among others: that which it would take alone, or else one that is looked for."""
+    def _find(self, number: int, traffic: Traffic, delay: int) -> Motion | None:
+        """A robot's motion among others: that which it would take alone, later by some steps, or else one that is
+        looked for.
+        """
         alone, team = self.alone[number], len(self.robots)
+        if alone is not None and alone.steps + delay <= self.problem.horizon:
+            alone = alone.later(delay)
         if alone is not None and meets_nobody(self.robots[number].task.body, traffic, alone.poses, self._nodes.buffer):
             return alone
         self._searches += 1
@@ -244,10 +254,12 @@ def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
 def _complete(search: SolveRun, motions: TeamMotions) -> bool:
     """Replan neighbourhoods of robots without a motion until there are none; return whether that is so."""
     random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         if not motions.missing or search.should_stop():
             break
+        motions.late = number >= ROUNDS // 4
         search_neighbourhoods(motions, random, 1, search.should_stop)
+    motions.late = False
     return not motions.missing
 
 

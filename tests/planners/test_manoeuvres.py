@@ -85,6 +85,15 @@ def test_robots_that_meet_in_a_corridor_use_its_alcove() -> None:
     assert plan.trajectory.positions[..., 1].min() < 0.3 + 0.125
 
 
+def test_one_sets_out_late_where_two_would_meet_before_the_bay() -> None:
+    walls = [[-0.2, -0.3, 6.2, 0.0], [-0.2, 0.6, 2.6, 1.3], [3.4, 0.6, 6.2, 1.3], [2.6, 1.3, 3.4, 1.6]]
+    world = World(boxes=walls, lower=(-0.2, -0.3), upper=(6.2, 1.6))
+    team = Team(("unicycle2",) * 2, footprint=Box(0.5, 0.25), max_turn_rate=1.5, own_limits={"max_reverse_speed": 0.5})
+    ends, headings = np.array([[0.4, 0.3], [5.6, 0.3]]), np.array([0.0, np.pi])
+    start = np.column_stack([ends, headings, np.zeros((2, 2))])
+    solved(Problem(team, start, ends[::-1], world, margin=0.02, goal_heading=headings, horizon=600))
+
+
 def test_a_robot_at_its_goal_makes_way_and_returns() -> None:
     start, goal = [[0.7, 0.65, 0.0], [3.1, 0.65, 0.0]], [[5.3, 0.65, 0.0], [3.1, 0.65, 0.0]]
     plan = solved(problem_of(start, goal, CORRIDOR))
