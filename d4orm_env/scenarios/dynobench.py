@@ -3,7 +3,7 @@
 Their models move by Euler steps of 0.1 s and ours by Runge-Kutta, which differ by about the 0.01 that db-CBS's checker
 allows from one state to the next. They bound velocities and accelerations of integrators by component and we by norm,
 which is within. They keep reference points within the bounds and we bodies, so ours are wider by what every body
-covers.
+covers, and hold all bodies at starts and goals.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.arrays import Floats, number_list, short_repr
+from d4orm_env.core.arrays import FloatArray, Floats, number_list, short_repr
 from d4orm_env.core.errors import did_you_mean, first_line
 from d4orm_env.core.files import naming, read_yaml
 from d4orm_env.core.goal_poses import MOST_TRAILERS
@@ -27,6 +27,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import Model
+from d4orm_env.footprints import Box, Disc
 from d4orm_env.scenarios.dynobench_types import (
     DYNAMICS,
     MODELS,
@@ -86,6 +87,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     robots, environment = content["robots"], content["environment"]
     entries = [(f"robot_{number}", robot, ROBOT_KEYS) for number, robot in enumerate(robots)]
     for what, entry, keys in [("environment", environment, KEYS), *entries]:
+        _check_mapping(entry, what)
         for name in entry:
             if name not in keys and (meant := did_you_mean(name, keys)):
                 raise ValueError(f"{what} has the key {short_repr(name)}{meant}")
@@ -112,9 +114,9 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     distance = np.linalg.norm(goal[:, :d] - start[:, :d], axis=1)
     steps = math.ceil(SLOWEST * float((distance / team.max_speed).max()) / DT)
     return Problem(
-        team, start, goal[:, :d], _world(environment, team, goal[:, :d]), DT, max(LEAST_STEPS, steps), margin=0.0,
+        team, start, goal[:, :d], _world(environment, team, start, goal), DT, max(LEAST_STEPS, steps), margin=0.0,
         goal_radius=GOAL_TOLERANCE, goal_speed=np.where(inertia, GOAL_TOLERANCE, np.inf), name=Path(path).stem,
-        arrival="stay", goal_heading=np.where(turning, goal[:, min(2, team.state_size - 1)], np.nan),
+        arrival="stay", goal_heading=np.where(turning, _wrapped(goal[:, min(2, team.state_size - 1)]), np.nan),
         goal_heading_tolerance=GOAL_TOLERANCE, goal_hitches=_hitches(team, goal),
     )  # fmt: skip
 
@@ -163,24 +165,59 @@ def _hitches(team: Team, states: Floats) -> Floats:
     return hitches
 
 
-def _world(environment: Mapping[str, Any], team: Team, goal: Floats) -> World:
+def _world(environment: Mapping[str, Any], team: Team, start: Floats, goal: Floats) -> World:
     d, covered = team.dimension, min(footprint.inner_radius for footprint in team.footprint)
     lower, upper = (number_list(environment[name], f"environment's {name}", d) for name in ("min", "max"))
     # A robot whose goal lies on the bounds ends on either side of them; their checkers allow the whole tolerance there.
-    lower -= GOAL_TOLERANCE / 2 * (abs(goal - lower) < GOAL_TOLERANCE / 2).any(axis=0)
-    upper += GOAL_TOLERANCE / 2 * (abs(goal - upper) < GOAL_TOLERANCE / 2).any(axis=0)
+    lower -= GOAL_TOLERANCE / 2 * (abs(goal[:, :d] - lower) < GOAL_TOLERANCE / 2).any(axis=0)
+    upper += GOAL_TOLERANCE / 2 * (abs(goal[:, :d] - upper) < GOAL_TOLERANCE / 2).any(axis=0)
+    inside = (lower <= start[:, :d]) & (start[:, :d] <= upper) & (lower <= goal[:, :d]) & (goal[:, :d] <= upper)
     boxes, balls = [], []
     for number, obstacle in enumerate(environment.get("obstacles") or ()):
-        centre = number_list(obstacle["center"], f"center of obstacle {number}", d)
-        size = number_list(obstacle["size"], f"size of obstacle {number}", 1 if obstacle["type"] == "sphere" else d)
-        if obstacle["type"] == "sphere":
+        what, kind = (
+            f"obstacle {number}",
+            _check_mapping(obstacle, f"obstacle {number}", "type", "center", "size")["type"],
+        )
+        if kind not in ("box", "sphere"):
+            raise ValueError(f"type of {what} is {short_repr(kind)}; known are box, sphere")
+        centre = number_list(obstacle["center"], f"center of {what}", d)
+        size = number_list(obstacle["size"], f"size of {what}", 1 if kind == "sphere" else d)
+        if not (size > 0).all():
+            raise ValueError(f"size of {what} is {short_repr(obstacle['size'])}; it must be positive")
+        if kind == "sphere":
             balls.append([*centre, *size])
-            continue
-        if obstacle["type"] != "box":
-            raise ValueError(f"obstacle type {short_repr(obstacle['type'])} is unknown; known are box, sphere")
-        boxes.append([*(centre - size / 2), *(centre + size / 2)])
-    kind = {"circles" if d == 2 else "spheres": balls}
-    return World(d, boxes=boxes, lower=lower - covered, upper=upper + covered, **kind)
+        else:
+            boxes.append([*(centre - size / 2), *(centre + size / 2)])
+    lower, upper = lower - covered, upper + covered
+    if d == 2 and inside.all():
+        lowest, highest = _covered(team, np.stack([start, goal]).astype(np.float32))
+        lower = np.where(lowest <= lower, lowest - GOAL_TOLERANCE / 2, lower)
+        upper = np.where(highest >= upper, highest + GOAL_TOLERANCE / 2, upper)
+    return World(d, boxes=boxes, lower=lower, upper=upper, **{"circles" if d == 2 else "spheres": balls})
+
+
+def _covered(team: Team, states: FloatArray) -> tuple[Floats, Floats]:
+    """``(2,)`` least and largest coordinates of all bodies in the plane in states ``(2, K, n)``."""
+    ends = []
+    for number, body in enumerate(team.bodies):
+        assert isinstance(body.footprint, Box | Disc)
+        corners, rounding = body.footprint.core
+        for x, y, heading in team.body_poses(states)[:, number]:
+            turned = corners @ [[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]]
+            placed = np.add(turned, (x, y))
+            ends += [placed - rounding, placed + rounding]
+    points = np.concatenate(ends)
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _check_mapping(entry: Any, what: str, *names: str) -> Any:
+    """Return an entry of the file, which must be a mapping with these keys."""
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"{what} is {short_repr(entry)}; it must be a mapping")
+    for name in names:
+        if name not in entry:
+            raise ValueError(f"{what} is {short_repr(entry)}; it lacks {name!r}")
+    return entry
 
 
 def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:

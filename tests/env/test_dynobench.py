@@ -92,6 +92,30 @@ def test_a_solution_passes_a_check_of_their_kind(instance: Path, tmp_path: Path)
         assert np.abs(gap[:-1]).max() <= 0.0101  # the last one ends at rest
 
 
+@pytest.mark.parametrize(
+    ("robots", "lower"),
+    [
+        (["unicycle1_sphere_v0, start: [0.2, 2, 0], goal: [4, 2, 0]"], [-0.4, -0.4]),
+        (
+            ["unicycle1_sphere_v0, start: [0.2, 2, 0], goal: [4, 2, 0]", "integrator2_2d_v0, start: [2, 1, 0, 0], "
+             "goal: [3, 1, 0, 0]"], [-0.205, -0.1],
+        ),
+        (["car1_v0, start: [0.5, 2, 0, 0], goal: [4, 2, 0, 0]"], [-0.155, -0.125]),
+    ],
+)  # fmt: skip
+def test_bounds_are_wide_enough_for_starts_and_goals(robots: list[str], lower: list[float], tmp_path: Path) -> None:
+    """They hold reference points in dynobench, and bodies here."""
+    path = tmp_path / "edge.yaml"
+    listed = "".join(f"  - {{type: {robot}}}\n" for robot in robots)
+    path.write_text(f"environment:\n  min: [0, 0]\n  max: [5, 4]\n  obstacles: []\nrobots:\n{listed}")
+    np.testing.assert_allclose(load_dynobench(path).world.lower, lower, atol=1e-6)
+
+
+def test_a_goal_heading_may_have_whole_turns(instance: Path) -> None:
+    instance.write_text(INSTANCE.replace("goal: [4, 1.5, 0]", f"goal: [4, 1.5, {32 * np.pi + 0.5}]"))
+    assert load_dynobench(instance).goal_heading[0] == pytest.approx(0.5, abs=1e-4)
+
+
 def test_own_parameters_are_taken(instance: Path) -> None:
     wide = {"dynamics": "unicycle1", "max_vel": 1.0, "max_angular_vel": 2.0, "shape": "sphere", "radius": 0.3}
     problem = load_dynobench(instance, models={"unicycle1_v0": wide})
@@ -103,7 +127,10 @@ def test_own_parameters_are_taken(instance: Path) -> None:
     ("old", "new", "message"),
     [
         ("unicycle1_v0", "hovercraft_7", "robot types 'hovercraft_7' are unknown; known are unicycle1_v0"),
-        ("type: box", "type: torus", "obstacle type 'torus' is unknown; known are box, sphere"),
+        ("type: box", "type: torus", "type of obstacle 0 is 'torus'; known are box, sphere"),
+        ("{type: box", "{kind: box", "obstacle 0 is {'kind': 'box', 'center': "),
+        ("size: [0.4, 0.6]", "size: [-0.4, 0.6]", "size of obstacle 0 is [-0.4, 0.6]; it must be positive"),
+        ("obstacles:\n", "obstacles:\n    - 5\n", "obstacle 0 is 5; it must be a mapping"),
         ("obstacles:", "obstacle:", "environment has the key 'obstacle'; did you mean 'obstacles'?"),
         ("goal: [4, 1.5, 0]", "gaol: [4, 1.5, 0]", "robot_0 has the key 'gaol'; did you mean 'goal'?"),
         (
