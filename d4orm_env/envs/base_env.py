@@ -83,7 +83,7 @@ class TeamSimulation(Simulation):
     def require_reset(self) -> None:
         """Raise ``RuntimeError`` unless an episode has begun."""
         if not self._running:
-            raise RuntimeError("no episode has begun; call reset() first")
+            raise RuntimeError("no episode has begun; call env.reset() first")
 
     def reset(self, random: np.random.Generator) -> TeamStep:
         """Begin an episode at the start; everything random in it follows from one draw from ``random``."""

@@ -75,13 +75,16 @@ def split_state(problem: Problem, state: ArrayLike) -> JointState:
         The parts, as copies.
 
     Raises:
-        ValueError: If it is no vector of numbers, or its length does not fit the problem.
+        ValueError: If it is no vector of finite numbers, or its length does not fit the problem.
     """
     check_is_problem(problem)
     try:
         vector = np.array(state, np.float32)
     except (TypeError, ValueError):
         raise ValueError(f"state is {short_repr(state)}; give the vector that env.state() returns") from None
+    if vector.ndim == 1 and not (finite := np.isfinite(vector)).all():
+        entry = finite.argmin()
+        raise ValueError(f"state[{entry}] is {vector[entry]}; every value must be finite, as env.state() returns them")
     team_size = problem.num_robots
     widths = (problem.state_size, problem.dimension, problem.control_size, 1)
     expected, body = team_size * sum(widths) + 1, 2 * problem.dimension + 1

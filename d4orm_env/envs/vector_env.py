@@ -234,7 +234,7 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDA
 
     def _require_reset(self) -> None:
         if not self._running.all():
-            raise RuntimeError("no episode has begun; call reset() first")
+            raise RuntimeError("no episode has begun; call env.reset() first")
 
     def _new_observations(self) -> FloatArray:
         """``(B, K, D)`` array for observations."""

@@ -19,7 +19,8 @@ from d4orm_env.core.arrays import FloatArray, as_float32, short_repr
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.envs.features import Features
 from d4orm_env.envs.joint_state import split_state
-from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices, within_limits
+from d4orm_planners.base.measured_states import acting_robots, stacked_observations
+from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
 from d4orm_planners.tracking.steering import brake_to_dock
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ class SharedPolicy(Policy):
         self._low, self._high = np.stack([space.low for space in spaces]), np.stack([space.high for space in spaces])
         self._features = Features.of_team(env.unwrapped.layout, self.problem.team) if self._egocentric else None
         seen = env.observation_space(env.possible_agents[0]).shape
+        (self._seen_size,) = seen
         shapes = seen if self._features is None else (self._features.size,), self._low.shape[1:]
         self._env, self._is_joint = env, self._steers_team(shapes)
 
@@ -98,9 +100,10 @@ class SharedPolicy(Policy):
         return self._joint or (self._trained == team and count > 1)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
+        robots = acting_robots(self, observations)
         if not observations:
             return {}
-        robots, seen = robot_indices(observations), np.stack([*map(as_float32, observations.values())])
+        seen = stacked_observations(observations, self._seen_size)
         if self._is_joint:
             # It wants to see those too that have left.
             everybody = self._env.unwrapped.last_step.observations.copy()

@@ -1,15 +1,16 @@
-"""Measured times and states, made usable."""
+"""Measured times and states, and observations, made usable."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache
 from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, numbers_of, short_repr
+from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, frozen_array, numbers_of, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.winding import MAX_ANGLE
 from d4orm_planners.tracking.steering import by_model
@@ -34,6 +35,45 @@ def seconds(time: object) -> float:
             if abs(value := float(time)) <= LATEST:
                 return value
     raise ValueError(f"time is {short_repr(time)}; give the seconds of one clock")
+
+
+@cache
+def robots_by_agent(num_robots: int) -> dict[str, int]:
+    """Numbers of the robots of a team by the names of their agents."""
+    return {f"robot_{robot}": robot for robot in range(num_robots)}
+
+
+def acting_robots(policy: object, observations: Mapping[str, object]) -> list[int]:
+    """Numbers of the robots that a policy is asked for.
+
+    Raises:
+        RuntimeError: Before the policy's first reset, or after one that failed.
+        ValueError: If the observations are not by agent of its team.
+    """
+    problem: Problem | None = getattr(policy, "problem", None)
+    if problem is None:
+        raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
+    robots = robots_by_agent(problem.num_robots)
+    with suppress(AttributeError, KeyError):
+        return [robots[agent] for agent in observations.keys()]  # noqa: SIM118 - of a list this fails
+    remedy = f"give them by agent, robot_0 to robot_{problem.num_robots - 1}, as env.step() returns them"
+    if not isinstance(observations, Mapping):
+        raise ValueError(f"observations are {short_repr(observations)}; {remedy}")
+    unknown = next(agent for agent in observations if agent not in robots)
+    raise ValueError(f"observations hold {short_repr(unknown)}, which is no agent of this team; {remedy}")
+
+
+def stacked_observations(observations: Mapping[str, FloatArray], size: int) -> FloatArray:
+    """``(N, size)`` observations of ``N`` robots.
+
+    Raises:
+        ValueError: If one has another shape or is not finite.
+    """
+    with suppress(ValueError):
+        seen = as_float32([*observations.values()])
+        if seen.shape == (len(observations), size) and np.isfinite(seen).all():
+            return seen
+    return np.stack([frozen_array(one, f"observation of {agent}", (size,)) for agent, one in observations.items()])
 
 
 def completed(

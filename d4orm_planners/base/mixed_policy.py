@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from d4orm_env.core.arrays import FloatArray, short_repr
 from d4orm_env.core.problem import Problem
+from d4orm_planners.base.measured_states import acting_robots
 from d4orm_planners.base.planner_registry import PolicyLike, called, copy_policy, make_policy, policy_settings
-from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset
+from d4orm_planners.base.policy import Actions, Observations, Policy
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -70,7 +71,7 @@ class MixedPolicy(Policy):
             member.reset(env, seed=seed)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
-        require_reset(self)
+        acting_robots(self, observations)
         actions: Actions = {}
         for index, member in enumerate(self._members):
             own = {agent: seen for agent, seen in observations.items() if self._index(agent) == index}

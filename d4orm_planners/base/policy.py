@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, usable
+from d4orm_env.core.arrays import FloatArray, as_float32, short_repr, usable, whole_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import check_call, required_parameters
 from d4orm_env.core.seeds import Stream, generator
 from d4orm_env.envs.joint_state import JointState, split_state
+from d4orm_planners.base.measured_states import acting_robots, robots_by_agent
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner import Planner
 from d4orm_planners.base.policy_threads import ATTRIBUTE, driven_alone
@@ -61,15 +62,18 @@ class Policy(ABC):
 
         Args:
             env: A :mod:`d4orm_env.navigation_v0` parallel environment, wrapped or not.
-            seed: Seeds whatever the policy draws.
+            seed: Seeds whatever the policy draws, zero or more.
 
         Raises:
-            ValueError: If that is no environment, or an egocentric one.
+            RuntimeError: If no episode has begun.
+            ValueError: If that is no environment, or an egocentric one, or no seed.
         """
-        if not hasattr(env, "unwrapped"):
+        whole_number(seed, "seed", 0)
+        if not hasattr(getattr(env, "unwrapped", None), "state"):
             raise ValueError(f"env is {short_repr(env)}; give an environment, such as parallel_env(problem=problem)")
         if (options := getattr(env.unwrapped, "options", None)) is not None:
             options.require_physical_units()
+        env.unwrapped.state()  # refused before the first reset
         self.problem = env.unwrapped.problem
 
     @abstractmethod
@@ -85,7 +89,10 @@ class Policy(ABC):
             the step, or a real robot, executes them as they are; see :func:`within_limits`.
 
         Raises:
-            RuntimeError: Before the first reset, if the policy needs one, or if another thread uses the policy.
+            RuntimeError: Before the first reset, if the policy needs one, after one that failed, or if another thread
+                uses the policy.
+            ValueError: If the observations are not by agent of this team, or what the policy reads of them or of the
+                state has another size or is not finite.
         """
 
     def observation_options(self, problem: Problem) -> Mapping[str, object]:
@@ -120,9 +127,9 @@ class StatePolicy(Policy):
         self._begin(env, seed)
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
-        require_reset(self)
+        robots = acting_robots(self, observations)
         controls = limit_controls(self.problem, self._controls(split_state(self.problem, state)))
-        return {agent: controls[robot] for agent, robot in zip(observations, robot_indices(observations))}
+        return {agent: controls[robot] for agent, robot in zip(observations, robots)}
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         """Prepare for an episode, beyond looking at the problem."""
@@ -130,16 +137,6 @@ class StatePolicy(Policy):
     @abstractmethod
     def _controls(self, joint: JointState) -> FloatArray:
         """``(K, m)`` controls of the whole team."""
-
-
-def require_reset(policy: Policy) -> None:
-    """Refuse to act before the first reset.
-
-    Raises:
-        RuntimeError: If there was none.
-    """
-    if not hasattr(policy, "problem"):
-        raise RuntimeError("the policy has seen no environment yet; call reset(env) before act()")
 
 
 def robot_indices(agents: Iterable[str]) -> list[int]:
@@ -157,7 +154,7 @@ def within_limits(problem: Problem, actions: Actions) -> Actions:
         actions: ``(m,)`` controls by agent.
     """
     controls, size = np.zeros((problem.num_robots, problem.control_size), np.float32), (problem.control_size,)
-    robots = {f"robot_{robot}": robot for robot in range(problem.num_robots)}
+    robots = robots_by_agent(problem.num_robots)
     if not isinstance(actions, Mapping):
         return actions
     for agent, action in actions.items():
@@ -179,7 +176,7 @@ class TeamFunction(Policy):
         self.function = function
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
-        require_reset(self)
+        acting_robots(self, observations)
         return within_limits(self.problem, self.function(observations, state))
 
 
@@ -190,7 +187,7 @@ class RobotFunction(Policy):
         self.function = function
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
-        require_reset(self)
+        acting_robots(self, observations)
         actions = {agent: self.function(observation) for agent, observation in observations.items()}
         return within_limits(self.problem, actions)
 

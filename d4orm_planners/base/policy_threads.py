@@ -76,7 +76,7 @@ def check_episode(policy: Any, env: Any) -> None:
 
 
 def driven_alone(method: Callable[..., Any]) -> Callable[..., Any]:
-    """``reset`` or ``act`` of a policy, refused where :class:`Driving` refuses it."""
+    """``reset`` or ``act`` of a policy, refused where :class:`Driving` refuses it. A failed reset is none."""
 
     @wraps(method)
     def guarded(policy: Any, *arguments: Any, **keywords: Any) -> Any:
@@ -84,7 +84,12 @@ def driven_alone(method: Callable[..., Any]) -> Callable[..., Any]:
         driving: Driving = vars(policy).setdefault(ATTRIBUTE, Driving())
         env = keywords.get("env", *arguments[:1]) if method.__name__ == "reset" else None
         with driving.turn(env):
-            return method(policy, *arguments, **keywords)
+            try:
+                return method(policy, *arguments, **keywords)
+            except BaseException:
+                if method.__name__ == "reset":
+                    vars(policy).pop("problem", None)
+                raise
 
     return guarded
 

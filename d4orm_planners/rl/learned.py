@@ -14,7 +14,8 @@ from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3
-from d4orm_planners.base.policy import Actions, Observations, Policy, require_reset, robot_indices, within_limits
+from d4orm_planners.base.measured_states import acting_robots, stacked_observations
+from d4orm_planners.base.policy import Actions, Observations, Policy, within_limits
 from d4orm_planners.base.settings import CheckedSettings, PathText
 from d4orm_planners.rl.network import SUFFIX, Header, Network, load_network, range_sensors
 from d4orm_planners.tracking.steering import brake_to_dock, goals_along_paths
@@ -127,7 +128,9 @@ class LearnedPolicy(Policy):
             return
         options = env.unwrapped.options
         self._check_sensors(self._actor.header, range_sensors(options.observed_rays, options.ray_range))
-        self._check_team(self._actor, env.observation_space(env.possible_agents[0]).shape)
+        shape = env.observation_space(env.possible_agents[0]).shape
+        self._check_team(self._actor, shape)
+        (self._seen_size,) = shape
         hiding = options.communication_range is not None or options.line_of_sight
         self._detours = Detours(self.problem) if self.config.detours and not hiding else None
 
@@ -156,13 +159,12 @@ class LearnedPolicy(Policy):
             )
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:
-        require_reset(self)
+        robots = acting_robots(self, observations)
         if not observations:
             return {}
         if isinstance(self._actor, SharedPolicy):
             return self._actor.act(observations, state)
-        seen = np.stack([np.asarray(observation, np.float32) for observation in observations.values()])
-        robots, joint = robot_indices(observations), split_state(self.problem, state)
+        seen, joint = stacked_observations(observations, self._seen_size), split_state(self.problem, state)
         self._look_along_paths(self._actor, robots, seen, joint)
         controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
         if not self._actor.header.brakes:
