@@ -63,17 +63,17 @@ def acting_robots(policy: object, observations: Mapping[str, object]) -> list[in
     raise ValueError(f"observations hold {short_repr(unknown)}, which is no agent of this team; {remedy}")
 
 
-def stacked_observations(observations: Mapping[str, FloatArray], size: int) -> FloatArray:
-    """``(N, size)`` observations of ``N`` robots.
+def stacked_observations(observations: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    """``(N, *shape)`` observations of ``N`` robots.
 
     Raises:
         ValueError: If one has another shape or is not finite.
     """
     with suppress(ValueError):
         seen = as_float32([*observations.values()])
-        if seen.shape == (len(observations), size) and np.isfinite(seen).all():
+        if seen.shape == (len(observations), *shape) and np.isfinite(seen).all():
             return seen
-    return np.stack([frozen_array(one, f"observation of {agent}", (size,)) for agent, one in observations.items()])
+    return np.stack([frozen_array(one, f"observation of {agent}", shape) for agent, one in observations.items()])
 
 
 def completed(

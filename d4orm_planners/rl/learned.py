@@ -128,9 +128,8 @@ class LearnedPolicy(Policy):
             return
         options = env.unwrapped.options
         self._check_sensors(self._actor.header, range_sensors(options.observed_rays, options.ray_range))
-        shape = env.observation_space(env.possible_agents[0]).shape
-        self._check_team(self._actor, shape)
-        (self._seen_size,) = shape
+        self._seen_shape = env.observation_space(env.possible_agents[0]).shape
+        self._check_team(self._actor, self._seen_shape)
         hiding = options.communication_range is not None or options.line_of_sight
         self._detours = Detours(self.problem) if self.config.detours and not hiding else None
 
@@ -164,7 +163,7 @@ class LearnedPolicy(Policy):
             return {}
         if isinstance(self._actor, SharedPolicy):
             return self._actor.act(observations, state)
-        seen, joint = stacked_observations(observations, self._seen_size), split_state(self.problem, state)
+        seen, joint = stacked_observations(observations, self._seen_shape), split_state(self.problem, state)
         self._look_along_paths(self._actor, robots, seen, joint)
         controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
         if not self._actor.header.brakes:

@@ -46,6 +46,46 @@ def test_stable_baselines3() -> None:
         np.testing.assert_allclose(action, model.predict(observation, deterministic=True)[0], rtol=1e-5, atol=1e-6)
     assert from_sb3(model).identity() == from_sb3(model).identity() != from_sb3(other).identity()
     assert from_sb3(model, deterministic=False).identity() != from_sb3(model).identity()
+    with pytest.raises(ValueError, match="deterministic is 1; it must be True or False"):
+        from_sb3(model, deterministic=1)
+    other_robots = make_problem("circle", num_robots=3, model="differential_drive", max_turn_rate=0.7)
+    with pytest.raises(ValueError, match="make the environment of robots as in training"):
+        run_episode(navigation_v0.parallel_env(problem=other_robots), from_sb3(model))
+
+
+def test_bounds_of_actions_are_compared_as_robots_or_the_team_have_them() -> None:
+    team = make_problem("circle", num_robots=2, max_speed=[1, 2], model="velocity2d")
+    env = navigation_v0.parallel_env(problem=team)
+    joint = gymnasium.make("d4orm/Navigation-v0", problem=team)
+    spaces = {False: env.action_space("robot_0"), True: joint.action_space}
+    for of_team, space in spaces.items():
+        shape = (1, 4) if of_team else (2, 2)
+        policy, other = (
+            SharedPolicy(lambda seen, shape=shape: np.zeros(shape), None, joint=of_team, actions=actions)
+            for actions in (space, spaces[not of_team])
+        )
+        run_episode(env, policy)
+        with pytest.raises(ValueError, match="was trained for actions from"):
+            run_episode(env, other)
+    egocentric = SharedPolicy(lambda seen: np.zeros((len(seen), 2)), None, egocentric=True, actions=spaces[False])
+    with pytest.raises(ValueError, match="say whether that was egocentric"):
+        run_episode(env, egocentric)
+
+
+@pytest.mark.parametrize("make", [from_torch, from_torchrl, from_rllib])
+def test_what_is_no_loaded_model_is_refused_at_once(make: Any) -> None:
+    for bad in (None, "model.pt", torch.nn.Identity):
+        with pytest.raises(ValueError, match="load it first, and give what acts"):
+            make(bad)
+
+
+@pytest.mark.parametrize("name", ["normalized", "egocentric", "joint"])
+@pytest.mark.parametrize("value", ["no", 1, None])
+def test_what_is_neither_true_nor_false_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name} is .*; it must be True or False"):
+        from_torch(torch.nn.Identity(), **{name: value})
+    with pytest.raises(ValueError, match="predict is None"):
+        SharedPolicy(None, None)  # type: ignore[arg-type]
 
 
 def test_a_module_of_torch() -> None:
