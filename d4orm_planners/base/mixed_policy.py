@@ -25,6 +25,9 @@ class MixedPolicy(Policy):
     Args:
         policies: By agent, as ``{"robot_0": "orca"}``, anything that :func:`~d4orm_planners.make_policy` takes.
         others: Policy of all robots that ``policies`` does not name; ``None`` where it names them all.
+
+    Raises:
+        ValueError: If there is none, or no such policy.
     """
 
     name = "mixed"

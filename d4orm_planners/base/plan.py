@@ -269,5 +269,10 @@ class Plan(DisplayMixin):
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Read a plan, as :meth:`Plan.load` does."""
+    """Read a plan, as :meth:`Plan.load` does.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is damaged or is not a plan.
+    """
     return Plan.load(path)

@@ -198,6 +198,9 @@ class OpenLoop(StatePolicy):
     Attributes:
         planner: Planner that makes the plan.
         plan: The plan of the present episode.
+
+    Raises:
+        ValueError: If neither or both are given, or one is none; at the reset, if the plan is for another problem.
     """
 
     name = "open-loop"
