@@ -147,7 +147,7 @@ class MovingObstacle(Disturbance[Kept]):
         radius: [m].
 
     Raises:
-        ValueError: If times do not increase, positions do not fit them, or the radius is not positive.
+        ValueError: If times do not increase, positions do not fit them or are half NaN, or the radius is not positive.
     """
 
     times: ArrayLike
@@ -172,6 +172,8 @@ class MovingObstacle(Disturbance[Kept]):
             )
         if (np.abs(positions) > LARGEST).any():
             raise ValueError(f"MovingObstacle positions must be at most {LARGEST:g} m in magnitude, or NaN")
+        for row in positions[np.isnan(positions).any(axis=2) & ~np.isnan(positions).all(axis=2)][:1]:
+            raise ValueError(f"MovingObstacle position {row.tolist()} is half NaN; give all of it, or NaN for absent")
         for name, value in {"times": times, "positions": positions}.items():
             object.__setattr__(self, name, value)
 
@@ -251,8 +253,8 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
         radius: Of everyone [m].
 
     Raises:
-        ValueError: If the file cannot be read, a column is missing, a value is no number, there are fewer than two
-            times, or somebody is at two places at one time.
+        ValueError: If the file cannot be read, a column is missing, a value is no finite number, there are fewer than
+            two times, or somebody is at two places at one time.
     """
     try:
         file = open(path, newline="", encoding="utf-8-sig")  # noqa: SIM115
@@ -269,6 +271,8 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
         for row in reader:
             try:
                 time, x, y = (float(row[name]) for name in _COLUMNS[1:])
+                if not np.isfinite((time, x, y)).all():
+                    raise ValueError("not finite")
             except (TypeError, ValueError):
                 given = ", ".join(short_repr(row[name]) for name in _COLUMNS[1:])
                 raise ValueError(f"{path}, line {reader.line_num}: time, x and y are {given}; give numbers") from None

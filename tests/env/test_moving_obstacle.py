@@ -118,6 +118,7 @@ def test_pedestrians_are_read_from_a_file(tmp_path: Path) -> None:
     [
         ("id,time,x\na,0,0\n", "has no column y; it needs a header with id, time, x and y"),
         ("id,time,x,y\na,0,0,zero\n", "line 2: time, x and y are '0', '0', 'zero'; give numbers"),
+        ("id,time,x,y\na,0,0,0\na,1,nan,1\n", "line 3: time, x and y are '1', 'nan', '1'; give numbers"),
         ("id,time,x,y\na,0,0,0\na,0,1,0\n", "line 3: a is at two places at 0 s"),
         ("id,time,x,y\na,0,0,0\n", "people.csv has rows at 1 different times; give two"),
         ("id,time,x,y\n", "people.csv has rows at 0 different times; give two"),
@@ -138,6 +139,7 @@ def test_a_bad_file_is_an_error(tmp_path: Path, text: str, message: str) -> None
         (([0, 1], "a"), "MovingObstacle positions are 'a'; they must be numbers"),
         (([0, 1], [[0, 0], [1]]), r"positions are \[\[0, 0\], \[1\]\]; they must be numbers"),
         (([0, 1], [[0, 0], [1, 1]], 0), "radius is 0"),
+        (([0, 1], [[0, 0], [np.nan, 1]]), r"position \[nan, 1.0\] is half NaN; give all of it, or NaN for absent"),
         (([0, 1], [[0, 0], [1e9, 1]]), "at most 1e\\+06 m"),
     ],
 )
