@@ -66,8 +66,17 @@ def _detached(value: Any) -> Any:
     return value
 
 
+def _holds_truth(value: Any) -> bool:
+    """Check for truth values, in lists too."""
+    if isinstance(value, list | tuple):
+        return any(map(_holds_truth, value))
+    return isinstance(value, bool) or getattr(value, "dtype", None) == np.bool_
+
+
 def numbers_of(value: ArrayLike, what: str) -> FloatArray:
     """:func:`as_float32` of what a user gave; the error says ``what`` is wanted, as ``"goal must be numbers"``."""
+    if _holds_truth(value):
+        raise ValueError(f"{what}, not {short_repr(value)}; True and False are no numbers")
     try:
         return as_float32(value)
     except ValueError as error:

@@ -15,7 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, as_float32, positive_number, short_repr
+from d4orm_env.core.arrays import LARGEST, BoolArray, FloatArray, numbers_of, positive_number, short_repr
 from d4orm_env.core.observation_layout import BoundsSlack, ObservationLayout
 from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
@@ -271,10 +271,7 @@ def truth(value: object, name: str) -> bool:
 
 def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:
     """One number, or one per control component, of zero or more."""
-    try:
-        array = as_float32(value)
-    except ValueError:
-        raise ValueError(f"{name} must be a number or one per control component, not {short_repr(value)}") from None
+    array = numbers_of(value, f"{name} must be a number or one per control component")
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; give one number, or one per control component")
     if not np.isfinite(array).all() or (array < 0).any():
