@@ -70,12 +70,18 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
 
     @property
     def max_cycles(self) -> int:
-        """Steps until truncation; assigning it also makes a new ``state_space``, which counts steps."""
+        """Steps until truncation; assigning it also makes a new ``state_space``, which counts steps.
+
+        In the middle of an episode it must be more than the steps taken.
+        """
         return self._simulation.max_cycles
 
     @max_cycles.setter
     def max_cycles(self, value: int) -> None:
-        self._simulation.max_cycles = checked_cycles(value)
+        cycles, taken = checked_cycles(value), int(self._simulation.worlds.steps[0]) if self.agents else 0
+        if cycles <= taken:
+            raise ValueError(f"max_cycles is {cycles} after {taken} steps; give more, or assign it before the reset")
+        self._simulation.max_cycles = cycles
         self.state_space = gymnasium.spaces.Box(*self._simulation.state_bounds)
 
     @property

@@ -120,13 +120,14 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
             temporary.unlink(missing_ok=True)
 
 
-def claim_folder(path: Path, identity: Mapping[str, object], kind: str) -> None:
+def claim_folder(path: Path, identity: Mapping[str, object], kind: str, remedy: str = "choose another folder") -> None:
     """Write the purpose of a folder to a JSON file in it, or check that it is the same.
 
     Args:
         path: The file.
         identity: All that must be the same.
         kind: Content of the folder for messages, as ``"a training"``.
+        remedy: What else to do than to go on with the same.
 
     Raises:
         ValueError: If it is for something else, or does not say.
@@ -145,7 +146,7 @@ def claim_folder(path: Path, identity: Mapping[str, object], kind: str) -> None:
         if before.get(name) != value:
             raise ValueError(
                 f"folder {path.parent} holds {kind} with {name} {before.get(name)!r}, not {value!r}; go on with the "
-                "same, or choose another folder"
+                f"same, or {remedy}"
             )
 
 

@@ -239,7 +239,8 @@ def _refuse(options: EnvOptions) -> None:
     }
     for name, given in refused.items():
         if given:
-            raise ValueError(f"{name} is not possible in pure functions of JAX; use gymnasium.make_vec or parallel_env")
+            other = "parallel_env" if name in ("render_mode", "lifelong") else "gymnasium.make_vec or parallel_env"
+            raise ValueError(f"{name} is not possible in pure functions of JAX; use {other}")
 
 
 def _stacked(problems: list[Problem]) -> tuple[dict[int, jax.Array], list[ArrayLike], PyTreeDef]:

@@ -119,7 +119,8 @@ class Checkpoints:
         self.policy_path = out / f"policy{SUFFIX}"
         self._folder = out / "checkpoints"
         self._folder.mkdir(parents=True, exist_ok=True)
-        claim_folder(out / "settings.json", settings, "a training")
+        remedy = f"learn on from its policy in another folder, with --start-from {self.policy_path}"
+        claim_folder(out / "settings.json", settings, "a training", remedy)
 
     def policy(self) -> Network:
         """The policy that did best so far."""

@@ -264,7 +264,8 @@ def _load_zip(algorithm: str, path: Path) -> Any:
             f"a policy in a .zip needs Stable-Baselines3; install it with: pip install 'd4orm-env[rl]' ({path})"
         ) from None
     if not path.is_file():
-        raise FileNotFoundError(f"policy file {path} does not exist; give what model.save() wrote")
+        below = "".join(f", as {found}" for found in sorted(path.parent.glob(f"*/{path.name}"))[-1:])
+        raise FileNotFoundError(f"policy file {path} does not exist; give what model.save() wrote{below}")
     try:
         return getattr(stable_baselines3, algorithm.upper()).load(path, device="cpu")
     except Exception as error:  # whatever a foreign file makes its reader raise

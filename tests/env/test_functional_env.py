@@ -194,8 +194,8 @@ def test_noise_is_drawn_from_the_key() -> None:
     ("options", "complaint"),
     [
         ({"disturbances": [Delay(2)]}, "disturbances other than ControlNoise and RayNoise are no pure functions"),
-        ({"lifelong": True}, "lifelong is not possible"),
-        ({"render_mode": "human"}, "render_mode is not possible"),
+        ({"lifelong": True}, "lifelong is not possible in pure functions of JAX; use parallel_env"),
+        ({"render_mode": "human"}, "render_mode is not possible in pure functions of JAX; use parallel_env"),
         ({"observed_path": True}, "observed_path is not possible"),
         ({"progress": "path"}, "progress='path' is not possible"),
         ({"num_instances": 0}, "num_instances is 0"),

@@ -157,6 +157,16 @@ def test_max_cycles_can_be_assigned() -> None:
     assert env.metrics()["steps"] == 130
     with pytest.raises(ValueError, match="max_cycles is 0"):
         env.max_cycles = 0
+    env.max_cycles = 5  # the episode is over
+    env.reset()
+    for _ in range(3):
+        env.step({"robot_0": [-1, 0]})
+    with pytest.raises(ValueError, match="max_cycles is 3 after 3 steps; give more, or assign it before the reset"):
+        env.max_cycles = 3
+    env.max_cycles = 4
+    env.step({"robot_0": [-1, 0]})
+    assert not env.agents
+    assert env.state_space.contains(env.state())
 
 
 def test_types_are_plain_and_dictionaries_fresh() -> None:
@@ -296,6 +306,7 @@ def test_a_missing_action_is_refused_by_name() -> None:
         ({"max_cycles": 10**12}, "max_cycles is 1000000000000; it must be at most 1000000000"),
         ({"observed_robots": 10**9}, "observed_robots is 1000000000; it must be at most 10000"),
         ({"control_noise_std": "much"}, "control_noise_std must be a number"),
+        ({"control_noise_std": True}, "control_noise_std must be a number .*, not True"),
         ({"control_noise_std": [0.1, 0.1, 0.1]}, "control_noise_std has shape"),
         ({"max_cycles": 0}, "max_cycles is 0"),
         ({"observed_robots": -1}, "observed_robots"),

@@ -206,7 +206,7 @@ def test_what_cannot_be_learned_is_refused_and_nothing_is_written(tmp_path: Path
 
 def test_other_settings_in_the_same_folder_are_refused(trained: tuple[TrainingSettings, Path]) -> None:
     settings, out = trained
-    with pytest.raises(ValueError, match=r"holds a training with seed 5, not 6"):
+    with pytest.raises(ValueError, match=r"holds a training with seed 5, not 6; .* with --start-from .*policy\."):
         train(replace(settings, seed=6), out)
 
 
@@ -326,6 +326,10 @@ def test_files_that_are_no_policies_are_refused(tmp_path: Path) -> None:
         make_policy("ppo", path=str(garbage))
     with pytest.raises(FileNotFoundError, match="does not exist"):
         make_policy("ppo", path=str(tmp_path / "none.safetensors"))
+    (tmp_path / "000001").mkdir()
+    (tmp_path / "000001" / "model.zip").touch()
+    with pytest.raises(FileNotFoundError, match=r"does not exist; .*, as .*000001.model\.zip"):
+        make_policy("ppo", path=str(tmp_path / "model.zip"))
     with pytest.raises(ValueError, match=r"must end in \.safetensors"):
         make_policy("ppo", path="policy.pkl")
     garbage.with_suffix(".zip").write_bytes(b"no zip")
