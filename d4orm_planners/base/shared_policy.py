@@ -171,7 +171,7 @@ def loaded(model: Model, method: str = "state_dict") -> Model:
         ValueError: If it has not, as the path of one.
     """
     if isinstance(model, type) or not hasattr(model, method):
-        raise ValueError(f"the model is {short_repr(model)}, without {method}(); load it first, and give what acts")
+        raise ValueError(f"the model is {short_repr(model)}; load it first, and give what acts and has {method}")
     return model
 
 
