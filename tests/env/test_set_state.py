@@ -98,7 +98,7 @@ def test_agents_that_act_in_turn_see_it_at_once() -> None:
 )
 def test_a_bad_state_is_named_and_changes_nothing(states: Any, message: str) -> None:
     env = navigation_v0.parallel_env(problem=mixed_problem())
-    with pytest.raises(RuntimeError, match="call reset"):
+    with pytest.raises(RuntimeError, match=r"call env\.reset"):
         env.set_state(states)
     env.reset(seed=0)
     before = env.state()
