@@ -19,7 +19,7 @@ from d4orm_planners.base.measured_states import completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
 from d4orm_planners.base.policy import Actions, OpenLoop, Policy
 from d4orm_planners.base.policy_threads import Background, check_episode
-from d4orm_planners.tracking.reference_feedback import Lag, LaggedReference, Reference, regulated
+from d4orm_planners.tracking.reference_feedback import ActuatorLag, LaggedReference, Reference, regulated
 from d4orm_planners.tracking.steering import (
     advanced,
     limited_states,
@@ -179,7 +179,7 @@ class Controller:
         self._open(problem.with_state(start, problem.goal, team=team), seed)
         self.policy.reset(self._env, seed=seed)
         # A tracker follows by itself, and what a policy looks at is as without a lag.
-        lag = Lag(self._observer.lag.constants * (not (self.tracker or self._looks)), problem.dt)
+        lag = ActuatorLag(self._observer.lag.constants * (not (self.tracker or self._looks)), problem.dt)
         self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, lag)
         self._setpoint = self._described(Reference(start, start, *2 * (self._joint.controls,)), held=False)
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, short_repr
 from d4orm_env.core.problem import Problem
-from d4orm_planners.tracking.reference_feedback import Lag
+from d4orm_planners.tracking.reference_feedback import ActuatorLag
 from d4orm_planners.tracking.steering import limit_controls, rates, short_way_round
 
 GAIN = 0.1
@@ -64,7 +64,7 @@ class DisturbanceObserver:
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
         self._fastest = fastest[:, None]
-        self.lag = Lag(constants, problem.dt)
+        self.lag = ActuatorLag(constants, problem.dt)
         self._trust = problem.dt / (problem.dt + 2 * constants[:, None])
         self.bias, self.applied = np.zeros((count, d)), np.zeros((count, problem.control_size))
         self._explained: Floats | None = None

@@ -42,7 +42,7 @@ class SharedPolicy(Policy):
         trained: Shapes of the observations and actions of the training, where the model tells them. Those of a whole
             team are of a model that steers it at once, trained in the joint environment.
         joint: Whether it is one, where it does not tell: it is asked for one row, of all robots one after the other.
-        actions: Space of the actions of the training, where the model tells it; bounds tell most robot models apart.
+        actions: Space of the actions of the training, where the model tells it; wider ones are refused.
             Those of egocentric ones are all alike, so give these the robot model that they were trained on.
 
     Raises:
@@ -96,7 +96,10 @@ class SharedPolicy(Policy):
         return self._joint or (self._trained == team and count > 1)
 
     def _check_bounds(self) -> None:
-        """Refuse other bounds of actions than those of the training: the controls of other robots mean other things."""
+        """Refuse bounds of actions beyond those of the training: the controls of other robots mean other things.
+
+        Lower ones may be those of the same robots, as in a Controller, which holds back some.
+        """
         if not isinstance(self._actions, gymnasium.spaces.Box):
             return
         low, high = self._low, self._high
@@ -108,12 +111,14 @@ class SharedPolicy(Policy):
         if not self._is_joint:
             low, high = low[:1], high[:1]
         trained, here = (self._actions.low, self._actions.high), (low.ravel(), high.ravel())
-        if self._actions.shape != here[0].shape or not np.allclose(trained, here):
+        fits = self._actions.shape == here[0].shape and (
+            np.allclose(trained, here) if self._egocentric else (np.abs(here) <= np.abs(trained) * (1 + 1e-5)).all()
+        )
+        if not fits:
             raise ValueError(
                 f"the model was trained for actions from {trained[0].tolist()} to {trained[1].tolist()}, and those "
                 f"here are from {here[0].tolist()} to {here[1].tolist()}; make the environment of robots as in "
-                "training, say whether that was egocentric, and give a Controller, which holds back some of the "
-                "limits, reserve=0"
+                "training, and say whether that was egocentric"
             )
 
     def act(self, observations: Observations, state: FloatArray) -> Actions:

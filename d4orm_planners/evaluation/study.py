@@ -179,11 +179,11 @@ def _checked(label: str, given: Any) -> tuple[PolicyLike, dict[str, object]]:
     if isinstance(given, Mapping):
         settings = dict(given)
         return settings.pop("policy", label), settings
-    if is_brought(given) or (isinstance(given, str) and ":" in given):
+    if is_brought(given) or isinstance(given, str):
         return given, {}
     raise ValueError(
         f"policies[{label!r}] is {short_repr(given)}; give the settings of a policy, as {{}} or "
-        "{'policy': 'd4orm', 'num_samples': 128}, or a policy or function of your own"
+        "{'policy': 'd4orm', 'num_samples': 128}, its name, or a policy or function of your own"
     )
 
 

@@ -41,7 +41,7 @@ class Reference(NamedTuple):
     applied: FloatArray  #: ``(K, m)`` what they apply now
 
 
-class Lag:
+class ActuatorLag:
     """Lag of first order with which actuators approach what they are told.
 
     Args:
@@ -80,9 +80,9 @@ class LaggedReference:
         lag: That of their actuators.
     """
 
-    def __init__(self, problem: Problem, states: FloatArray, lag: Lag) -> None:
+    def __init__(self, problem: Problem, states: FloatArray, lag: ActuatorLag) -> None:
         self.lag, self._problem, self._slowest = lag, problem, float(lag.constants.max())
-        self._filter = Lag(np.full_like(lag.constants, self._slowest), problem.dt)
+        self._filter = ActuatorLag(np.full_like(lag.constants, self._slowest), problem.dt)
         self._ratio = (lag.constants / max(self._slowest, 1e-12))[:, None]
         at_rest, self._behind = np.zeros((len(states), problem.control_size), np.float32), np.zeros(states.shape)
         self._behind[:, : problem.dimension] -= self._slowest * present_velocities(problem, states, at_rest)
@@ -101,7 +101,9 @@ class LaggedReference:
         return Reference(*(row.astype(np.float32) for row in rows))
 
 
-def regulated(problem: Problem, states: FloatArray, reference: Reference, applied: Floats, lag: Lag) -> FloatArray:
+def regulated(
+    problem: Problem, states: FloatArray, reference: Reference, applied: Floats, lag: ActuatorLag
+) -> FloatArray:
     """``(K, m)`` controls within the limits that lead robots from ``states`` ``(K, n)`` back to a reference.
 
     Full control is worth a distance of a radius, or a radian. Who is lost drives to where the reference
@@ -168,7 +170,7 @@ def _linearised(
     return short_way_round(problem, missed), slopes[..., :n], slopes[..., n:]
 
 
-def _augmented(by_state: Floats, by_control: Floats, missed: Floats, lag: Lag) -> tuple[Floats, Floats]:
+def _augmented(by_state: Floats, by_control: Floats, missed: Floats, lag: ActuatorLag) -> tuple[Floats, Floats]:
     """Slopes ``(K, N, N)`` and ``(K, N, m)`` of the states, of what actuators with a lag apply, and of a last one.
 
     That is always one: it has the reference go on to depart from its own controls as it does now, by ``missed``.

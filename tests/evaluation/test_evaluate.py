@@ -643,7 +643,7 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
             "'orca' and 'same' are one policy with the same settings",
         ),
         ({"policies": {"mine": object()}}, r"policies\['mine'\] is <object .*; give the settings of a policy, as {}"),
-        ({"policies": {"mine": "d4orm"}}, r"policies\['mine'\] is 'd4orm'; give the settings"),
+        ({"policies": {"mine": "d4orn"}}, "policy 'd4orn' is unknown; .*did you mean 'd4orm'"),
         ({"policies": object()}, "policy <object object at .* is no name; give one of d4orm"),
         ({"policies": [{"policy": "go-to-goal"}]}, "policy {'policy': 'go-to-goal'} is no name"),
         ({"policies": {3: {}}}, "policy 3 is no name"),

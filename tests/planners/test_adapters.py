@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from d4orm_env import make_problem, navigation_v0
-from d4orm_planners import evaluate, make_policy, run_episode
+from d4orm_planners import Controller, evaluate, make_policy, run_episode
 from d4orm_planners.base.adapters import SharedPolicy, from_rllib, from_sb3, from_torch, from_torchrl
 from d4orm_planners.tracking.steering import limit_controls
 
@@ -48,9 +48,12 @@ def test_stable_baselines3() -> None:
     assert from_sb3(model, deterministic=False).identity() != from_sb3(model).identity()
     with pytest.raises(ValueError, match="deterministic is 1; it must be True or False"):
         from_sb3(model, deterministic=1)
-    other_robots = make_problem("circle", num_robots=3, model="differential_drive", max_turn_rate=0.7)
+    other_robots = make_problem("circle", num_robots=3, model="differential_drive", max_turn_rate=2.0)
     with pytest.raises(ValueError, match="make the environment of robots as in training"):
         run_episode(navigation_v0.parallel_env(problem=other_robots), from_sb3(model))
+    controller = Controller(from_sb3(model))  # which holds back some of the limits
+    controller.begin(PROBLEM, PROBLEM.start)
+    assert np.isfinite(controller.step(PROBLEM.start, 0.1).control).all()
 
 
 def test_bounds_of_actions_are_compared_as_robots_or_the_team_have_them() -> None:
