@@ -13,7 +13,7 @@ from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.envs.joint_state import JointState, split_state
-from d4orm_planners.base.disturbance_observer import GAIN, DisturbanceObserver, check_lag
+from d4orm_planners.base.disturbance_observer import DisturbanceObserver, check_lag
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.measured_states import completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
@@ -181,7 +181,8 @@ class Controller:
         # A tracker follows by itself, and what a policy looks at is as without a lag.
         lag = ActuatorLag(self._observer.lag.constants * (not (self.tracker or self._looks)), problem.dt)
         self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, lag)
-        self._setpoint = self._described(Reference(start, start, *2 * (self._joint.controls,)), held=False)
+        idle = self._joint.controls
+        self._setpoint = self._described(Reference(start, start, idle, idle), held=False)
 
     def step(self, states: ArrayLike, time: float) -> ControlSetpoint:
         """Return the setpoint for the period that begins now.
@@ -247,7 +248,7 @@ class Controller:
         self.states = measured
         self._observer.observe(measured, known)
         if self.tracker:
-            self._shift(measured, known)
+            self._lead = self._observer.shifted(self._lead, self._joint.states, measured, known)
         if self._looks:
             observer, joint = self._observer, self._joint
             seen = observer.blended(measured, joint.states) if self.tracker else observer.undelayed(measured, known)
@@ -276,12 +277,6 @@ class Controller:
             back = regulated(self._robots, measured, reference, self._observer.applied, lag)
             controls = np.where(follows[:, None], back, controls)
         return self._described(reference._replace(controls=self._observer.compensated(controls, self.arrived)), held)
-
-    def _shift(self, measured: FloatArray, known: BoolArray) -> None:
-        """Shift setpoints against a lasting distance from the reference, at most by the margin."""
-        d, margin = self.problem.dimension, self.problem.margin
-        error = np.where(known[:, None], self._joint.states[:, :d] - measured[:, :d], 0.0)
-        self._lead = np.clip(self._lead + GAIN * error, -margin, margin)
 
     def _actions(self) -> Actions | None:
         """Return the policy's actions; ``None`` if they do not come in time, or the episode is over."""

@@ -91,10 +91,14 @@ class DisturbanceObserver:
         """
         driven = self.applied.copy()
         driven[:, : self.problem.dimension] += self.bias
-        ahead = np.where(known, self.lag.constants, 0.0)[:, None] * rates(
-            self.problem, states, driven.astype(np.float32)
-        )
-        return states + ahead.astype(np.float32)
+        lag, rate = np.where(known, self.lag.constants, 0.0), rates(self.problem, states, driven.astype(np.float32))
+        return states + (lag[:, None] * rate).astype(np.float32)
+
+    def shifted(self, lead: Floats, reference: FloatArray, states: FloatArray, known: BoolArray) -> Floats:
+        """``(K, d)`` a lead of setpoints, shifted against a lasting distance from the reference, up to the margin."""
+        d, margin = self.problem.dimension, self.problem.margin
+        error = np.where(known[:, None], reference[:, :d] - states[:, :d], 0.0)
+        return np.clip(lead + GAIN * error, -margin, margin)
 
     def blended(self, states: FloatArray, reference: FloatArray) -> FloatArray:
         """``(K, n)`` the states of a reference, moved towards measured ones by the share that no lag explains."""
