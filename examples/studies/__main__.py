@@ -32,8 +32,7 @@ FIGURES = (
     "amswarm", "big-teams", "coarseness", "ipopt", "nodes", "noise-schedule", "robustness", "selections", "team-size",
 )  # fmt: skip
 FURTHER = {
-    "algorithm_4": ("big-teams", "coarseness"), "algorithm_4_noise": ("robustness",), "ipopt_preset": ("ipopt",),
-    "big-teams_seconds": ("big-teams",),
+    "algorithm_4": ("coarseness",), "ipopt_preset": ("ipopt",), "big-teams_seconds": ("big-teams",),
 }  # fmt: skip
 """Further trials of these, few: of the paper's presets, and for seconds of one machine."""
 TIMED = ("big-teams_seconds", "coarseness", "ipopt")

@@ -147,7 +147,7 @@ def _big_teams() -> Figure:
         },
         remarks=(
             "Runtime is that of the first solution, or of the coarse plan of d4orm-c2f. Within deadlines d4orm-c2f "
-            "counts with all its control loops. `d4orm-c2f` is Algorithm 4 (preset `paper`), with few seeds.",
+            "counts with all its control loops. `d4orm-c2f` is Algorithm 4 (preset `paper`), with 20 seeds or fewer.",
             "The paper shows 100 random robots; its authors' scenario has no room for them, and ours, with a square of "
             "12.5 m, takes its place.",
         ),
