@@ -13,7 +13,7 @@ from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, draw_noise, quantity_of, write_figure
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
-from d4orm_planners.evaluation.tables import markdown, panels, table, target, write_csv, write_rates
+from d4orm_planners.evaluation.tables import errors, markdown, panels, table, target, write_csv, write_rates
 
 THRESHOLD = 0.9
 """Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
@@ -85,7 +85,8 @@ def write_disturbances(folder: str | os.PathLike[str], groups: Sequence[TrialGro
         f"- `disturbances{suffix}`, `disturbance_map{suffix}`: {markdown_text(title)}"
         for suffix, title in zip(suffixes, groups_by_title)
     ]
-    blocks = [tolerance_tables(rates), "## Figures", _FIGURES, "\n".join(captions), *_pair_tables(rates, pairs)]
+    blocks = errors((rate.label, rate.error) for rate in rates)  # first, as below they look like bad policies
+    blocks += [tolerance_tables(rates), "## Figures", _FIGURES, "\n".join(captions), *_pair_tables(rates, pairs)]
     paths = [Path(folder, name) for name in ("disturbances.md", "tolerance.csv")]
     with target(paths[0]) as path:
         path.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")

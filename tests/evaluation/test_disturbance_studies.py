@@ -210,6 +210,12 @@ def test_without_a_level_without_effect_no_tolerance_is_named(tmp_path: Path) ->
     assert row["undisturbed"] == row["threshold"] == row["passes"] == row["fails"] == ""
 
 
+def test_policies_that_failed_are_told_first(tmp_path: Path) -> None:
+    groups = [group("a", level, wins, error=error) for level, wins, error in ((0, "+++", ""), (1, "---", "it broke"))]
+    write_disturbances(tmp_path, groups)
+    assert (tmp_path / "disturbances.md").read_text().startswith("### Errors\n\n- `a`: it broke\n")
+
+
 def test_pairs_are_compared_by_seed() -> None:
     (pair,) = compare_pairs(
         [group("a", 1, "+++++++++---", travel_time=5.0), group("b", 1, "++----------", travel_time=6.0)]
