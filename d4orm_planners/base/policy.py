@@ -65,7 +65,7 @@ class Policy(ABC):
             seed: Seeds whatever the policy draws, zero or more.
 
         Raises:
-            RuntimeError: If no episode has begun.
+            RuntimeError: If no episode has begun and the policy needs one.
             ValueError: If that is no environment, or an egocentric one, or no seed.
         """
         whole_number(seed, "seed", 0)
@@ -73,7 +73,6 @@ class Policy(ABC):
             raise ValueError(f"env is {short_repr(env)}; give an environment, such as parallel_env(problem=problem)")
         if (options := getattr(env.unwrapped, "options", None)) is not None:
             options.require_physical_units()
-        env.unwrapped.state()  # refused before the first reset
         self.problem = env.unwrapped.problem
 
     @abstractmethod
