@@ -174,10 +174,8 @@ def _world(environment: Mapping[str, Any], team: Team, start: Floats, goal: Floa
     inside = (lower <= start[:, :d]) & (start[:, :d] <= upper) & (lower <= goal[:, :d]) & (goal[:, :d] <= upper)
     boxes, balls = [], []
     for number, obstacle in enumerate(environment.get("obstacles") or ()):
-        what, kind = (
-            f"obstacle {number}",
-            _check_mapping(obstacle, f"obstacle {number}", "type", "center", "size")["type"],
-        )
+        what = f"obstacle {number}"
+        kind = _check_mapping(obstacle, what, "type", "center", "size")["type"]
         if kind not in ("box", "sphere"):
             raise ValueError(f"type of {what} is {short_repr(kind)}; known are box, sphere")
         centre = number_list(obstacle["center"], f"center of {what}", d)
@@ -198,11 +196,11 @@ def _world(environment: Mapping[str, Any], team: Team, start: Floats, goal: Floa
 
 def _covered(team: Team, states: FloatArray) -> tuple[Floats, Floats]:
     """``(2,)`` least and largest coordinates of all bodies in the plane in states ``(2, K, n)``."""
-    ends = []
+    ends, poses = [], team.body_poses(states)
     for number, body in enumerate(team.bodies):
         assert isinstance(body.footprint, Box | Disc)
         corners, rounding = body.footprint.core
-        for x, y, heading in team.body_poses(states)[:, number]:
+        for x, y, heading in poses[:, number]:
             turned = corners @ [[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]]
             placed = np.add(turned, (x, y))
             ends += [placed - rounding, placed + rounding]
