@@ -18,27 +18,20 @@ from d4orm_planners.base.settings import Count
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.mapf.lacam import TeamOnRoadmap, find_moves
 from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
+from d4orm_planners.mapf.one_by_one import plan_one_by_one, settle
 from d4orm_planners.mapf.replanning import is_compiled
 from d4orm_planners.mapf.roadmap import fill_costs, lay_roadmap
 from d4orm_planners.mapf.roadmap_team import FAR, Replanning, TeamRollout, drive_moves
 
 NEARNESS = 10 / 3
 """Random distance by which a robot may be farther away and still be replanned with another, in radii of the largest."""
-ONE_BY_ONE = (
-    (1.6, False, 0.5),
-    (1.6, True, 1.5),
-    (3.0, True, 1.5),
-    (1.6, True, 1.5),
-    (3.0, True, 1.5),
-    (4.0, True, 1.5),
-)
-"""Searches for paths one by one: fineness of the roadmap, whether turns on the spot are counted, and paths per robot
-after which the next one is tried if no fewer wait for theirs. They differ by chance too: another one often succeeds."""
+ONE_BY_ONE = (1.6, 3.0, 1.6, 3.0, 4.0)
+"""Fineness of the roadmaps of searches for paths one by one; the searches differ by chance too."""
 ALL_AT_ONCE = (1.6, 1.25, 1.0, 2.2, 3.0)
 """Fineness of those on which paths are then looked for all at once; see
 :func:`~d4orm_planners.mapf.roadmap.lay_roadmap`."""
-LEAST_PATIENCE = 50
-"""Paths beyond those per robot."""
+PATIENCE = (50, 1.5)
+"""Paths, and paths for each robot, after which the next roadmap is tried if no fewer robots wait for theirs."""
 MAX_ROBOT_STEPS = 4_000_000
 """Most steps of all robots together, whose drives are kept several times over."""
 DETOUR_RATIO = 1.25
@@ -181,13 +174,13 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
         return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for paths")
     with search.watch.paused():
         compile_path_finding(problem)
-    random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
-    for number, (fineness, counts_turns, patience) in enumerate(ONE_BY_ONE):
+    random, patience = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), PATIENCE[0]
+    patience += int(PATIENCE[1] * problem.num_robots)
+    for number, fineness in enumerate(ONE_BY_ONE):
         roadmap = lay_roadmap(problem, fineness)
-        replanning = Replanning(problem, roadmap, counts_turns=counts_turns)
+        replanning = Replanning(problem, roadmap)
         if np.isfinite(replanning.alone).all():
-            paths = LEAST_PATIENCE + int(patience * problem.num_robots)
-            driven = replanning.one_by_one(random, search.should_stop, paths)
+            driven = plan_one_by_one(replanning, random, search.should_stop, patience)
             if driven is not None:
                 return RoadmapSolution(replanning, driven)
         elif number == 0 and (reason := NoPaths.unless_reachable(search)) is not None:
@@ -239,7 +232,7 @@ def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: i
     present.positions[:, changed] = FAR
     before, random, robots = present.positions.copy(), np.random.default_rng(seed), np.flatnonzero(changed)
     order = robots[np.argsort(replanning.alone[robots] + random.random(len(robots)))]
-    driven = replanning.settle(present, order, random, lambda: False, num_robots)
+    driven = settle(replanning, present, order, random, lambda: False, num_robots)
     if driven is None:
         return None
     for robot in np.flatnonzero((driven.positions != before).any(axis=(0, 2))):
@@ -285,7 +278,7 @@ def compile_path_finding(problem: Problem) -> None:
         found = find_moves(alone, roadmap, 0, lambda: False, STEPS)
         if found is not None:
             drive_moves(alone, roadmap, found.moves)
-            Replanning(alone, roadmap).one_by_one(np.random.default_rng(0), lambda: False, 1)
+            plan_one_by_one(Replanning(alone, roadmap), np.random.default_rng(0), lambda: False, 1)
 
 
 def _small_problem(problem: Problem, robot: int) -> Problem:

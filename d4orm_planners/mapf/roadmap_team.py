@@ -27,9 +27,9 @@ from d4orm_planners.tracking.timed_path import drive_by_clock
 
 FIRST_CUT = 0.2
 """Most by which corners are cut on first routes, in radii of the largest robot, as all lengths below."""
-SPEED_PROFILES = ((1.0, 5 / 3), (0.9, 2 / 3), (0.75, 0.2), (0.6, 1 / 15))
-"""Shares of its speed that a robot is taken to drive at when its path is planned, and by how much it cuts corners; the
-next where it is late so, or comes too near to something."""
+SPEED_PROFILES = ((1.0, 5 / 3, False), (0.9, 2 / 3, True), (0.75, 0.2, True), (0.6, 1 / 15, True))
+"""Shares of its speed that a robot is taken to drive at when its path is planned, by how much it cuts corners, and
+whether the steps that it turns on the spot count; the next where it is late so, or comes too near to something."""
 LEISURE = 0.1
 """Share of that by which it is slower, at most: drawn for every path, so that no two searches are the same."""
 LAUNCH = 0.4
@@ -40,10 +40,6 @@ BOUND_FACTOR, BOUND_EXTRA = 1.5, 60
 """Bounds of the first search for a path: so many times as long as alone, and so many steps more."""
 FAR = 1e9
 """Position of robots that are not there yet [m]."""
-MINDED = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
-"""Shares of the others that a robot without a path minds in turn, at random: the fewer it displaces, the better."""
-HOPELESS = 4
-"""Paths that robots do not find even alone after which patience is over."""
 LATER = 30
 """Steps by which a robot may come later for the sake of others."""
 KEEP, TOUCH, ROUNDING = 0.4, 1 / 30, 2.0**-17
@@ -96,16 +92,12 @@ class Replanning:
         roadmap: The roadmap of its world.
         dwell: Steps after which a robot that has arrived is no obstacle any more, for it goes on to another
             goal; ``None`` if it stays.
-        counts_turns: Whether plans allow for the steps that turns on the spot take: in a crowd others come in the
-            meantime, elsewhere robots are sooner without.
 
     Attributes:
         alone: ``(K,)`` about how many steps each robot takes by itself.
     """
 
-    def __init__(
-        self, problem: Problem, roadmap: Roadmap, dwell: int | None = None, *, counts_turns: bool = False
-    ) -> None:
+    def __init__(self, problem: Problem, roadmap: Roadmap, dwell: int | None = None) -> None:
         self.problem, self.roadmap, self.dwell = problem, roadmap, dwell
         self.cells = sort_into_cells(roadmap.nodes, float(2 * np.asarray(problem.team.radius).max() + problem.margin))
         self.space = make_space(problem) if problem.world.num_obstacles else None
@@ -118,8 +110,7 @@ class Replanning:
         self.ends_apart = np.minimum(gaps[0], gaps[1] - self.bodies.goal_radius) - ROUNDING * self.size
         # Who turns in place need not back up.
         self.backing = [(False,) if model.turns_in_place else (False, True) for model in problem.team.robot_models]
-        turns = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
-        self.turns_on_the_spot = [(turn * counts_turns, facing) for turn, facing in turns]
+        self.turns = [turn_on_the_spot(problem, robot) for robot in range(problem.num_robots)]
         rooms = [problem.world.clearance(ends[:, : problem.dimension]) for ends in positions]
         self.own_room = np.minimum(*rooms) - TOUCH * self.size
         self.threads = Threads(min(2, available_cores()))
@@ -140,61 +131,6 @@ class Replanning:
             if should_stop() or not self.replan_one(changed, occupancy, robot, int(latest[robot]), random):
                 return None
         return changed
-
-    def one_by_one(
-        self, random: np.random.Generator, should_stop: Callable[[], bool], patience: int
-    ) -> TeamRollout | None:
-        """The team, its paths planned one by one; a robot that finds none displaces others, whose turn comes again.
-
-        Args:
-            random: Of the order, and of the robots that may be displaced.
-            should_stop: Asked before every path.
-            patience: Paths after which it gives up if no fewer robots wait for theirs than ever before.
-
-        Returns:
-            All robots' paths within the horizon; ``None`` if they were not found.
-        """
-        problem, steps, num_robots = self.problem, self.problem.horizon, self.problem.num_robots
-        positions = np.full((steps + 1, num_robots, 3), FAR)
-        controls = np.zeros((steps, num_robots, problem.control_size), np.float32)
-        driven = TeamRollout(controls, positions, np.full(num_robots, steps + 1))
-        waiting = np.argsort(self.alone + random.random(num_robots))
-        return self.settle(driven, waiting, random, should_stop, patience)
-
-    def settle(
-        self,
-        driven: TeamRollout,
-        robots: IntArray,
-        random: np.random.Generator,
-        should_stop: Callable[[], bool],
-        patience: int,
-    ) -> TeamRollout | None:
-        """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
-        steps, waiting, num_robots = len(driven.controls), robots.tolist(), self.problem.num_robots
-        settled, met = np.ones((2, num_robots), bool)
-        settled[robots], occupancy = False, Occupancy(self.cells, driven.positions)
-        fewest, idle = len(waiting), 0
-        while waiting and idle < patience and not should_stop():
-            fewest, idle = min(fewest, len(waiting)), 0 if len(waiting) < fewest else idle + 1
-            robot = int(waiting.pop())
-            for hard in MINDED:
-                minded = ~settled | (random.random(num_robots) < hard)
-                if self.replan_one(driven, occupancy, robot, steps, random, minded):
-                    break
-            else:
-                # Not even alone: it drove too near to a wall, and might not at another pace.
-                waiting.insert(0, robot)
-                idle += patience // HOPELESS
-                continue
-            others = occupancy.around(self.separation(robot, KEEP))._replace(need=self.separation(robot, TOUCH))
-            last = self.leaves(int(driven.arrivals[robot]))
-            find_meetings(others, np.ascontiguousarray(driven.positions[:last, robot]), met)
-            displaced = settled & met
-            occupancy.put(displaced, FAR)
-            settled &= ~displaced
-            settled[robot] = True
-            waiting[:0] = random.permutation(np.flatnonzero(displaced)).tolist()
-        return None if waiting else driven
 
     def leaves(self, arrival: int) -> int | None:
         """The step from which on a robot that arrives at a step is no obstacle any more, if any."""
@@ -252,22 +188,23 @@ class Replanning:
 
         def look(part: IntArray) -> None:
             for each in range(number + part[0], number + part[1]):
-                found[each] = self.path(reservations, robot, latest, SPEED_PROFILES[each][0] * haste)
+                share, _, counts_turns = SPEED_PROFILES[each]
+                found[each] = self.path(reservations, robot, latest, share * haste, counts_turns)
 
-        for number, (_, cut) in enumerate(SPEED_PROFILES):
+        for number, (_, cut, _) in enumerate(SPEED_PROFILES):
             if number not in found:
                 self.threads.over(self.threads.num_threads, look)
             yield found[number], cut
 
-    def path(self, reservations: Reservations, robot: int, latest: int, cruise: float) -> IntArray:
+    def path(self, reservations: Reservations, robot: int, latest: int, cruise: float, counts_turns: bool) -> IntArray:
         """``(n, 3)`` int64 nodes of a robot's path at a share of its speed, and when it sets out for and comes to each;
         none where there is no path.
         """
         roadmap, bodies = self.roadmap, self.bodies
-        dwell, (turn, facing) = -1 if self.dwell is None else self.dwell, self.turns_on_the_spot[robot]
+        dwell, (turn, facing) = -1 if self.dwell is None else self.dwell, self.turns[robot]
         # Looked for among the sooner ones at first, because that is where it mostly is.
         for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
-            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell, turn, facing)
+            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell, turn * counts_turns, facing)
             path = find_path(roadmap, bodies, reservations, robot, trip)
             if len(path):
                 safety_distance = bodies.safety_distance[robot] * (1 + WALL_SLACK * 2 / 3)

@@ -22,7 +22,8 @@ from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.mapf.lacam import TeamMoves, TeamOnRoadmap, find_moves
 from d4orm_planners.mapf.lns import search_neighbourhoods
 from d4orm_planners.mapf.occupancy import Occupancy
-from d4orm_planners.mapf.planner import RoadmapPaths, needs_detour
+from d4orm_planners.mapf.one_by_one import plan_one_by_one
+from d4orm_planners.mapf.planner import ONE_BY_ONE, RoadmapPaths, needs_detour
 from d4orm_planners.mapf.precedence import join_routes, make_routes, stops_of
 from d4orm_planners.mapf.replanning import find_path
 from d4orm_planners.mapf.reservations import Trip, make_reservations, steps_to_turn
@@ -334,11 +335,21 @@ def test_a_crowd_of_robots_that_turn_on_the_spot_is_planned() -> None:
 
 
 @pytest.mark.slow
-def test_a_crowd_of_boxes_is_planned_one_by_one() -> None:
-    """Not where a robot that minds all others in vain goes on to mind half of them: it displaces too many."""
-    problem = make_problem("warehouse", num_robots=100, seed=1, footprint=Box(0.36, 0.24))
-    replanning = Replanning(problem, lay_roadmap(problem, 3.0), counts_turns=True)
-    assert replanning.one_by_one(np.random.default_rng(1), lambda: False, 200) is not None
+@pytest.mark.parametrize("model", ["holonomic2d", "differential_drive"])
+def test_a_crowd_of_boxes_is_planned_one_by_one(model: str) -> None:
+    """Not where robots take the places of others that find none: in a crowd as many always wait for theirs."""
+    problem = make_problem("warehouse", num_robots=100, seed=1, footprint=Box(0.36, 0.24), model=model)
+    replanning = Replanning(problem, lay_roadmap(problem, ONE_BY_ONE[0]))
+    assert plan_one_by_one(replanning, np.random.default_rng(1), lambda: False, 200) is not None
+
+
+def test_robots_that_pass_each_others_starts_leave_each_other_time_to_set_out() -> None:
+    """Two in one aisle, each of which must turn before it is out of the other's way."""
+    problem = make_problem("warehouse", num_robots=15, seed=2, model="differential_drive").select([0, 14])
+    replanning = Replanning(problem, lay_roadmap(problem, ONE_BY_ONE[0]))
+    driven = plan_one_by_one(replanning, np.random.default_rng(0), lambda: False, 50)
+    assert driven is not None
+    assert verify(problem, driven.until(problem.horizon)).ok
 
 
 def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
@@ -358,7 +369,7 @@ def test_what_is_replanned_is_better_for_all_together_or_left() -> None:
 def test_paths_one_by_one_displace_those_in_the_way() -> None:
     problem = corridor_with_bay(right=1.0)
     replanning = Replanning(problem, lay_roadmap(problem))
-    driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+    driven = plan_one_by_one(replanning, np.random.default_rng(0), lambda: False, 200)
     assert isinstance(driven, TeamRollout)
     assert driven.cost(problem.horizon)[0] == 0
     assert verify(problem, driven.until(problem.horizon)).ok
@@ -369,7 +380,7 @@ def test_paths_are_the_same_on_any_number_of_threads() -> None:
     for threads in (1, 2):
         replanning = Replanning(problem, lay_roadmap(problem))
         replanning.threads = Threads(threads)
-        team = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+        team = plan_one_by_one(replanning, np.random.default_rng(0), lambda: False, 200)
         assert team is not None
         driven.append(team.controls)
     np.testing.assert_array_equal(*driven)
@@ -382,7 +393,7 @@ def test_robots_may_pass_walls_closer_than_usual_if_that_is_all_they_find(
     problem = corridor_with_bay(right=1.0)
     replanning = Replanning(problem, lay_roadmap(problem))
     monkeypatch.setattr(replanning, "room_at_walls", lambda *_: room * problem.rounding)
-    driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+    driven = plan_one_by_one(replanning, np.random.default_rng(0), lambda: False, 200)
     assert (driven is not None) == planned
 
 
@@ -391,7 +402,7 @@ def test_a_robot_without_a_path_even_alone_is_tried_again(monkeypatch: pytest.Mo
     replanning = Replanning(problem, lay_roadmap(problem))
     usual, failures = replanning.replan_one, iter([False] * 3)
     monkeypatch.setattr(replanning, "replan_one", lambda *given: next(failures, True) and usual(*given))
-    driven = replanning.one_by_one(np.random.default_rng(0), lambda: False, 200)
+    driven = plan_one_by_one(replanning, np.random.default_rng(0), lambda: False, 200)
     assert driven is not None
     assert verify(problem, driven.until(problem.horizon)).ok
 

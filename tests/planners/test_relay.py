@@ -10,6 +10,7 @@ import pytest
 from d4orm_env import Problem, Team, World, make_problem, navigation_v0
 from d4orm_env.core.arrays import FloatArray
 from d4orm_planners import make_policy, run_episode
+from d4orm_planners.mapf.one_by_one import plan_one_by_one
 from d4orm_planners.mapf.planner import DWELL, compile_path_finding, relay_paths
 from d4orm_planners.mapf.roadmap import lay_roadmap
 from d4orm_planners.mapf.roadmap_team import Replanning
@@ -76,7 +77,7 @@ def test_a_goal_can_be_passed_once_who_arrived_has_gone_on() -> None:
     # Nobody gets past a robot that stays for good.
     compile_path_finding(problem)
     staying = Replanning(problem, lay_roadmap(problem))
-    assert staying.one_by_one(np.random.default_rng(0), lambda: False, 20) is None
+    assert plan_one_by_one(staying, np.random.default_rng(0), lambda: False, 20) is None
 
 
 def test_a_goal_without_a_way_has_no_ways() -> None:

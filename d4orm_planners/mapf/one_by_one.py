@@ -1,0 +1,142 @@
+"""Paths of a team, planned one robot after another; who finds none displaces others, if these find others.
+
+After J. Li, Z. Chen, D. Harabor, P. Stuckey and S. Koenig, *MAPF-LNS2: fast repairing for multi-agent path finding via
+large neighborhood search* (AAAI 2022): a change of some paths is kept if no more robots than before are without one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from d4orm_env.core.arrays import BoolArray, Floats, IntArray
+from d4orm_planners.mapf.occupancy import Occupancy, find_meetings
+from d4orm_planners.mapf.roadmap_team import FAR, KEEP, TOUCH, Replanning, TeamRollout
+
+MINDED = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
+"""Shares of the others that a robot without a path minds in turn, at random: the fewer it displaces, the better."""
+HOPELESS = 4
+"""Paths that robots do not find even alone after which patience is over."""
+
+
+def plan_one_by_one(
+    replanning: Replanning, random: np.random.Generator, should_stop: Callable[[], bool], patience: int
+) -> TeamRollout | None:
+    """The team, its paths planned one by one.
+
+    Args:
+        replanning: The search for a path.
+        random: Of the order, and of the robots that may be displaced.
+        should_stop: Asked before every path.
+        patience: Paths after which it gives up if no fewer robots wait for theirs than ever before.
+
+    Returns:
+        All robots' paths within the horizon; ``None`` if they were not found.
+    """
+    problem, steps, num_robots = replanning.problem, replanning.problem.horizon, replanning.problem.num_robots
+    positions = np.full((steps + 1, num_robots, 3), FAR)
+    controls = np.zeros((steps, num_robots, problem.control_size), np.float32)
+    driven = TeamRollout(controls, positions, np.full(num_robots, steps + 1))
+    waiting = np.argsort(replanning.alone + random.random(num_robots))
+    return settle(replanning, driven, waiting, random, should_stop, patience)
+
+
+def settle(
+    replanning: Replanning,
+    driven: TeamRollout,
+    robots: IntArray,
+    random: np.random.Generator,
+    should_stop: Callable[[], bool],
+    patience: int,
+) -> TeamRollout | None:
+    """The same for those ``robots``, the last of them first, among all others in ``driven``, which is changed."""
+    team, waiting = _Settled(replanning, driven, random, should_stop), robots.tolist()
+    team.settled[robots] = False
+    fewest, idle = len(waiting), 0
+    while waiting and idle < patience and not should_stop():
+        fewest, idle = min(fewest, len(waiting)), 0 if len(waiting) < fewest else idle + 1
+        robot = int(waiting.pop())
+        displaced = team.displace(robot)
+        if displaced is None:
+            # Not even alone: it drove too near to a wall, and might not at another pace.
+            waiting.insert(0, robot)
+            idle += patience // HOPELESS
+        elif len(displaced):
+            # The longer it gets no better, the more it may get worse for once.
+            most = 1 + int(random.random() * (1 + idle / len(team.settled)))
+            waiting[:0] = team.find_others(robot, displaced, most, int(random.random() * idle))
+    return None if waiting else driven
+
+
+class _Settled:
+    """A team of which some robots have paths."""
+
+    def __init__(
+        self,
+        replanning: Replanning,
+        driven: TeamRollout,
+        random: np.random.Generator,
+        should_stop: Callable[[], bool],
+    ) -> None:
+        self.replanning, self.driven, self.random, self.should_stop = replanning, driven, random, should_stop
+        self.occupancy, self.steps = Occupancy(replanning.cells, driven.positions), len(driven.controls)
+        self.settled = np.ones(replanning.problem.num_robots, bool)
+
+    def replan(self, robot: int, minded: BoolArray | None = None) -> bool:
+        """See :meth:`Replanning.replan_one`."""
+        return self.replanning.replan_one(self.driven, self.occupancy, robot, self.steps, self.random, minded)
+
+    def standing(self, robots: IntArray, steps: int) -> Floats:
+        """``(T + 1, R, 3)`` positions of robots that stand at their starts for some steps, and are nowhere then [m]."""
+        roadmap, positions = self.replanning.roadmap, np.full((self.steps + 1, len(robots), 3), FAR)
+        positions[:steps] = roadmap.nodes[roadmap.starts[robots]]
+        return positions
+
+    def displace(self, robot: int) -> IntArray | None:
+        """Plan a robot's path around as many as it can; those in whose way it is, ``None`` if it has no path at all."""
+        replanning, settled = self.replanning, self.settled
+        for hard in MINDED:
+            minded = ~settled | (self.random.random(len(settled)) < hard)
+            if self.replan(robot, minded):
+                break
+        else:
+            return None
+        others = self.occupancy.around(replanning.separation(robot, KEEP))
+        others, met = others._replace(need=replanning.separation(robot, TOUCH)), np.ones(len(settled), bool)
+        last = replanning.leaves(int(self.driven.arrivals[robot]))
+        find_meetings(others, np.ascontiguousarray(self.driven.positions[:last, robot]), met)
+        displaced = np.flatnonzero(settled & met)
+        settled[robot] = True
+        return displaced
+
+    def find_others(self, robot: int, displaced: IntArray, most: int, standing: int) -> list[int]:
+        """Plan other paths for those that a robot displaces, which it leaves time to set out if it can.
+
+        Args:
+            robot: The robot.
+            displaced: ``(D,)`` numbers of the others.
+            most: Those who may find no path, at most.
+            standing: Steps for which they stand at their starts, as the robot is to take it.
+
+        Returns:
+            Robots that have no path now: those that find none, or that robot where they are more than ``most``; then
+            all others have the paths that they had.
+        """
+        driven, lost = self.driven, list[int]()
+        controls, arrivals = driven.controls[:, displaced], driven.arrivals[displaced]
+        positions = driven.positions[:, displaced]
+        self.occupancy.put(displaced, self.standing(displaced, standing))
+        if standing:
+            self.replan(robot)
+        for other in self.random.permutation(displaced).tolist():
+            if self.should_stop() or not self.replan(other):
+                lost.append(other)
+            if len(lost) > most:
+                driven.controls[:, displaced], driven.arrivals[displaced] = controls, arrivals
+                self.occupancy.put(displaced, positions)
+                self.occupancy.put(robot, FAR)
+                lost = [robot]
+                break
+        self.settled[lost] = False
+        return lost
