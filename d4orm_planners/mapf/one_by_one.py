@@ -16,7 +16,7 @@ from d4orm_planners.mapf.roadmap_team import FAR, KEEP, TOUCH, Replanning, TeamR
 
 MINDED = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
 """Shares of the others that a robot without a path minds in turn, at random: the fewer it displaces, the better."""
-HOPELESS = 4
+HOPELESS = 10
 """Paths that robots do not find even alone after which patience is over."""
 
 
@@ -97,7 +97,7 @@ class _Settled:
         """Plan a robot's path around as many as it can; those in whose way it is, ``None`` if it has no path at all."""
         replanning, settled = self.replanning, self.settled
         for hard in MINDED:
-            minded = ~settled | (self.random.random(len(settled)) < hard)
+            minded = self.random.random(len(settled)) < hard
             if self.replan(robot, minded):
                 break
         else:
