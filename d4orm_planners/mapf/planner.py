@@ -176,15 +176,17 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
         compile_path_finding(problem)
     random, patience = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), PATIENCE[0]
     patience += int(PATIENCE[1] * problem.num_robots)
-    for number, fineness in enumerate(ONE_BY_ONE):
-        roadmap = lay_roadmap(problem, fineness)
-        replanning = Replanning(problem, roadmap)
+    narrow = False
+    for fineness in ONE_BY_ONE:
+        replanning = Replanning(problem, lay_roadmap(problem, fineness, narrow=narrow))
+        if not narrow and not np.isfinite(replanning.alone).all():
+            if (reason := NoPaths.unless_reachable(search)) is not None:
+                return reason
+            replanning, narrow = Replanning(problem, lay_roadmap(problem, fineness, narrow=True)), True
         if np.isfinite(replanning.alone).all():
             driven = plan_one_by_one(replanning, random, search.should_stop, patience)
             if driven is not None:
                 return RoadmapSolution(replanning, driven)
-        elif number == 0 and (reason := NoPaths.unless_reachable(search)) is not None:
-            return reason
         if search.should_stop():
             return NoPaths(NOT_IN_TIME)
     return None

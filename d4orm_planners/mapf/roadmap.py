@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,12 @@ REPLACED = 0.35
 """Share of the step within which a start or goal takes the place of a node of the lattice."""
 MAX_NODES, MAX_COSTS = 200_000, 2**25
 """Most nodes, and most of them times robots; lattices are coarser where there would be more."""
+NARROW_SLACK = 0.03
+"""The same as ``WALL_SLACK`` in gaps that are too narrow for it."""
+PUSHES, DAMPING = 12, 0.8
+"""Number of times a position is pushed away from obstacles, and by how much less each time, to end in the middle."""
+FINEST_IN_SPACE = 2.2
+"""Most of the fineness in space: nodes near edges become as many as its sixth power."""
 PAD = 3
 """Steps beyond starts, goals and obstacles that nodes reach."""
 
@@ -43,7 +50,7 @@ class Roadmap(NamedTuple):
     goals: IntArray  #: ``(K,)`` int64 nodes
 
 
-def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
+def lay_roadmap(problem: Problem, fineness: float = 1.0, *, narrow: bool = False) -> Roadmap:
     """The roadmap of a team's world.
 
     Nodes of the lattice are so far apart that a robot at one leaves room on the diagonals around it.
@@ -51,21 +58,24 @@ def lay_roadmap(problem: Problem, fineness: float = 1.0) -> Roadmap:
     Args:
         problem: The team, its starts and goals, and the world.
         fineness: By how much nearer to each other nodes are than that, at most: in large worlds they are farther apart.
+        narrow: Whether robots' own shortest paths are part of it, however narrow the gaps that they lead through.
     """
     d, radius = problem.dimension, np.asarray(problem.team.radius, np.float64)
     spread = 2 * radius.max() + problem.margin + PAIR_SLACK * problem.team.largest_radius
     safety_distances = np.unique(radius + problem.margin)
     space = make_space(problem) if problem.world.num_obstacles else None
     ends = np.unique(in_space(np.concatenate([problem.start[:, :d], problem.goal]).astype(np.float64)), axis=0)
+    fineness = min(fineness, FINEST_IN_SPACE) if d == 3 else fineness
     asked, most = float(np.sqrt(2.0) * spread / fineness), min(MAX_NODES, MAX_COSTS // problem.num_robots)
     lattice = lay_lattice(problem, space, float(safety_distances[-1]) * (1 + WALL_SLACK), asked, most, pad=PAD * asked)
     positions, step = lattice.positions, lattice.step
     near_end = np.diff(find_near(sort_into_cells(ends, step), positions, positions, REPLACED * step)[0]) > 0
-    nodes = np.concatenate([positions[~near_end], ends])
+    nodes = np.concatenate([positions[~near_end], _along_paths(problem, lattice.step) if narrow else ends[:0], ends])
     far = step * (1.5 if d == 2 else 1.8)
     line_first, others = find_near(sort_into_cells(nodes, far), nodes, nodes, far, after=True)
     one, other = np.repeat(np.arange(len(nodes)), np.diff(line_first)), others.astype(np.int64)
-    room = _room(problem, space, safety_distances, nodes[one], nodes[other])
+    slack = NARROW_SLACK if narrow else WALL_SLACK
+    room = _room(space, safety_distances * (1 + slack * 2 / 3), safety_distances, nodes[one], nodes[other])
     one, other, room = one[room > 0], other[room > 0], room[room > 0]
     return _assembled(problem, nodes, one, other, room, spread + problem.goal_radius)
 
@@ -102,16 +112,36 @@ def _numbers(nodes: Floats, positions: FloatArray) -> IntArray:
     return np.array([int(np.flatnonzero((nodes == position).all(axis=1))[-1]) for position in wanted], np.int64)
 
 
-def _room(problem: Problem, space: Space | None, safety_distances: Floats, tails: Floats, heads: Floats) -> Floats:
-    """``(Q,)`` the largest of the ``safety_distances`` that passes on lines; zero where none does."""
+def _room(space: Space | None, wanted: Floats, safety_distances: Floats, tails: Floats, heads: Floats) -> Floats:
+    """``(Q,)`` the largest of the ``safety_distances`` that passes on lines; zero where none does.
+
+    Where there is room, a little more is ``wanted``, because nobody drives exactly on the line.
+    """
     room = np.zeros(len(tails))
-    for safety_distance in safety_distances:
+    for distance, safety_distance in zip(wanted, safety_distances, strict=True):
         free = np.ones(len(tails), bool)
         if space is not None:
-            # Where there is room, a little more is kept, because nobody drives exactly on the line.
-            free_lines(space, float(safety_distance) * (1 + WALL_SLACK * 2 / 3), tails, heads, free)
+            free_lines(space, float(distance), tails, heads, free)
         room[free] = safety_distance
     return room
+
+
+def _along_paths(problem: Problem, step: float) -> Floats:
+    """``(Q, 3)`` positions on the robots' own shortest paths, pushed to the middle of narrow gaps [m]."""
+    d, world, lines = problem.dimension, problem.world, []
+    for robot in range(problem.num_robots):
+        corners = problem.shortest_paths.path(robot)
+        for tail, head in pairwise(corners):
+            shares = np.linspace(0, 1, 2 + int(2 * np.linalg.norm(head - tail) / step))
+            lines.append(tail + shares[:, None] * (head - tail))
+    points = np.concatenate(lines)
+    wanted = float(np.asarray(problem.team.radius).max() + problem.margin) * (1 + WALL_SLACK)
+    for push in DAMPING ** np.arange(PUSHES):
+        near = (world.clearance(points + probe) - world.clearance(points - probe) for probe in np.eye(d) * step / 64)
+        gradient = np.stack(list(near), axis=1)
+        norm = np.maximum(np.sqrt((gradient**2).sum(axis=1, keepdims=True)), np.finfo(float).tiny)
+        points += push * np.clip(wanted - world.clearance(points), 0, step / 4)[:, None] * gradient / norm
+    return in_space(points)
 
 
 @cached_kernel(variant="gaps", **OPTIONS)

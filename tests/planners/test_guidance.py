@@ -375,6 +375,19 @@ def test_paths_one_by_one_displace_those_in_the_way() -> None:
     assert verify(problem, driven.until(problem.horizon)).ok
 
 
+@pytest.mark.parametrize("name", ["mapf", "hybrid"])
+def test_a_window_hardly_wider_than_robots_is_passed(name: str) -> None:
+    """Of 0.5 m, by 0.46 m: no lattice has a line through it that keeps as far off the frame as usual."""
+    frame = [[-3, -3, 3, -0.25], [-3, 0.25, 3, 3], [-3, -0.25, -0.25, 0.25], [0.25, -0.25, 3, 0.25]]
+    boxes = [[-0.1, y, z, 0.1, up, top] for y, z, up, top in frame]
+    team, world = Team(("holonomic3d",) * 2, radius=0.18), World(3, boxes=boxes, lower=[-3] * 3, upper=[3] * 3)
+    start, goal = [[-2, -0.4, -0.5, 0, 0, 0], [2, 0.6, 0.3, 0, 0, 0]], [[2, 0.4, -0.5], [-2, -0.5, 0.4]]
+    problem = Problem(team, start, goal, world=world, horizon=200)
+    plan = make_planner(name).solve(problem, seed=0, max_iterations=3)
+    assert plan.solved
+    assert verify(problem, plan.controls).ok
+
+
 def test_paths_are_the_same_on_any_number_of_threads() -> None:
     problem, driven = corridor_with_bay(right=1.0), []
     for threads in (1, 2):
