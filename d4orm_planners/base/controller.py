@@ -270,8 +270,10 @@ class Controller:
             moving = before.states if self._leads else measured
             controls = self._observer.executed(moving, self._joint.states, self._joint.controls)
         reference = self._lagged.follow(before.states, self._joint.states, controls)
-        error, lag = self._setpoint.position - measured[:, : self.problem.dimension], self._lagged.lag
-        follows = known & led & ((np.linalg.norm(error, axis=1) > self.problem.rounding) | (lag.constants > 0))
+        # A robot that is where it is to be may still turn or move.
+        error, lag, d = measured - reference.states, self._lagged.lag, self.problem.dimension
+        error[:, :d] = measured[:, :d] - self._setpoint.position
+        follows = known & led & ((np.abs(error).max(axis=1) > self.problem.rounding) | (lag.constants > 0))
         controls = reference.controls
         if follows.any():
             back = regulated(self._robots, measured, reference, self._observer.applied, lag)

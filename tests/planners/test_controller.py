@@ -508,6 +508,20 @@ def test_the_estimate_leaves_something_to_steer_with() -> None:
     np.testing.assert_allclose(observer.bias, [[MOST, 0]])
 
 
+def test_a_robot_that_arrives_turning_on_the_spot_comes_to_rest() -> None:
+    """It is where its reference is, which does not turn."""
+    problem = make_problem("circle", num_robots=4, model="unicycle2", goal_heading=0.5)
+    controller, states = Controller("go-to-goal", mode="measured"), problem.start
+    controller.begin(problem, states)
+    turned = 0.0
+    for step in range(200):
+        turned = max(turned, np.abs(states[controller.arrived, 4]).max(initial=0.0))
+        states = advanced(problem, states, controller.step(states, step * problem.dt).control)
+    assert controller.over
+    assert turned > 0.1, "else there was nothing to brake"
+    np.testing.assert_allclose(states[:, 3:], 0.0, atol=1e-3)
+
+
 def test_setpoints_have_the_shapes_that_are_promised() -> None:
     problem = team("differential_drive", 3)
     controller = Controller("go-to-goal")
