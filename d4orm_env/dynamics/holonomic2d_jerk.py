@@ -43,15 +43,16 @@ def _rest(x: Vector, zero: Number) -> Vector:
 
 
 def _approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
-    """As a robot's whose brakes act later, by the time that the acceleration takes from zero to its limit."""
-    later = TimeStep(h.full, h.half + limits[ACCELERATION] / limits[MAX_JERK], h.third, h.sixth)
+    """As a robot's whose brakes act later, by 2.5 times the time that the acceleration takes to rise: its speed follows
+    that of its brakes late, and overshoots the goal with less."""
+    delay = limits[ACCELERATION] / limits[MAX_JERK]
+    later = TimeStep(h.full, h.half + delay + delay + delay / 2, h.third, h.sixth)
     return planar_approach(x, goal, limits, later, ops)
 
 
 def _track(x: Vector, velocity: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
-    """Aim at the acceleration that closes the gap in twice the time that it takes to rise."""
-    delay = limits[ACCELERATION] / limits[MAX_JERK]
-    within = h.full + delay + delay
+    """Aim at the acceleration that closes the gap in the time that it takes to rise from zero to its limit."""
+    within = h.full + limits[ACCELERATION] / limits[MAX_JERK]
     wanted_x, wanted_y = (velocity[0] - x[2]) / within, (velocity[1] - x[3]) / within
     return ((wanted_x - x[4]) / (h.full + h.half), (wanted_y - x[5]) / (h.full + h.half))
 

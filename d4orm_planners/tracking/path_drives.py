@@ -247,7 +247,8 @@ def paces_along(problem: Problem, robot: int, arcs: Floats, bends: Floats, share
     corner = np.sqrt(share * limits[ACCELERATION] * bends)
     if model.heading_index is not None:
         corner = np.minimum(corner, share * limits[TURN_RATE] * bends)
-    braking = share * limits[ACCELERATION] if ACCELERATION in model.control_limits else LARGEST
+    limited = {*model.control_limits, *(column for _, column in model.state_limits)}
+    braking = share * limits[ACCELERATION] if ACCELERATION in limited else LARGEST
     paces = np.empty(len(arcs))
     fill_paces(arcs, problem.dt, corner, limits[SPEED], braking, paces)
     return paces

@@ -438,6 +438,7 @@ def test_boxes_without_goal_headings_find_paths_as_discs() -> None:
         ("rooms", 8, {"model": "unicycle"}), slow("rooms", 8, {"model": "velocity2d"}),
         slow("forest", 10, {"model": "differential_drive"}), ("forest", 10, {"model": "holonomic3d"}),
         slow("rooms", 4, {"model": "car"}), slow("warehouse", 6, {"model": "car"}),
+        ("maze", 4, {"model": "holonomic2d_jerk", "horizon": 600}),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("name", ["mapf", "hybrid"])
