@@ -43,10 +43,10 @@ def _rest(x: Vector, zero: Number) -> Vector:
 
 
 def _approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
-    """As a robot's whose brakes act later, by 2.5 times the time that the acceleration takes to rise: its speed follows
-    that of its brakes late, and overshoots the goal with less."""
+    """As a robot's whose brakes act later, by four times the time that the acceleration takes to rise: with less its
+    speed, which follows late, overshoots the goal."""
     delay = limits[ACCELERATION] / limits[MAX_JERK]
-    later = TimeStep(h.full, h.half + delay + delay + delay / 2, h.third, h.sixth)
+    later = TimeStep(h.full, h.half + delay + delay + delay + delay, h.third, h.sixth)
     return planar_approach(x, goal, limits, later, ops)
 
 
