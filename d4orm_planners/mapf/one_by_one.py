@@ -16,6 +16,8 @@ from d4orm_planners.mapf.roadmap_team import FAR, KEEP, TOUCH, Replanning, TeamR
 
 MINDED = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
 """Shares of the others that a robot without a path minds in turn, at random: the fewer it displaces, the better."""
+RELEASED = 0.5
+"""Odds that a robot for which nothing gets better sets out late, and so lets others into a bay before it."""
 HOPELESS = 10
 """Paths that robots do not find even alone after which patience is over."""
 
@@ -56,7 +58,7 @@ def settle(
     fewest, idle = len(waiting), 0
     while waiting and idle < patience and not should_stop():
         fewest, idle = min(fewest, len(waiting)), 0 if len(waiting) < fewest else idle + 1
-        robot = int(waiting.pop())
+        robot, team.leisure = int(waiting.pop()), int(replanning.alone.max() * idle / patience)
         displaced = team.displace(robot)
         if displaced is None:
             # Not even alone: it drove too near to a wall, and might not at another pace.
@@ -65,7 +67,7 @@ def settle(
         elif len(displaced):
             # The longer it gets no better, the more it may get worse for once.
             most = 1 + int(random.random() * (1 + idle / len(team.settled)))
-            waiting[:0] = team.find_others(robot, displaced, most, int(random.random() * idle))
+            waiting[:0] = team.find_others(robot, displaced, most)
     return None if waiting else driven
 
 
@@ -82,10 +84,11 @@ class _Settled:
         self.replanning, self.driven, self.random, self.should_stop = replanning, driven, random, should_stop
         self.occupancy, self.steps = Occupancy(replanning.cells, driven.positions), len(driven.controls)
         self.settled = np.ones(replanning.problem.num_robots, bool)
+        self.leisure = 0  #: steps that robots leave others to set out, at most
 
-    def replan(self, robot: int, minded: BoolArray | None = None) -> bool:
+    def replan(self, robot: int, minded: BoolArray | None = None, release: int = 0) -> bool:
         """See :meth:`Replanning.replan_one`."""
-        return self.replanning.replan_one(self.driven, self.occupancy, robot, self.steps, self.random, minded)
+        return self.replanning.replan_one(self.driven, self.occupancy, robot, self.steps, self.random, minded, release)
 
     def standing(self, robots: IntArray, steps: int) -> Floats:
         """``(T + 1, R, 3)`` positions of robots that stand at their starts for some steps, and are nowhere then [m]."""
@@ -96,9 +99,12 @@ class _Settled:
     def displace(self, robot: int) -> IntArray | None:
         """Plan a robot's path around as many as it can; those in whose way it is, ``None`` if it has no path at all."""
         replanning, settled = self.replanning, self.settled
+        release = 0
+        if self.leisure and self.random.random() < RELEASED:
+            release = int(self.random.random() * self.leisure)
         for hard in MINDED:
             minded = self.random.random(len(settled)) < hard
-            if self.replan(robot, minded):
+            if self.replan(robot, minded, release):
                 break
         else:
             return None
@@ -110,20 +116,19 @@ class _Settled:
         settled[robot] = True
         return displaced
 
-    def find_others(self, robot: int, displaced: IntArray, most: int, standing: int) -> list[int]:
+    def find_others(self, robot: int, displaced: IntArray, most: int) -> list[int]:
         """Plan other paths for those that a robot displaces, which it leaves time to set out if it can.
 
         Args:
             robot: The robot.
             displaced: ``(D,)`` numbers of the others.
             most: Those who may find no path, at most.
-            standing: Steps for which they stand at their starts, as the robot is to take it.
 
         Returns:
             Robots that have no path now: those that find none, or that robot where they are more than ``most``; then
             all others have the paths that they had.
         """
-        driven, lost = self.driven, list[int]()
+        driven, lost, standing = self.driven, list[int](), int(self.random.random() * self.leisure)
         controls, arrivals = driven.controls[:, displaced], driven.arrivals[displaced]
         positions = driven.positions[:, displaced]
         self.occupancy.put(displaced, self.standing(displaced, standing))

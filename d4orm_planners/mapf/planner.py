@@ -176,20 +176,21 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
         compile_path_finding(problem)
     random, patience = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), PATIENCE[0]
     patience += int(PATIENCE[1] * problem.num_robots)
-    narrow = False
-    for fineness in ONE_BY_ONE:
+    connected = False
+    for number, fineness in enumerate((*ONE_BY_ONE, ONE_BY_ONE[0])):
+        # The last one only where no lattice leads to all goals.
+        narrow = number == len(ONE_BY_ONE)
+        if search.should_stop() or (narrow and connected):
+            break
         replanning = Replanning(problem, lay_roadmap(problem, fineness, narrow=narrow))
-        if not narrow and not np.isfinite(replanning.alone).all():
-            if (reason := NoPaths.unless_reachable(search)) is not None:
-                return reason
-            replanning, narrow = Replanning(problem, lay_roadmap(problem, fineness, narrow=True)), True
         if np.isfinite(replanning.alone).all():
+            connected = True
             driven = plan_one_by_one(replanning, random, search.should_stop, patience)
             if driven is not None:
                 return RoadmapSolution(replanning, driven)
-        if search.should_stop():
-            return NoPaths(NOT_IN_TIME)
-    return None
+        elif number == 0 and (reason := NoPaths.unless_reachable(search)) is not None:
+            return reason
+    return NoPaths(NOT_IN_TIME) if search.should_stop() else None
 
 
 def find_all_at_once(search: SolveRun) -> RoadmapSolution | NoPaths:

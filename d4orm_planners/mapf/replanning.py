@@ -39,6 +39,7 @@ def _followed_back(tree: IntArray, entry: Whole) -> IntArray:
         count -= 1
         found[count, 0], found[count, 1], found[count, 2] = tree[walk, 0], tree[walk, 1], tree[walk, 2]
         walk = tree[walk, 3]
+    found[0, 2] = 0  # there it is from the first step, whenever it sets out
     return found
 
 
@@ -186,7 +187,7 @@ def _room_needed(roadmap: Roadmap, safe: Intervals, node: Whole) -> Whole:
 def _grow(roadmap: Roadmap, bodies: RobotArrays, search: _Search, k: Whole, trip: Trip, tree: _Tree) -> Whole:
     """Search until an entry is at the goal for good, which is returned; -1 if there is none, -2 if room is short."""
     goal, costs = bodies.goals[k], bodies.costs[k]
-    passing = Trip(trip.stride, trip.launch, trip.latest, np.int64(-1), trip.turn, trip.facing)
+    passing = Trip(trip.stride, trip.launch, trip.latest, np.int64(-1), trip.turn, trip.facing, trip.release)
     root, entries, heap, sizes = np.int64(0), tree.entries, tree.heap, tree.sizes
     while sizes[1] > 0:
         entry = heap[0]
@@ -252,7 +253,8 @@ def find_path(roadmap: Roadmap, bodies: RobotArrays, reservations: Reservations,
     zero = np.int64(0)  # a literal would compile what it is passed to once more
     interval = reservations.safe.first[start]
     search.came[interval] = 0
-    _add_entry(tree, start, zero, zero, zero - 1, interval, float(bodies.costs[k, start]) / trip.stride)
+    left = float(bodies.costs[k, start]) / trip.stride
+    _add_entry(tree, start, zero, trip.release, zero - 1, interval, trip.release + left)
     while True:
         entry = _grow(roadmap, bodies, search, k, trip, tree)
         if entry >= 0:

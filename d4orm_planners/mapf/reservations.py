@@ -32,6 +32,7 @@ class Trip(NamedTuple):
     dwell: Whole  #: Steps for which it stays at its goal; negative for ever
     turn: float = 0.0  #: Steps in which it turns by a radian on the spot; zero where turns do not count
     facing: tuple[float, float] = (1.0, 0.0)  #: Unit vector along its heading at the start
+    release: Whole = 0  #: Step before which it does not set out
 
 
 TURNED_IN_DRIVING = float(np.sqrt(2.0 - 2.0 * float(FACING)))

@@ -151,14 +151,18 @@ class Replanning:
         latest: int,
         random: np.random.Generator,
         minded: BoolArray | None = None,
+        release: int = 0,
     ) -> bool:
-        """Plan a robot's path around those that it minds in ``driven``, which is changed; return whether it has one."""
+        """Plan a robot's path around those that it minds in ``driven``, which is changed; return whether it has one.
+
+        It does not set out before step ``release``.
+        """
         haste, others = 1 - random.random() * LEISURE, occupancy.around(self.separation(robot, KEEP))
         if minded is not None:
             others = others._replace(need=np.where(minded, others.need, 0.0))
         reservations = make_reservations(self.roadmap, self.bodies, others, robot, latest, self.dwell is None)
         close, usual = None, min(TOUCH * self.size, float(self.own_room[robot] - self.bodies.safety_distance[robot]))
-        for path, cut in self.paths(reservations, robot, latest, haste):
+        for path, cut in self.paths(reservations, robot, latest, haste, release):
             if not len(path):  # and hardly one for a slower robot
                 break
             for drive in self.drives(robot, path, cut, others.positions.shape[1] - 1):
@@ -180,31 +184,34 @@ class Replanning:
         occupancy.put(robot, positions)
 
     def paths(
-        self, reservations: Reservations, robot: int, latest: int, haste: float
+        self, reservations: Reservations, robot: int, latest: int, haste: float, release: int = 0
     ) -> Iterator[tuple[IntArray, float]]:
         """A robot's path in each of the :data:`SPEED_PROFILES`, and by how much it cuts corners."""
         # Two are looked for side by side, because the second one is often needed.
         found: dict[int, IntArray] = {}
+        dwell, (turn, facing) = -1 if self.dwell is None else self.dwell, self.turns[robot]
 
         def look(part: IntArray) -> None:
             for each in range(number + part[0], number + part[1]):
                 share, _, counts_turns = SPEED_PROFILES[each]
-                found[each] = self.path(reservations, robot, latest, share * haste, counts_turns)
+                stride, turns = share * haste * self.strides[robot], turn * counts_turns
+                trip = Trip(stride, self.launch[robot], latest, dwell, turns, facing, release)
+                found[each] = self.path(reservations, robot, trip)
 
         for number, (_, cut, _) in enumerate(SPEED_PROFILES):
             if number not in found:
                 self.threads.over(self.threads.num_threads, look)
             yield found[number], cut
 
-    def path(self, reservations: Reservations, robot: int, latest: int, cruise: float, counts_turns: bool) -> IntArray:
-        """``(n, 3)`` int64 nodes of a robot's path at a share of its speed, and when it sets out for and comes to each;
-        none where there is no path.
+    def path(self, reservations: Reservations, robot: int, trip: Trip) -> IntArray:
+        """``(n, 3)`` int64 nodes of a robot's path, and when it sets out for and comes to each; none where there is
+        none.
         """
         roadmap, bodies = self.roadmap, self.bodies
-        dwell, (turn, facing) = -1 if self.dwell is None else self.dwell, self.turns[robot]
         # Looked for among the sooner ones at first, because that is where it mostly is.
-        for bound in sorted({min(int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA, latest), latest}):
-            trip = Trip(cruise * self.strides[robot], self.launch[robot], bound, dwell, turn * counts_turns, facing)
+        soon = int(BOUND_FACTOR * self.alone[robot]) + BOUND_EXTRA + trip.release
+        for latest in sorted({min(soon, trip.latest), trip.latest}):
+            trip = trip._replace(latest=int(latest))
             path = find_path(roadmap, bodies, reservations, robot, trip)
             if len(path):
                 safety_distance = bodies.safety_distance[robot] * (1 + WALL_SLACK * 2 / 3)

@@ -343,6 +343,20 @@ def test_a_crowd_of_boxes_is_planned_one_by_one(model: str) -> None:
     assert plan_one_by_one(replanning, np.random.default_rng(1), lambda: False, 200) is not None
 
 
+@pytest.mark.parametrize("model", ["holonomic2d", "velocity2d", "differential_drive"])
+def test_two_robots_change_places_by_a_bay_that_one_must_reach_first(model: str) -> None:
+    """The other sets out late: on time it is at the bay as soon."""
+    corridor = World(boxes=[[-4, 0.5, -0.6, 2], [0.6, 0.5, 4, 2], [-4, -2, 4, -0.5]], lower=[-4, -2], upper=[4, 1.6])
+    team, goal = Team((model,) * 2, radius=0.28), [[2.5, 0], [-2.5, 0]]
+    start = np.zeros((2, team.state_size))
+    start[:, 0] = -2.5, 2.5
+    problem = Problem(team, start, goal, world=corridor, horizon=400)
+    for seed in range(3):
+        plan = make_planner("mapf").solve(problem, seed=seed, max_iterations=2)
+        assert plan.solved
+        assert verify(problem, plan.controls).ok
+
+
 def test_robots_that_pass_each_others_starts_leave_each_other_time_to_set_out() -> None:
     """Two in one aisle, each of which must turn before it is out of the other's way."""
     problem = make_problem("warehouse", num_robots=15, seed=2, model="differential_drive").select([0, 14])
