@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
-from itertools import chain
+from itertools import chain, product
 from types import FunctionType
 from typing import Any
 
@@ -22,7 +23,7 @@ from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.holonomic2d_jerk import HOLONOMIC2D_JERK
 from d4orm_env.dynamics.holonomic3d import HOLONOMIC3D
 from d4orm_env.dynamics.holonomic3d_drag import HOLONOMIC3D_DRAG
-from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, Limit, Model, RungeKutta
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, PYTHON_OPS, SPEED, Limit, Model, RungeKutta
 from d4orm_env.dynamics.source_digest import bytecode, check_formulas, pieces, source_text, with_strict_integers
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.dynamics.unicycle import UNICYCLE
@@ -45,6 +46,11 @@ COMMON = tuple(model.name for model in _BUILT_IN[:4])
 """Models that share compiled kernels, whatever mixture of them a team is. Teams with others have kernels of their own,
 so that compiling never takes longer because of a model that is not used.
 """
+
+FAR = 4.0
+"""Times its limit that a component is at, to see whether a model brings it within."""
+ROUNDING = 1 - 1e-6
+"""Factor that takes back what scaling by a norm rounds up."""
 
 
 def get_model(name: str) -> Model:
@@ -94,7 +100,8 @@ def register_model(model: Model) -> None:
 
     Raises:
         ValueError: If the name is taken or none, a size or an index does not fit, or a function fails on Python's
-            numbers, returns a wrong number of them or names a constant that is a float.
+            numbers, returns a wrong number of them, names a constant that is a float, leaves controls or speeds beyond
+            their limits, or moves a robot at rest.
     """
     if not isinstance(model, Model):
         raise ValueError(f"register_model takes a Model, not {short_repr(model)}; see docs/own_robot.md")
@@ -111,6 +118,8 @@ def _admit(name: str, model: object) -> Model:
         raise ValueError(f"model {name!r} calls itself {model.name!r}; offer it under that name")
     _check_attributes(model)
     _check_functions(model)
+    _check_limits(model)
+    _check_rest(model)
     MODEL_CODES.setdefault(name, len(MODEL_CODES))
     return model
 
@@ -166,15 +175,7 @@ def _check_functions(model: Model) -> None:
     }
     for name, (size, arguments) in calls.items():
         function = getattr(functions, name)
-        try:
-            result = function(*arguments)
-            numbers = np.array([float(value) for value in result])
-        except Exception as error:
-            raise ValueError(f"model {model.name!r}: {name} fails on Python's numbers: {error!r}") from error
-        if not isinstance(result, tuple) or len(result) != size or not np.isfinite(numbers).all():
-            raise ValueError(
-                f"model {model.name!r}: {name} returns {result!r}; expected a tuple of {size} finite numbers"
-            )
+        _result(model, name, size, *arguments)
         floats = [value for value in _pieces(function, bytecode) if isinstance(value, float)]
         if floats:
             raise ValueError(
@@ -186,6 +187,66 @@ def _check_functions(model: Model) -> None:
             own = own.limit_state
         if isinstance(own, FunctionType) and not own.__module__.startswith("d4orm_env."):
             _check_compilable(f"model {model.name!r}: {name}", own, arguments)
+
+
+def _result(model: Model, name: str, size: int, *arguments: Any) -> tuple[float, ...]:
+    """Call a function of the model, which must return as many finite numbers."""
+    try:
+        result = getattr(model.functions, name)(*arguments)
+        numbers = tuple(float(value) for value in result)
+    except Exception as error:
+        raise ValueError(f"model {model.name!r}: {name} fails on Python's numbers: {error!r}") from error
+    if not isinstance(result, tuple) or len(result) != size or not np.isfinite(numbers).all():
+        raise ValueError(f"model {model.name!r}: {name} returns {result!r}; expected a tuple of {size} finite numbers")
+    return numbers
+
+
+def _check_limits(model: Model) -> None:
+    """Check that controls and states far beyond the limits are brought within them: the judge takes the model's word.
+
+    Controls component by component, for those that share a limit may as well keep to a square of it as to a disc.
+    """
+    bounds = dict(model.state_limits) | dict.fromkeys(model.speed_indices, SPEED)
+    states = [bounds.get(index) for index in range(model.state_size)]
+    speeds = list(model.limited_components.items())
+    controls = [(column, [part]) for part, column in enumerate(model.control_limits)]
+    # Ascending and descending, so that a function that takes another column than it declares goes too far in one.
+    for standard in ((1.0, 2.0, 3.0), (3.0, 2.0, 1.0)):
+        limits = (*standard, *(limit.default for limit in model.own_limits))
+        _check_bounds(model, "limit_control", model.control_limits, controls, limits)
+        _check_bounds(model, "limit_state", states, speeds, limits)
+
+
+def _check_bounds(
+    model: Model,
+    name: str,
+    columns: Sequence[int | None],
+    bounded: Iterable[tuple[int, list[int]]],
+    limits: tuple[float, ...],
+) -> None:
+    lowest = model.lower_bounds([*limits])
+    ends = [(0.5,) if column is None else (-FAR * lowest[column], FAR * limits[column]) for column in columns]
+    for beyond, (column, parts) in product(product(*ends), bounded):
+        result = _result(model, name, len(columns), beyond, limits, PYTHON_OPS)
+        reached = result[parts[0]] if len(parts) == 1 else math.hypot(*(result[part] for part in parts))
+        if not -lowest[column] <= reached * ROUNDING <= limits[column]:
+            raise ValueError(
+                f"model {model.name!r}: {name} makes {result} of {beyond}, where {model.limit_names[column]}, "
+                f"{limits[column]:g}, bounds component {' and '.join(map(str, parts))}; bring them within, with clip "
+                "or norm_scale"
+            )
+
+
+def _check_rest(model: Model) -> None:
+    """Check that a robot that docks stays where it is, and stands."""
+    x = tuple(0.25 + 0.125 * index for index in range(model.state_size))
+    result = _result(model, "rest", len(x), x, 0.0)
+    kept = [*range(model.dimension), *model.angles[: model.heading_index is not None]]
+    if any(result[part] != x[part] for part in kept) or any(result[part] for part in model.speed_indices):
+        raise ValueError(
+            f"model {model.name!r}: rest makes {result} of {x}; it must keep the position and the heading, and make "
+            "speeds zero"
+        )
 
 
 def _check_compilable(owner: str, function: FunctionType, arguments: tuple[Any, ...]) -> None:

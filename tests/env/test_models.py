@@ -18,6 +18,7 @@ from registry_support import forgetting
 from d4orm_env import Problem, Team, load_problem, make_problem, register_model, rollout, save_problem, verify
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.dynamics import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
+from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model, model_digest
 from d4orm_env.dynamics.transition import TimeStep, advance
 from d4orm_env.engine.choice import get_engine
@@ -89,6 +90,19 @@ def with_function(**functions: Any) -> Model:
     return replace(BOAT, functions=FUNCTIONS._replace(**functions))
 
 
+def unbounded(u: Any, limits: Any, ops: Any) -> Any:
+    return u
+
+
+def boxed(x: Any, limits: Any, ops: Any) -> Any:
+    return (x[0], x[1], clip(x[2], limits[SPEED], ops), clip(x[3], limits[SPEED], ops))
+
+
+def with_inertia(**functions: Any) -> Model:
+    model = get_model("unicycle2")
+    return replace(model, name="boat", functions=model.functions._replace(**functions))
+
+
 @pytest.mark.parametrize(
     ("model", "message"),
     [
@@ -114,6 +128,19 @@ def with_function(**functions: Any) -> Model:
         (with_function(rest=lambda x, zero, one=1: (one * x[0], x[1])), "rest computes with a whole number"),
         (replace(BOAT, own_limits=Limit("drag", 0.3)), r"own_limits is Limit\(.*; give a tuple of Limit"),
         ("boat", "register_model takes a Model, not 'boat'"),
+        (with_function(limit_control=unbounded), "limit_control makes .*, where max_speed, 1, bounds component 0"),
+        (with_inertia(limit_control=unbounded), "where max_acceleration, 2, bounds component 0; bring them within"),
+        (with_inertia(limit_state=unbounded), "limit_state makes .*, where max_speed, 1, bounds component 3"),
+        (
+            with_inertia(limit_state=lambda x, limits, ops: (*x[:3], clip(x[3], limits[SPEED], ops), x[4])),
+            r"limit_state makes \(0.5, 0.5, 0.5, -1.0, .*where max_speed",
+        ),
+        (
+            replace(HOLONOMIC2D, name="boat", functions=HOLONOMIC2D.functions._replace(limit_state=boxed)),
+            "where max_speed, 1, bounds component 2 and 3",
+        ),
+        (with_function(rest=lambda x, zero: (zero, zero)), "rest makes .* it must keep the position"),
+        (with_inertia(rest=lambda x, zero: x), "rest makes .* and make speeds zero"),
     ],
 )
 def test_a_model_that_does_not_fit_is_refused(model: Any, message: str) -> None:
@@ -121,6 +148,12 @@ def test_a_model_that_does_not_fit_is_refused(model: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         register_model(model)
     assert before == MODELS
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_may_be_another_of_the_users(name: str) -> None:
+    with forgetting(MODELS):
+        register_model(replace(get_model(name), name="mine"))
 
 
 def test_a_model_may_be_registered_twice_but_not_two(boat: Model) -> None:
