@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 from d4orm_env.core.arrays import FloatArray, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_planners.base.measured_states import acting_robots
-from d4orm_planners.base.planner_registry import PolicyLike, called, copy_policy, make_policy, policy_settings
+from d4orm_planners.base.planner_registry import PolicyLike, called, make_policy, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy
+from d4orm_planners.base.policy_copies import copy_policy
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias, TypeVar
@@ -129,12 +128,6 @@ def find_policy(policy: object) -> object:
             f"policy {short_repr(policy)} is a model; give from_sb3(model), from d4orm_planners.base.adapters"
         )
     raise unknown("policy", policy, list_policies(), "give a Policy, a function, or package.module:Name of one")
-
-
-def copy_policy(policy: Policy) -> Policy:
-    """A policy like this one, whose episodes do not change it."""
-    # Those of this package begin anew at every reset.
-    return copy.copy(policy) if type(policy).__module__.startswith("d4orm_planners.") else copy.deepcopy(policy)
 
 
 def is_brought(policy: object) -> bool:

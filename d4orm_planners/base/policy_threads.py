@@ -107,6 +107,9 @@ class Background(Generic[Result]):
         self._pool: ThreadPoolExecutor | None = None
         self._job: Future[Result] | None = None
 
+    def __reduce__(self) -> tuple[type[Background[Result]], tuple[bool]]:
+        return type(self), (self._initializer is not None,)
+
     def start(self, work: Callable[[], Result]) -> Future[Result]:
         """Begin a job."""
         if self._pool is None:

@@ -77,7 +77,7 @@ class Orca(StatePolicy):
 
     def __init__(self, config: OrcaConfig | None = None) -> None:
         self.config = config or OrcaConfig()
-        self._rvo = load(pyrvo)
+        load(pyrvo)
 
     def _begin(self, env: ParallelEnv, seed: int) -> None:
         problem = self.problem
@@ -115,7 +115,7 @@ class Orca(StatePolicy):
         """
         problem, config = self.problem, self.config
         # Made anew at every step, so that an action depends on the present state alone.
-        simulator = self._rvo.RVOSimulator()
+        simulator = pyrvo.RVOSimulator()
         simulator.set_time_step(problem.dt)
         clearance = problem.margin if config.clearance is None else config.clearance
         # The library has absolute constants, which are meant for robots of about the default size.

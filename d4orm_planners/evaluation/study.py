@@ -23,7 +23,8 @@ from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
 from d4orm_planners.base.episode import check_physics
-from d4orm_planners.base.planner_registry import PolicyLike, is_brought, list_policies, make_policy, origin
+from d4orm_planners.base.planner_registry import PolicyLike, is_brought, list_policies, origin
+from d4orm_planners.base.policy_copies import fresh_policy
 from d4orm_planners.evaluation.trials import Condition, Configuration, Job
 
 T = TypeVar("T")
@@ -111,7 +112,7 @@ class Study:
         choice = Configuration(label, own, settings, origin(policy), self.observation)
         if self.time_limit is not None and choice.planned:
             settings.setdefault("time_limit", duration(self.time_limit, "time_limit"))
-        make_policy(policy, **settings)
+        fresh_policy(policy, **settings)
         if not named and label in list_policies():
             raise ValueError(f"policies[{label!r}] has the name of another policy; give it another label")
         return choice

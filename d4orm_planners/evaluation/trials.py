@@ -24,8 +24,9 @@ from d4orm_env.disturbances.disturbance import AnyDisturbance
 from d4orm_env.disturbances.disturbance_registry import attributes_of, name_of
 from d4orm_planners.base.episode import Episode, open_env, run_episode
 from d4orm_planners.base.plan import IterationRecord, Plan
-from d4orm_planners.base.planner_registry import copy_policy, is_planned, make_policy, policy_settings
+from d4orm_planners.base.planner_registry import is_planned, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy
+from d4orm_planners.base.policy_copies import fresh_policy
 from d4orm_planners.base.provenance import commit, describe_machine, versions
 from d4orm_planners.evaluation.store import Trial, TrialKey
 
@@ -168,7 +169,7 @@ class Job:
             error, outcome = "", {}
             try:
                 if timed is None or timed.plan is None:
-                    timed = _TimedPolicy(make_policy(self.policy.source, **self.policy.settings))
+                    timed = _TimedPolicy(fresh_policy(self.policy.source, **self.policy.settings))
                 outcome = _outcome(timed, self, condition)
             except (Exception, SystemExit, GeneratorExit) as problem:
                 error = describe(problem) + _place(problem)
@@ -242,7 +243,7 @@ class _TimedPolicy(Policy):
     """A policy with a stopwatch. It keeps the plan of an open-loop policy from one episode to the next."""
 
     def __init__(self, policy: Policy) -> None:
-        self.actor = copy_policy(policy)
+        self.actor = policy
         self.wall_time = 0.0
         self.preparation = 0.0
         self.plan: Plan | None = None

@@ -220,8 +220,8 @@ class Trouble(GoToGoal):
             time.sleep(1000)
 
 
-make_policy = trials.make_policy
-trials.make_policy = lambda name, **settings: Trouble() if "GoToGoal" in name else make_policy(name, **settings)
+fresh_policy = trials.fresh_policy
+trials.fresh_policy = lambda name, **settings: Trouble() if "GoToGoal" in name else fresh_policy(name, **settings)
 """
 EVALUATE = """
 from d4orm_planners import evaluate

@@ -355,7 +355,7 @@ class Unlucky(GoToGoal):
 
 
 def test_an_error_is_a_row_and_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trials_module, "make_policy", lambda name, **settings: Unlucky())
+    monkeypatch.setattr(trials_module, "fresh_policy", lambda name, **settings: Unlucky())
     rates = rates_of(["go-to-goal"], tmp_path, **TINY)
     assert [(row.trials, row.errors) for row in rates] == [(2, 1)] * 2
     assert all(row.error.startswith("RuntimeError: out of luck (test_robustness.py, line ") for row in rates)

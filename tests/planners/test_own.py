@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,7 @@ from d4orm_planners.base.planner_registry import describe_policy
 from d4orm_planners.base.settings import CheckedSettings, Positive
 from d4orm_planners.cli import app as cli
 from d4orm_planners.evaluation.store import STORE, TrialStore
+from d4orm_planners.rl.dataset import Demonstrations
 
 ROOT = Path(__file__).resolve().parents[2]
 PROBLEM = line_problem([9.0, 9.0, 9.0], horizon=20)
@@ -395,6 +397,28 @@ def test_trials_leave_a_given_policy_as_it_was(tmp_path: Path) -> None:
     assert first["planner"] == "Ahead"
     assert first["max_iterations"] == 1
     assert "source" in first
+
+
+class Locked(Push):
+    """It holds what cannot be copied, a lock, and a policy that can."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lock, self.helper = threading.Lock(), make_policy("orca")
+
+    def identity(self) -> dict[str, object]:
+        return {}
+
+
+def test_what_cannot_be_copied_is_given_as_a_class(tmp_path: Path) -> None:
+    remedy = r"policy 'Locked' cannot be copied .*lock.*give its class, or a function that makes it"
+    with pytest.raises(ValueError, match=remedy):
+        compare({"locked": Locked()}, tmp_path)
+    with pytest.raises(ValueError, match=remedy):
+        Demonstrations(policy=Locked(), environment={"scenario": "circle", "num_robots": 2}, seeds=range(1))
+    assert rows_of(tmp_path) == []
+    (row,) = compare({"locked": Locked}, tmp_path)
+    assert row.errors == 0
 
 
 def test_the_command_line_takes_import_paths(

@@ -128,3 +128,19 @@ def test_copies_are_driven_by_themselves(kind: type[Policy], duplicate: Callable
     elsewhere(lambda: twin.reset(other))
     assert set(policy.act(seen, env.state())) == set(seen)
     assert policy.identity() == twin.identity() == {}
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, pickled])
+@pytest.mark.parametrize("used", [False, True])
+@pytest.mark.parametrize("name", list_policies())
+def test_every_policy_is_copied_whole(name: str, used: bool, duplicate: Callable[[Policy], Policy]) -> None:
+    policy = cheap_policy(name)
+    (env, seen), (other, _) = episode(), episode()
+    if used:
+        policy.reset(env, seed=1)
+        policy.act(seen, env.state())
+    twin = duplicate(policy)
+    policy.reset(env, seed=2)
+    twin.reset(other, seed=2)
+    actions, again = policy.act(seen, env.state()), twin.act(seen, other.state())
+    np.testing.assert_array_equal(list(actions.values()), list(again.values()))

@@ -23,8 +23,9 @@ from d4orm_env.core.registry import source_digest
 from d4orm_env.disturbances.disturbance import Disturbance
 from d4orm_env.envs.team_step import TeamStep
 from d4orm_planners.base.episode import run_episode
-from d4orm_planners.base.planner_registry import PolicyLike, copy_policy, make_policy, origin, policy_settings
+from d4orm_planners.base.planner_registry import PolicyLike, origin, policy_settings
 from d4orm_planners.base.policy import Actions, Observations, Policy, robot_indices
+from d4orm_planners.base.policy_copies import fresh_policy
 from d4orm_planners.evaluation.trials import Condition
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ class Demonstrations:
             raise ValueError("render_mode is for looking on; a dataset records without, so leave it out")
         if self.only_success and self.environment.get("lifelong"):
             raise ValueError("only_success and lifelong do not go together: a lifelong episode never ends in success")
-        make_policy(self._source, **self.settings)
+        fresh_policy(self._source, **self.settings)
         self.make_env().close()
 
     def make_env(self) -> ParallelEnv:
@@ -95,7 +96,7 @@ class Demonstrations:
     def record(self, seed: int) -> RecordedEpisode:
         """The episode of a seed."""
         with closing(self.make_env()) as env:
-            return record_episode(env, make_policy(self._source, **self.settings), seed)
+            return record_episode(env, fresh_policy(self._source, **self.settings), seed)
 
     @property
     def policy_name(self) -> str:
@@ -250,7 +251,7 @@ class _Recorder(Policy):
     """A policy that notes what the team saw and did."""
 
     def __init__(self, policy: Policy) -> None:
-        self._policy = copy_policy(policy)
+        self._policy = policy
         self.steps: list[TeamStep] = []
         self.states: list[FloatArray] = []
         self._actions: list[Actions] = []
