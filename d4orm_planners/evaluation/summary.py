@@ -101,7 +101,8 @@ class SuccessRate(Compared):
     Intervals are of 95% confidence.
 
     Attributes:
-        verified: Trials with whose executed controls :func:`d4orm_env.verify` found no fault.
+        verified: Trials with whose executed controls :func:`d4orm_env.verify` found no fault; ``None`` where none
+            could be judged.
         contacts: Those in which robots touched something.
         late: Those in which a robot did not arrive in time.
         travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
@@ -119,7 +120,7 @@ class SuccessRate(Compared):
         compute_upper: Upper end.
     """
 
-    verified: int
+    verified: int | None
     contacts: int
     late: int
     travel_time: float | None
@@ -203,10 +204,11 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
     shares = [trial.denoising_share for trial in trials if trial.denoising_share is not None]
     timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
     compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
+    judged = [trial.verified for trial in trials if trial.verified is not None]
     choosing = [trial.decision_time for trial in trials if trial.decision_time is not None]
     return SuccessRate(
         **vars(Compared.of(trials, len(successes), trials[0].label if label is None else label)),
-        verified=sum(trial.verified is True for trial in trials),
+        verified=sum(judged) if judged else None,
         contacts=sum(trial.collided > 0 for trial in trials),
         late=sum(not trial.error and trial.arrived < trial.num_robots for trial in trials),
         travel_time=travel[0],

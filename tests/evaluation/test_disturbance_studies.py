@@ -102,6 +102,7 @@ def test_every_trial_is_stored_with_its_disturbance_and_run_once(tmp_path: Path)
     ]  # fmt: skip
     # Both at level zero are the undisturbed trials, which run once.
     assert counts[-1] == (6, 6)
+    assert [row.verified for row in rows] == [0, 0, 0, None]
     stored = TrialStore.existing(tmp_path).trials()
     assert sorted({row.disturbances for row in stored}) == [
         '[["delay", {"steps": 1}]]', '[["push", {"rate": 0.2, "speed": 0.4}]]', "[]"

@@ -93,6 +93,7 @@ def test_success_rate_sums_up() -> None:
 
 def test_only_what_was_judged_counts_as_verified() -> None:
     assert success_rate([trial(0, verified=True), trial(1, verified=False), trial(2, verified=None)]).verified == 1
+    assert success_rate([trial(0, verified=None)]).verified is None
 
 
 def test_a_trial_that_was_over_at_once_has_no_time_of_motion() -> None:
@@ -474,7 +475,7 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "",
         f"| {' | '.join(HEADER)} |",
         f"|{'---|' * len(HEADER)}",
-        "| go-to-goal | 0.1 | 1 of 2 (50%) | 9% to 91% | 0 | 1 | 0 | 0 | 5.00 | - | - | - | 0.38 | - | - "
+        "| go-to-goal | 0.1 | 1 of 2 (50%) | 9% to 91% | - | 1 | 0 | 0 | 5.00 | - | - | - | 0.38 | - | - "
         "| 0.062 (-0.202 to 0.327) |",
     ]
     paths = write_robustness(tmp_path, rates)
