@@ -168,7 +168,7 @@ class Disturbance(Generic[M]):
         return ()  # type: ignore[return-value] # of a disturbance that remembers nothing
 
     def limits(self, limits: FloatArray) -> FloatArray:
-        """Return the true limits ``(K, L)`` of the robots, see :attr:`d4orm_env.core.team.Team.limits`."""
+        """Return the true limits ``(K, L)`` of the robots, positive, see :attr:`d4orm_env.core.team.Team.limits`."""
         return limits
 
     def command(self, controls: FloatArray, memory: M, scene: Scene, draws: Draws) -> FloatArray:

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, as_float32, read_only, short_repr
+from d4orm_env.core.arrays import SMALLEST, BoolArray, FloatArray, as_float32, read_only, short_repr
 from d4orm_env.core.observation_layout import ObservationLayout
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import check_call
@@ -116,7 +116,10 @@ class DisturbedWorlds:
     def true_limits(self, limits: FloatArray) -> FloatArray:
         """``(K, L)`` what limits truly are, read-only."""
         for one in self._all:
-            limits = one.disturbance.limits(limits)
+            changed = _checked(one.disturbance.limits(limits), limits.shape, one, "limits")
+            if one.foreign and (changed < SMALLEST).any():
+                raise one.wrong("limits", changed[changed < SMALLEST], f"numbers of at least {SMALLEST:g}")
+            limits = changed
         return read_only(np.array(limits, np.float32))
 
     def scene(
@@ -238,7 +241,10 @@ def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
 
 def _checked(values: ArrayLike, shape: tuple[int, ...], one: _ActiveDisturbance, method: str) -> FloatArray:
     """Return a disturbance's result as float32, its shape and numbers checked."""
-    array = values if isinstance(values, np.ndarray) and values.dtype == _FLOAT32 else as_float32(values)
+    try:
+        array = values if isinstance(values, np.ndarray) and values.dtype == _FLOAT32 else as_float32(values)
+    except ValueError:
+        raise one.wrong(method, values, f"numbers of shape {shape}") from None
     if array.shape != shape:
         name = type(one.disturbance).__name__
         raise ValueError(f"disturbance {name}: {method} returned shape {array.shape}; expected {shape}")

@@ -674,6 +674,11 @@ def test_what_an_environment_cannot_have_is_refused(disturbances: Any, complaint
         ({"move": lambda self, states, controls, *rest: states}, "move returned array.*; expected 2 arrays"),
         ({"see": lambda self, seen, memory, scene, draws: None}, "see returned None; expected 3 arrays"),
         ({"begin": lambda self, scene, draws: np.zeros(1)}, r"begin returned array\(\[0.\]\); expected a NamedTuple"),
+        ({"command": lambda self, controls, *rest: "fast"}, "command returned 'fast'; expected numbers of shape"),
+        ({"limits": lambda self, limits: None}, r"limits returned shape \(\); expected \(3, 3\)"),
+        ({"limits": lambda self, limits: limits[0]}, r"limits returned shape \(3,\); expected \(3, 3\)"),
+        ({"limits": lambda self, limits: limits * np.nan}, r"limits returned array\(\[nan.*; expected finite numbers"),
+        ({"limits": lambda self, limits: limits * [[1, 1, 0]]}, r"limits returned array\(\[0.*; expected numbers of at"),
         ({"command": lambda self, controls, memory: controls}, "command takes .* is called with .*scene, draws"),
     ],
 )  # fmt: skip
