@@ -125,6 +125,12 @@ class Stall(Disturbance[Stops]):
     def replayable(self) -> bool:
         return True  # it changes controls only
 
+    def check(self, problem: Problem) -> None:
+        if (self.robots or 0) > problem.num_robots:
+            raise ValueError(
+                f"Stall robots is {self.robots}; the team has {problem.num_robots}, so give at most that, or None"
+            )
+
     def begin(self, scene: Scene, draws: Draws) -> Stops:
         num_robots = scene.problem.num_robots
         happens = draws.uniform(num_robots) < self.probability

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, whole_number
 from d4orm_env.envs import ENV_ID, register_environments
 from d4orm_env.envs.base_env import RENDER_MODES, BaseEnv
 from d4orm_env.envs.inputs import check_options, joint_controls
@@ -51,10 +51,10 @@ class JointNavigationEnv(BaseEnv, gymnasium.Env[FloatArray, FloatArray]):
             Observation ``(K * D,)`` and infos.
 
         Raises:
-            ValueError: For any option.
+            ValueError: For any option, or if the seed is no whole number of zero or more.
         """
         check_options(options)
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else whole_number(seed, "seed", 0))
         step = self._simulation.reset(self.np_random)
         self._show()
         return step.observations.ravel(), self._infos(step)

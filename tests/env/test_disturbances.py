@@ -652,6 +652,7 @@ def test_levels_without_sense_are_refused(make: Any, complaint: str) -> None:
         ([StateNoise(0.1, velocity_std=0.1)], "no state of velocity2d holds a velocity"),
         ([StateNoise(0.1, heading_std=0.1)], "no state of velocity2d holds a heading"),
         ([Bias((0.1, 0.1, 0.1))], r"Bias std has shape \(3,\); give one number, or 2"),
+        ([Stall(1.0, robots=2)], "Stall robots is 2; the team has 1, so give at most that"),
         ("delay", "disturbances is 'delay'; give a list"),
         ([2], "disturbances holds 2, which is none"),
         ([Delay], "disturbances holds <class"),
@@ -677,8 +678,8 @@ def test_what_an_environment_cannot_have_is_refused(disturbances: Any, complaint
         ({"command": lambda self, controls, *rest: "fast"}, "command returned 'fast'; expected numbers of shape"),
         ({"limits": lambda self, limits: None}, r"limits returned shape \(\); expected \(3, 3\)"),
         ({"limits": lambda self, limits: limits[0]}, r"limits returned shape \(3,\); expected \(3, 3\)"),
-        ({"limits": lambda self, limits: limits * np.nan}, r"limits returned array\(\[nan.*; expected finite numbers"),
-        ({"limits": lambda self, limits: limits * [[1, 1, 0]]}, r"limits returned array\(\[0.*; expected numbers of at"),
+        ({"limits": lambda self, limits: limits * np.nan}, r"limits returned array\(\[nan.*; expected finite"),
+        ({"limits": lambda self, limits: limits * [[1, 1, 0]]}, r"limits returned array\(\[0.*; expected numbers of"),
         ({"command": lambda self, controls, memory: controls}, "command takes .* is called with .*scene, draws"),
     ],
 )  # fmt: skip

@@ -136,6 +136,14 @@ def test_calls_before_reset_are_refused() -> None:
         JointNavigationEnv(num_robots=2).step(np.zeros(4, np.float32))
 
 
+def test_a_seed_is_a_whole_number_of_any_kind() -> None:
+    env = JointNavigationEnv("random", 2)
+    np.testing.assert_array_equal(env.reset(seed=np.int64(3))[0], env.reset(seed=3)[0])
+    for seed, message in ((-1, "seed is -1; it must be at least 0"), (1.5, "seed must be a whole number")):
+        with pytest.raises(ValueError, match=message):
+            env.reset(seed=seed)
+
+
 def test_episodes_repeat_with_their_seed() -> None:
     def log(seed: int) -> list[Any]:
         env = gymnasium.make(ENV_ID, num_robots=2, control_noise_std=0.2)
