@@ -236,6 +236,18 @@ def whole_number(value: object, name: str, minimum: int, maximum: int | None = N
     return int(value)
 
 
+def plain_number(value: object) -> object:
+    """A number or truth value of NumPy's as Python's: ``default=`` of ``json.dumps``.
+
+    Raises:
+        TypeError: If it is neither.
+    """
+    for theirs, ours in ((np.bool_, bool), (np.integer, int), (np.floating, float)):
+        if isinstance(value, theirs):
+            return ours(value)
+    raise TypeError(f"{type(value).__name__} has no form in JSON")
+
+
 MAX_ACTION = 1e15
 """Largest magnitude of an action. float32 still holds the square of more, but no control of a robot is near it: an
 action so far outside its space is refused like one that is not finite, and less is clipped to the robot's limits."""

@@ -264,9 +264,9 @@ def unless(special: object, check: Check) -> Check:
 
 def truth(value: object, name: str) -> bool:
     """True or False."""
-    if not isinstance(value, bool):
+    if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} is {short_repr(value)}; it must be True or False")
-    return value
+    return bool(value)
 
 
 def per_component(value: ArrayLike, name: str) -> float | tuple[float, ...]:

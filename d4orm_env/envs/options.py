@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from d4orm_env.core.arrays import short_repr
@@ -137,6 +138,9 @@ class EnvOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "disturbances", checked_disturbances(self.disturbances))
+        for attribute in fields(self):
+            if isinstance(value := getattr(self, attribute.name), np.bool_):
+                object.__setattr__(self, attribute.name, bool(value))
 
     def _check(self) -> None:
         if not isinstance(self.randomize_instance, bool | None):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env import verify
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import FloatArray, plain_number
 from d4orm_env.core.errors import describe
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import load_reference, source_digest
@@ -283,7 +283,7 @@ def _origin() -> tuple[str, str]:
 def _stored(content: object, owner: str) -> str:
     """JSON with sorted keys; the error of what has no such form begins with its owner."""
     try:
-        return json.dumps(content, sort_keys=True)
+        return json.dumps(content, sort_keys=True, default=plain_number)
     except TypeError as error:
         raise ValueError(
             f"{owner} that cannot be stored ({error}); give numbers, text, truth values, lists and mappings of them"

@@ -399,6 +399,15 @@ def test_trials_leave_a_given_policy_as_it_was(tmp_path: Path) -> None:
     assert "source" in first
 
 
+def test_numbers_of_numpy_are_numbers(tmp_path: Path) -> None:
+    for strength, robots, path in ((0.5, 2, True), (np.float32(0.5), np.int64(2), np.bool_(True))):
+        observation = {"observed_robots": robots, "observed_path": path}
+        rows = compare({"mine": {"policy": Push, "strength": strength}}, tmp_path, observation=observation)
+        assert [row.errors for row in rows] == [0]
+    # They mean the same.
+    assert len(rows_of(tmp_path)) == 2
+
+
 class Locked(Push):
     """It holds what cannot be copied, a lock, and a policy that can."""
 

@@ -203,6 +203,19 @@ def test_a_killed_recording_goes_on_and_loses_nothing(tmp_path: Path) -> None:
     assert_same(dataset, written(tmp_path / "two", seeds=there))
 
 
+def test_numbers_of_numpy_are_numbers(tmp_path: Path) -> None:
+    theirs = {"scenario": np.str_("random"), "num_robots": np.int64(3), "observed_path": np.bool_(False)}
+    one, other = (
+        written(tmp_path / name, environment=environment, policy="mppi", settings={"time_limit": limit}, seeds=range(1))
+        for name, environment, limit in (
+            ("own", RANDOM | {"observed_path": False}, 0.5),
+            ("numpy", theirs, np.float32(0.5)),
+        )
+    )
+    assert one.spec.env_spec == other.spec.env_spec
+    assert one.recover_environment().unwrapped.problem == other.recover_environment().unwrapped.problem
+
+
 def test_only_success_leaves_out_the_rest(tmp_path: Path) -> None:
     everything = written(tmp_path / "all", seeds=range(12))
     succeeded = [

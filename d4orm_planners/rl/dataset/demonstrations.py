@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from d4orm_env import __version__, navigation_v0
-from d4orm_env.core.arrays import LARGEST_WHOLE, BoolArray, FloatArray, as_float32, short_repr, whole_number
+from d4orm_env.core.arrays import (
+    LARGEST_WHOLE,
+    BoolArray,
+    FloatArray,
+    as_float32,
+    plain_number,
+    short_repr,
+    whole_number,
+)
 from d4orm_env.core.files import ArrayArchive, replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.registry import source_digest
@@ -143,7 +151,7 @@ def _described(thing: object) -> object:
         return json.loads(Condition(disturbances=(thing,)).text)
     if callable(thing):
         return {"source": source_digest(thing), "name": getattr(thing, "__qualname__", type(thing).__qualname__)}
-    raise TypeError(f"{type(thing).__name__} is none of these")
+    return plain_number(thing)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from d4orm_env.core.arrays import whole_number
+from d4orm_env.core.arrays import plain_number, whole_number
 from d4orm_env.core.errors import describe
 from d4orm_env.core.files import claim_folder
 from d4orm_env.core.lazy import LazyModule
@@ -174,9 +174,8 @@ def dataset_files(demonstrations: Demonstrations, folder: Path) -> DatasetFiles:
 def _spec(environment: Mapping[str, object]) -> EnvSpec | None:
     """Return the spec by which Gymnasium makes the joint environment; ``None`` if its arguments have no JSON form."""
     spec = copy.deepcopy(gymnasium.spec(ENV_ID))
-    spec.kwargs = dict(environment)
     try:
-        json.dumps(spec.kwargs)
+        spec.kwargs = json.loads(json.dumps(dict(environment), default=plain_number))
     except TypeError:
         return None
     return spec
