@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import fields
 from functools import cache
 from itertools import chain, product
 from types import FunctionType
@@ -125,11 +126,7 @@ def _admit(name: str, model: object) -> Model:
 
 
 def _check_attributes(model: Model) -> None:
-    own = model.own_limits
-    if not (isinstance(own, tuple) and all(isinstance(limit, Limit) for limit in own)):
-        raise ValueError(
-            f"model {model.name!r}: own_limits is {short_repr(own)}; give a tuple of Limit, as (Limit('drag', 0.3),)"
-        )
+    _check_tuples(model)
     n, m, num_limits = model.state_size, model.control_size, len(model.limit_names)
     indices = (*model.speed_indices, *(index for index, _ in (*model.state_limits, *model.trailers)), *model.angles)
     columns = (
@@ -146,6 +143,8 @@ def _check_attributes(model: Model) -> None:
         (model.dimension in (2, 3), f"dimension is {model.dimension}; it must be 2 or 3"),
         (model.dimension <= n <= 6, f"state_names has {n} names; it must have from {model.dimension} to 6"),
         (m in (2, 3), f"control_names has {m} names; it must have 2 or 3"),
+        (len({*model.state_names}) == n, "two components of state_names have the same name; rename one"),
+        (len({*model.control_names}) == m, "two components of control_names have the same name; rename one"),
         (len(model.control_limits) == m, f"control_limits has {len(model.control_limits)} columns; expected {m}"),
         (all(0 <= index < n for index in indices), f"an index of a state component is not from 0 to {n - 1}"),
         (all(0 <= column < num_limits for column in columns), f"a column of limits is not from 0 to {num_limits - 1}"),
@@ -156,6 +155,21 @@ def _check_attributes(model: Model) -> None:
     for holds, complaint in checks:
         if not holds:
             raise ValueError(f"model {name!r}: {complaint}")
+
+
+def _check_tuples(model: Model) -> None:
+    """Check that what is several is in tuples, by which models are told apart."""
+    own = model.own_limits
+    if not (isinstance(own, tuple) and all(isinstance(limit, Limit) for limit in own)):
+        raise ValueError(
+            f"model {model.name!r}: own_limits is {short_repr(own)}; give a tuple of Limit, as (Limit('drag', 0.3),)"
+        )
+    for attribute in fields(model):
+        value = getattr(model, attribute.name)
+        if str(attribute.type).startswith("tuple") and not (
+            isinstance(value, tuple) and not any(isinstance(part, list) for part in value)
+        ):
+            raise ValueError(f"model {model.name!r}: {attribute.name} is {short_repr(value)}; give tuples, not lists")
 
 
 def _check_functions(model: Model) -> None:
