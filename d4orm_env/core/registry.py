@@ -91,7 +91,9 @@ class Registry(Mapping[str, T]):
     def look_up(self, name: object) -> T:
         """Return the thing of this name."""
         return self._known(
-            name, f"import the module that registers yours, or offer it by an entry point of {self.group}"
+            name,
+            "import the module that registers yours, as --scenario FILE.py:FUNCTION does, or offer it by an entry "
+            f"point of {self.group}",
         )
 
     def _known(self, name: object, remedy: str) -> T:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
+from d4orm_env.core.registry import load_reference
 from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner
 from d4orm_planners.cli.options import (
@@ -94,6 +95,13 @@ def solving(
     return solve_progress(planner.name, problem.num_robots, limit, enabled=not quiet)
 
 
+def read_plan(path: Path, scenario: str | None) -> Plan:
+    """The plan of a file, whose robots the module of a user's scenario, if one is given, registers."""
+    if scenario is not None:
+        load_reference(scenario)
+    return Plan.load(path)
+
+
 def export(
     plan_file: Annotated[Path, typer.Argument(help="Plan to export, .npz.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")],
@@ -108,12 +116,15 @@ def export(
         float | None,
         typer.Option(help="Limit of the setpoints [m/s^2].", show_default="the team's"),
     ] = None,
+    scenario: Annotated[
+        str | None, typer.Option("--scenario", "-s", help="package.module:function whose module registers its robots.")
+    ] = None,
     max_jerk: Annotated[float | None, typer.Option(help="Limit of the setpoints [m/s^3].", show_default="none")] = None,
 ) -> None:
     """Smooth a plan, verify it again, and write setpoints for robots to execute."""
     if rate is not None and format == "crazyswarm2":
         raise ValueError(f"--rate {rate:g} would count for nothing: {format} takes polynomials; leave it out")
-    plan, rates = Plan.load(plan_file), {} if rate is None else {"rate": rate}
+    plan, rates = read_plan(plan_file, scenario), {} if rate is None else {"rate": rate}
     with output_folder(out):
         report = plan.export(format, out, height=height, max_acceleration=max_acceleration, max_jerk=max_jerk, **rates)
     rows = [

@@ -20,7 +20,6 @@ from d4orm_env.disturbances.disturbance_registry import disturbances_at
 from d4orm_env.render import save_animation, save_picture
 from d4orm_env.render.replay import Replay, save_denoising
 from d4orm_planners.base.episode import open_env, run_episode
-from d4orm_planners.base.plan import Plan
 from d4orm_planners.base.planner_registry import RECOMMENDED, make_planner, make_policy
 from d4orm_planners.base.policy import OpenLoop
 from d4orm_planners.cli import on_signals
@@ -49,7 +48,7 @@ from d4orm_planners.cli.outputs import (
     require_success,
     tell_written,
 )
-from d4orm_planners.cli.plan_command import solving
+from d4orm_planners.cli.plan_command import read_plan, solving
 from d4orm_planners.sampling.denoising import DenoisingFilm
 
 if TYPE_CHECKING:
@@ -110,12 +109,14 @@ class RunOptions(PictureOptions, ObservationOptions, ProblemOptions):
             if self.preset is not None and settings.setdefault("preset", self.preset) != self.preset:
                 raise ValueError(f"--preset {self.preset} and {label!r} name two presets; give one")
             return self.problem(), _made(label, settings)
+        registering = self.scenario if ":" in self.scenario else None
+        taken = {"seed"} if registering is None else {"seed", "scenario"}
         refuse_options(
             self.context,
-            {"policy", "preset", "compare", *(field.name for field in fields(ProblemOptions) if field.name != "seed")},
+            {"policy", "preset", "compare", *(field.name for field in fields(ProblemOptions))} - taken,
             f"does not go with a plan file; {self.plan_file} has a problem and controls of its own",
         )
-        plan = Plan.load(self.plan_file)
+        plan = read_plan(self.plan_file, registering)
         return plan.problem, OpenLoop(plan=plan)
 
 

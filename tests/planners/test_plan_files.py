@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import stat
 import zipfile
 from collections.abc import Callable
@@ -16,9 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 from planner_support import cheap_planner, hop_problem
+from registry_support import forgetting
 
 import d4orm_env
 from d4orm_env.core.trajectory import Trajectory
+from d4orm_env.dynamics.models import MODELS
 from d4orm_env.scenarios import make_problem
 from d4orm_planners import Plan, load_plan, make_planner
 
@@ -460,3 +463,34 @@ def test_a_number_that_is_not_finite_is_refused(saved: Path, name: str) -> None:
         arrays[name].flat[3] = bad
         rewrite(saved, header, arrays)
         refuse(saved, name)
+
+
+DRIFTER = """
+import dataclasses
+
+from d4orm_env import make_problem, register_model
+from d4orm_env.dynamics.models import get_model
+
+register_model(dataclasses.replace(get_model("velocity2d"), name="drifter"))
+
+
+def arena(seed, num_robots=2):
+    return make_problem("circle", num_robots=num_robots, seed=seed, model="drifter")
+"""
+
+
+@pytest.mark.parametrize("command", [("run",), ("export", "--out", "out")])
+def test_the_command_line_knows_the_robots_of_a_scenarios_module(command: Any, tmp_path: Path, d4orm: Any) -> None:
+    (tmp_path / "own.py").write_text(DRIFTER)
+    arguments = (*command, "plan.npz")
+    with forgetting(MODELS):
+        problem = make_problem("own.py:arena")
+        make_planner("d4orm").solve(problem, seed=0).save("plan.npz")
+        shutil.copy("own.py", "again.py")
+    outcome = d4orm(*arguments)
+    assert outcome.status == 2
+    assert "model 'drifter' is unknown" in outcome.err
+    assert "as --scenario FILE.py:FUNCTION does" in outcome.err
+    with forgetting(MODELS):
+        outcome = d4orm(*arguments, "--scenario", "again.py:arena")
+        assert outcome.status == 0, outcome.err
