@@ -44,7 +44,8 @@ def _rest(x: Vector, zero: Number) -> Vector:
 
 def _approach(x: Vector, goal: Vector, limits: Vector, h: TimeStep, ops: Ops) -> Vector:
     """As a robot's whose brakes act later, by four times the time that the acceleration takes to rise: with less its
-    speed, which follows late, overshoots the goal."""
+    speed, which follows late, overshoots the goal.
+    """
     delay = limits[ACCELERATION] / limits[MAX_JERK]
     later = TimeStep(h.full, h.half + delay + delay + delay + delay, h.third, h.sixth)
     return planar_approach(x, goal, limits, later, ops)
