@@ -229,8 +229,10 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
                 f"robot_{robot} is a {model.name}, which dynobench has no model for; it has {', '.join(known)}"
             )
         states = trajectory.states[:, robot, : model.state_size].astype(np.float64)
-        # Where it may leave its goal it is there before it is at rest.
-        moving = ~trajectory.arrived[:, robot] | (abs(states - states[-1]) > GOAL_TOLERANCE / 100).any(axis=1)
+        # Where it may leave its goal it is there before all that arriving does not ask for, as turn rates, is at rest.
+        others = [*{*range(model.dimension, model.state_size)} - {*model.speed_indices}]
+        unlike = abs(states[:, others] - states[-1, others]) > GOAL_TOLERANCE / 100
+        moving = ~trajectory.arrived[:, robot] | unlike.any(axis=1)
         last = int(np.flatnonzero(moving)[-1]) + 1 if moving.any() else 0
         states = states[: last + 1]
         for hitch, _ in model.trailers:

@@ -228,6 +228,22 @@ def test_a_result_ends_when_nothing_moves_any_more(tmp_path: Path) -> None:
     assert np.abs(result["actions"][-1]).max() > 0  # and not later
 
 
+def test_a_result_ends_though_robots_creep_about_their_goals(tmp_path: Path) -> None:
+    """Denoised plans never come to rest where robots may leave their goals."""
+    box = {"type": "box", "center": [2.5] * 3, "size": [0.5] * 3}
+    ends = ([1, 2.5, 2.5, 0, 0, 0], [4, 2.5, 2.5, 0, 0, 0])
+    robots = [{"type": "integrator2_3d_v0", "start": list(a), "goal": list(b)} for a, b in (ends, ends[::-1])]
+    environment = {"min": [0] * 3, "max": [5] * 3, "obstacles": [box]}
+    path = tmp_path / "two.yaml"
+    path.write_text(yaml.safe_dump({"environment": environment, "robots": robots}))
+    problem = load_dynobench(path)
+    plan = make_planner().solve(problem, seed=0)
+    plan.to_dynobench(tmp_path / "result.yaml")
+    for result, robot in zip(yaml.safe_load((tmp_path / "result.yaml").read_text())["result"], robots, strict=True):
+        assert len(result["actions"]) * problem.dt <= plan.metrics["makespan"] + 1e-9
+        np.testing.assert_allclose(result["states"][-1], robot["goal"], atol=0.01)
+
+
 def test_a_start_is_written_as_it_was_read(tmp_path: Path) -> None:
     path = tmp_path / "one.yaml"
     robots = f"robots: [{{type: unicycle1_v0, start: [4, 2.5, {np.pi}], goal: [3, 2.5, 3.0]}}]\n"
