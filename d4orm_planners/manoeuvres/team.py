@@ -120,8 +120,9 @@ class TeamMotions:
 
     @property
     def cost(self) -> tuple[int, int]:
-        """Number of robots without a motion, and the sum of the others' steps."""
-        return self.missing, sum(motion.steps for motion in self.motions if motion is not None)
+        """Number of robots without a motion, or, once all have one, the sum of their steps."""
+        steps = [motion.steps for motion in self.motions if motion is not None]
+        return (0, sum(steps)) if len(steps) == len(self.motions) else (self.missing, 0)
 
     def plan_all(self) -> None:
         """Plan one robot after the other, each among those before it, those first that take longest."""
