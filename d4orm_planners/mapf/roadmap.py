@@ -132,11 +132,11 @@ def _along_paths(problem: Problem, step: float) -> Floats:
     for robot in range(problem.num_robots):
         corners = problem.shortest_paths.path(robot)
         for tail, head in pairwise(corners):
-            shares = np.linspace(0, 1, 2 + int(2 * np.linalg.norm(head - tail) / step))
+            shares = np.linspace(0, 1, 2 + int(2 * np.sqrt(((head - tail) ** 2).sum()) / step))
             lines.append(tail + shares[:, None] * (head - tail))
     points = np.concatenate(lines)
     wanted = float(np.asarray(problem.team.radius).max() + problem.margin) * (1 + WALL_SLACK)
-    for push in DAMPING ** np.arange(PUSHES):
+    for push in np.cumprod(np.full(PUSHES, DAMPING)):
         near = (world.clearance(points + probe) - world.clearance(points - probe) for probe in np.eye(d) * step / 64)
         gradient = np.stack(list(near), axis=1)
         norm = np.maximum(np.sqrt((gradient**2).sum(axis=1, keepdims=True)), np.finfo(float).tiny)

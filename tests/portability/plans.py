@@ -69,6 +69,7 @@ CASES = {
     "under way": Case(
         "d4orm-c2f", {"refine": "sync"}, "circle", {"num_robots": 6}, 0, (Intruder(4, 0.8), Push(0.3, 0.3))
     ),
+    "a crowd among walls": Case("mapf", {}, "rooms", {"num_robots": 60, "model": "differential_drive"}, 1),
     "through a corridor": Case("mapf", {"improve": True}, "corridor", {"num_robots": 6}, 2),
 }
 
