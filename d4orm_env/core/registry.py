@@ -92,8 +92,7 @@ class Registry(Mapping[str, T]):
         """Return the thing of this name."""
         return self._known(
             name,
-            "import the module that registers yours, as --scenario FILE.py:FUNCTION does, or offer it by an entry "
-            f"point of {self.group}",
+            f"import its module (as --scenario FILE.py:FUNCTION does), or offer it by an entry point of {self.group}",
         )
 
     def _known(self, name: object, remedy: str) -> T:

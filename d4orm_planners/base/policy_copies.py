@@ -32,6 +32,7 @@ def copy_policy(policy: Policy) -> Policy:
     try:
         return copy.deepcopy(policy)
     except Exception as error:  # objects reduce themselves by methods of their own
+        policy.identity()  # what cannot be told from others is to be told first
         raise ValueError(
             f"policy {called(policy)!r} cannot be copied for an episode of its own ({describe(error)}); give its "
             "class, or a function that makes it, in place of the instance"

@@ -40,6 +40,7 @@ class Kind:
     dt: float  #: Time step [s]
     cell: float  #: Distance that should be told apart [m]
     start: Mode  #: Mode that the robot starts in
+    stops: bool = False  #: Whether it has moves from rest to rest only
 
     @property
     def model(self) -> Model:

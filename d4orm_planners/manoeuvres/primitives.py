@@ -56,6 +56,9 @@ def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]
     """The primitives of a robot, the same backwards in time, and their modes; the first one is that of rest."""
     # Longer ones, of a robot that is next to unable to reverse or to turn, have no room in a search.
     moves = [move for move in MOVES[kind.name](kind) if len(move[2]) <= MAX_STEPS]
+    speeds = len(kind.model.speed_indices)
+    if kind.stops:
+        moves = [move for move in moves if not any((*move[0][:speeds], *move[1][:speeds]))]
     modes = tuple(dict.fromkeys(mode for before, after, _ in moves for mode in (before, after)))
     modes = tuple(sorted(modes, key=lambda mode: sum(map(abs, mode))))
     driven = [drive(kind, before, controls) for before, _, controls in moves]
@@ -68,8 +71,7 @@ def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]
         for (before, after, controls), (poses, speed) in zip(moves, driven, strict=True)
         if _is_shortest(moves, before, after, controls)
     ]
-    speeds = kind.model.speed_indices
-    rests = np.array([not any(mode[: len(speeds)]) for mode in modes])
+    rests = np.array([not any(mode[:speeds]) for mode in modes])
     return _table(ahead, rests), _table(back, rests), modes
 
 

@@ -51,15 +51,16 @@ class ManoeuvreScene(NamedTuple):
     arrays: ProblemArrays
     extra: float  #: Distance kept from everything [m]
     bent: BoolArray  #: ``(K,)`` whether trailers have to be in a bend at the robot's goal
+    stops: bool = False  #: Whether robots stop after every move
 
     @property
     def interaction_range(self) -> float:
         """Distance beyond which two robots do not matter to each other in a step [m]."""
         return 2 * float(self.problem.team.radius.max()) + self.extra + 2 * self.problem.stride
 
-    def with_cells(self, share: float) -> ManoeuvreScene:
-        """The same with smaller cells."""
-        return self._replace(area=self.area._replace(cell=share * self.area.cell))
+    def with_cells(self, share: float, stops: bool = False) -> ManoeuvreScene:
+        """The same with smaller cells, or with robots that stop after every move."""
+        return self._replace(area=self.area._replace(cell=share * self.area.cell), stops=stops)
 
     def body(self, robot: int) -> RobotBody:
         """A robot among the obstacles."""
@@ -177,7 +178,7 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     model = problem.team.robot_models[number]
     state = problem.start[number, : model.state_size].astype(np.float64).tolist()
     limits = problem.team.limits[number, : len(model.limit_names)].astype(np.float64).tolist()
-    kind = Kind(model.name, tuple(limits), problem.dt, area.cell, tuple(state[_extra(model) :]))
+    kind = Kind(model.name, tuple(limits), problem.dt, area.cell, tuple(state[_extra(model) :]), scene.stops)
     primitives, _, modes = primitives_of(kind)
     if kind.start not in modes:
         return None

@@ -234,6 +234,13 @@ def test_a_first_order_car_parks_beside_a_wall_and_between_two_others() -> None:
     assert (plan.controls[..., 0] < 0).any()
 
 
+def test_a_car_that_stops_to_steer_parks_in_a_gap_hardly_longer_than_itself() -> None:
+    """With moves at full speed as well its search runs out of nodes."""
+    world = World(boxes=[[-3, -1, -0.5, -0.4], [0.5, -1, 3, -0.4], [-3, -1.2, 3, -1]], lower=(-3, -1.2), upper=(3, 1.5))
+    team = Team(("car",), footprint=Box(0.6, 0.3))
+    solved(Problem(team, [[-2, 0, 0, 0, 0]], [[0, -0.7]], world, horizon=300, goal_heading=0.0))
+
+
 def test_discs_without_headings_are_planned_otherwise() -> None:
     """Others have the same plans as ever, and nothing new to compile."""
     team = Team(("unicycle", "unicycle"))

@@ -88,7 +88,7 @@ CHANGES: dict[str, tuple[Any, dict[str, Any]]] = {
     "reroute": (True, REPAIRING),
     "start": ("straight", {"start": "team"}),
     "neighbours": (1, {"max_iterations": 4}),
-    "replannings": (1, {"max_iterations": 4}),
+    "replannings": (1, {"max_iterations": 12}),
     "first_collisions": (False, TEAM),
     "repair_samples": (16, REPAIRING),
     "repair_steps": (9, REPAIRING),
