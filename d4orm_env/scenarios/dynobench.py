@@ -230,7 +230,7 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
             )
         states = trajectory.states[:, robot, : model.state_size].astype(np.float64)
         # Where it may leave its goal it is there before all that arriving does not ask for, as turn rates, is at rest.
-        others = [*{*range(model.dimension, model.state_size)} - {*model.speed_indices}]
+        others = [*{*range(model.dimension, model.state_size)} - {*model.speed_indices, model.heading_index}]
         unlike = abs(states[:, others] - states[-1, others]) > GOAL_TOLERANCE / 100
         moving = ~trajectory.arrived[:, robot] | unlike.any(axis=1)
         last = int(np.flatnonzero(moving)[-1]) + 1 if moving.any() else 0

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from d4orm_env.core.arrays import BoolArray, Floats, IntArray
+from d4orm_env.core.arrays import BoolArray, IntArray
 from d4orm_planners.mapf.occupancy import Occupancy, find_meetings
 from d4orm_planners.mapf.roadmap_team import FAR, KEEP, TOUCH, Replanning, TeamRollout
 
@@ -29,7 +29,7 @@ def plan_one_by_one(
 
     Args:
         replanning: The search for a path.
-        random: Of the order, and of the robots that may be displaced.
+        random: Of the order, of the robots that may be displaced, and of how long others are left to set out.
         should_stop: Asked before every path.
         patience: Paths after which it gives up if no fewer robots wait for theirs than ever before.
 
@@ -90,16 +90,9 @@ class _Settled:
         """See :meth:`Replanning.replan_one`."""
         return self.replanning.replan_one(self.driven, self.occupancy, robot, self.steps, self.random, minded, release)
 
-    def standing(self, robots: IntArray, steps: int) -> Floats:
-        """``(T + 1, R, 3)`` positions of robots that stand at their starts for some steps, and are nowhere then [m]."""
-        roadmap, positions = self.replanning.roadmap, np.full((self.steps + 1, len(robots), 3), FAR)
-        positions[:steps] = roadmap.nodes[roadmap.starts[robots]]
-        return positions
-
     def displace(self, robot: int) -> IntArray | None:
         """Plan a robot's path around as many as it can; those in whose way it is, ``None`` if it has no path at all."""
-        replanning, settled = self.replanning, self.settled
-        release = 0
+        replanning, settled, release = self.replanning, self.settled, 0
         if self.leisure and self.random.random() < RELEASED:
             release = int(self.random.random() * self.leisure)
         for hard in MINDED:
@@ -128,10 +121,13 @@ class _Settled:
             Robots that have no path now: those that find none, or that robot where they are more than ``most``; then
             all others have the paths that they had.
         """
-        driven, lost, standing = self.driven, list[int](), int(self.random.random() * self.leisure)
+        driven, lost, roadmap = self.driven, list[int](), self.replanning.roadmap
         controls, arrivals = driven.controls[:, displaced], driven.arrivals[displaced]
         positions = driven.positions[:, displaced]
-        self.occupancy.put(displaced, self.standing(displaced, standing))
+        # Nowhere yet, or for some steps at their starts.
+        standing, places = int(self.random.random() * self.leisure), np.full_like(positions, FAR)
+        places[:standing] = roadmap.nodes[roadmap.starts[displaced]]
+        self.occupancy.put(displaced, places)
         if standing:
             self.replan(robot)
         for other in self.random.permutation(displaced).tolist():

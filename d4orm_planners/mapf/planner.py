@@ -174,9 +174,8 @@ def find_one_by_one(search: SolveRun) -> RoadmapSolution | NoPaths | None:
         return NoPaths(f"more than {MAX_ROBOT_STEPS} steps of all robots together are too many to look for paths")
     with search.watch.paused():
         compile_path_finding(problem)
-    random, patience = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE)), PATIENCE[0]
-    patience += int(PATIENCE[1] * problem.num_robots)
-    connected = False
+    random = np.random.default_rng(search.iteration_seed(Stream.GUIDANCE))
+    patience, connected = PATIENCE[0] + int(PATIENCE[1] * problem.num_robots), False
     for number, fineness in enumerate((*ONE_BY_ONE, ONE_BY_ONE[0])):
         # The last one only where no lattice leads to all goals.
         narrow = number == len(ONE_BY_ONE)
