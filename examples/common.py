@@ -7,7 +7,7 @@ import csv
 import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib import import_module
+from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
@@ -41,15 +41,11 @@ plt.rcParams.update({"grid.alpha": 0.25, "legend.frameon": False, "figure.dpi": 
 
 
 def require(extra: str, *modules: str) -> None:
-    """End with one line that names the extra to install, unless these modules can be imported."""
+    """End with one line that names the extra to install, unless these modules are there."""
     for module in modules:
-        try:
-            import_module(module)
-        except ModuleNotFoundError as error:
-            print(
-                f"this example needs {error.name}; install it with: pip install 'd4orm-env[{extra}]'", file=sys.stderr
-            )
-            raise SystemExit(2) from None
+        if find_spec(module) is None:
+            print(f"this example needs {module}; install it with: pip install 'd4orm-env[{extra}]'", file=sys.stderr)
+            raise SystemExit(2)
 
 
 def argument_parser(description: str | None) -> argparse.ArgumentParser:

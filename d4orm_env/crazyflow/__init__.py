@@ -11,11 +11,14 @@ from importlib.util import find_spec
 
 if find_spec("crazyflow") is None:
     raise ImportError("drones in flight need crazyflow; install it with: pip install 'd4orm-env[drones]'")
-if "scipy" in sys.modules and os.environ.get("SCIPY_ARRAY_API") != "1":
-    raise ImportError(
-        "crazyflow needs SciPy's array API, and SciPy is imported already; set the environment variable "
-        "SCIPY_ARRAY_API=1, or import d4orm_env.crazyflow first"
-    )
+# SciPy looks once, in one of these. numba has imported SciPy by now, but neither of them.
+if os.environ.get("SCIPY_ARRAY_API") != "1":
+    if {"scipy._lib._array_api", "scipy._lib._array_api_override"} & sys.modules.keys():
+        raise ImportError(
+            "crazyflow needs SciPy's array API, and SciPy is in use without it already; set the environment variable "
+            "SCIPY_ARRAY_API=1, or import d4orm_env.crazyflow first"
+        )
+    os.environ["SCIPY_ARRAY_API"] = "1"
 
 from d4orm_env.crazyflow.environment import DroneBodies, DronePhysics, check_problem, parallel_env
 from d4orm_env.crazyflow.flight import FlightRecord

@@ -136,7 +136,7 @@ def test_scipy_without_its_array_api_is_named(monkeypatch: pytest.MonkeyPatch) -
     for name in [name for name in sys.modules if name.startswith("d4orm_env.crazyflow")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delenv("SCIPY_ARRAY_API", raising=False)
-    with pytest.raises(ImportError, match="SciPy is imported already; set the environment variable SCIPY_ARRAY_API=1"):
+    with pytest.raises(ImportError, match="SciPy is in use without it already; set the environment variable SCIPY_ARRAY_API=1"):
         open_env(swap(), "crazyflow")
 
 
