@@ -32,6 +32,7 @@ class DronePhysics:
     Attributes:
         drone: Their type, as crazyflow names it: ``"cf2x_L250"`` is the Crazyflie 2.x.
         mass_factor: Their mass over that which their controller reckons with.
+        thrust_factor: Thrust of their rotors likewise: below 1 with a low battery.
         gust: Force on every drone, in another random direction every 0.5 s [N].
 
     Raises:
@@ -40,13 +41,14 @@ class DronePhysics:
 
     drone: str = Drone.cf2x_L250.value
     mass_factor: float = 1.0
+    thrust_factor: float = 1.0
     gust: float = 0.0
 
     def __post_init__(self) -> None:
         if self.drone not in DRONES:
             raise ValueError(f"drone is {short_repr(self.drone)}; choose one of {', '.join(DRONES)}")
-        factor = positive_number(self.mass_factor, "mass_factor", least=0.1, most=10)
-        object.__setattr__(self, "mass_factor", factor)
+        for name in ("mass_factor", "thrust_factor"):
+            object.__setattr__(self, name, positive_number(getattr(self, name), name, least=0.1, most=10))
         object.__setattr__(self, "gust", positive_number(self.gust, "gust", zero_allowed=True, most=10))
 
 
@@ -105,7 +107,7 @@ class DroneBodies:
 
     def __init__(self, problem: Problem, intruder_radius: FloatArray, physics: DronePhysics) -> None:
         self.problem, self.intruder_radius, self._physics = problem, intruder_radius, physics
-        self._flight = Flight(problem.num_robots, physics.drone, physics.mass_factor)
+        self._flight = Flight(problem.num_robots, physics.drone, physics.mass_factor, physics.thrust_factor)
         self._radius = problem.team.radius.astype(np.float64)
         self._step = TimeStep(*problem.arrays.time_step)
         self.record = FlightRecord.empty(problem.num_robots)

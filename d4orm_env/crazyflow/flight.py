@@ -28,13 +28,15 @@ _QUATERNION_W = 12
 class Flight:
     """Drones in the air, at ``position`` ``(K, 3)`` [m] and ``velocity`` ``(K, 3)`` [m/s].
 
-    Their mass is ``mass_factor`` times that which their controller reckons with.
+    Their mass and the thrust of their rotors are ``mass_factor`` and ``thrust_factor`` times those which their
+    controller reckons with.
     """
 
-    def __init__(self, num_drones: int, drone: str, mass_factor: float) -> None:
+    def __init__(self, num_drones: int, drone: str, mass_factor: float, thrust_factor: float) -> None:
         self._sim, self._fly = _compiled(num_drones, drone)
         params = self._sim.default_data.params
-        self._fresh = self._sim.default_data.replace(params=params.replace(mass=params.mass * mass_factor))
+        params = params.replace(mass=params.mass * mass_factor, rpm2thrust=params.rpm2thrust * thrust_factor)
+        self._fresh = self._sim.default_data.replace(params=params)
         self._data = self._fresh
         self._look()
 

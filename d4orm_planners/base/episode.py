@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -22,11 +21,9 @@ from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
+from d4orm_planners.base.physics import check_physics, find_physics
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Policy, robot_indices
-
-PHYSICS = ("model", "mujoco", "crazyflow")
-"""Physics that moves robots: the equations that planners know, rigid bodies in MuJoCo, or drones in crazyflow."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,47 +77,24 @@ class Episode(DisplayMixin):
         return mean_stretch(self.problem, self.trajectory)
 
 
-def check_physics(problem: Problem, physics: str) -> None:
-    """Refuse an unknown physics, or one in which the robots of a problem have no bodies.
-
-    Raises:
-        ValueError: If it is not one of :data:`PHYSICS`, or robots have no bodies in it.
-        ImportError: If it needs a library that is not installed.
-    """
-    module = physics_module(physics)
-    if module is not navigation_v0:
-        module.check_problem(problem)
-
-
-def physics_module(physics: str) -> Any:
-    """The module with the environment of a physics.
-
-    Raises:
-        ValueError: If it is not one of :data:`PHYSICS`.
-        ImportError: If it needs a library that is not installed.
-    """
-    if physics not in PHYSICS:
-        raise ValueError(f"physics is {short_repr(physics)}; choose one of {', '.join(PHYSICS)}")
-    return navigation_v0 if physics == "model" else import_module(f"d4orm_env.{physics}")
-
-
 def open_env(problem: Problem, physics: str = "model", policy: Policy | None = None, **options: Any) -> ParallelEnv:
     """An environment of a problem.
 
     Args:
         problem: The problem.
-        physics: Physics of the robots, one of :data:`PHYSICS`.
+        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
         policy: Policy that is to act in it: where ``options`` say nothing, robots observe what it wants them to.
         **options: Further arguments of :class:`d4orm_env.navigation_v0.parallel_env`.
 
     Raises:
-        ValueError: As :func:`check_physics`, or for a bad argument.
+        ValueError: As :func:`~d4orm_planners.base.physics.check_physics`, or for a bad argument.
         ImportError: If the physics needs a library that is not installed.
     """
     check_physics(problem, physics)
     if isinstance(policy, Policy):  # a user's own may have no more than reset and act
         options = {**policy.observation_options(problem), **options}
-    return physics_module(physics).parallel_env(problem=problem, **options)
+    module, bodies = find_physics(physics)
+    return module.parallel_env(problem=problem, **options, **bodies)
 
 
 def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics: str | None = None) -> Episode:
@@ -131,7 +105,7 @@ def run_episode(env: ParallelEnv, policy: PolicyLike, seed: int = 0, *, physics:
             with no wrappers but those of ``gymnasium.make``: the parallel one of the same options runs in its place.
         policy: A policy, or anything else that :func:`~d4orm_planners.make_policy` takes.
         seed: Seeds both.
-        physics: One of :data:`PHYSICS`, to run an environment like ``env`` with that in its place.
+        physics: See :func:`~d4orm_planners.base.physics.find_physics`; in place of ``env`` one like it runs.
 
     Returns:
         The executed trajectory and its metrics.
@@ -195,7 +169,8 @@ def _moved_by(env: ParallelEnv, physics: str) -> ParallelEnv:
     check_physics(env.unwrapped.problem, physics)
     if env is not env.unwrapped:
         raise ValueError(f"physics is {physics!r}, and the environment is wrapped; give one that is not")
-    return physics_module(physics).parallel_env(**env.options.keywords())
+    module, bodies = find_physics(physics)
+    return module.parallel_env(**env.options.keywords(), **bodies)
 
 
 def _outcome(env: ParallelEnv, rewards: dict[str, float]) -> tuple[FloatArray, BoolArray, BoolArray]:

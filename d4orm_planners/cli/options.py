@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 N = TypeVar("N", int, float)
-_episode: Any = LazyModule("d4orm_planners.base.episode")
+_physics: Any = LazyModule("d4orm_planners.base.physics")
 
 MOST_SEEDS = 1_000_000
 """Trials of one policy at most: a slip of the finger must not fill the memory."""
@@ -117,14 +117,17 @@ class ObservationOptions:
 
 
 def _imported(physics: str) -> str:
-    _episode.physics_module(physics)  # before SciPy, as crazyflow must be
+    _physics.find_physics(physics)  # before SciPy, as crazyflow must be
     return physics
 
 
 Physics = Annotated[
     str,
     typer.Option(
-        "--physics", callback=_imported, help="What moves the robots: model, as planners know them, mujoco, crazyflow."
+        "--physics",
+        callback=_imported,
+        help="What moves the robots: model, as planners know them, mujoco or crazyflow; with settings, as "
+        "crazyflow:gust=0.02,mass_factor=1.05.",
     ),
 ]
 

@@ -72,9 +72,10 @@ def evaluate(
         scenario_settings: Further arguments of the scenarios by name, as ``{"corridor_width": 0.8}``; every one of them
             must take all of these. The results name them behind the scenario.
         time_limit: Seconds for planning, for planners without a ``time_limit`` of their own.
-        physics: Physics of the robots: ``"model"``, the equations that planners know, ``"mujoco"``, see
-            :mod:`d4orm_env.mujoco`, or ``"crazyflow"``, see :mod:`d4orm_env.crazyflow`. Executed controls are not
-            judged by :func:`d4orm_env.verify` then.
+        physics: Physics of the robots: ``"model"``, the equations that planners know, ``"mujoco"`` or ``"crazyflow"``,
+            with settings of their bodies as ``"crazyflow:gust=0.02"``: see
+            :func:`~d4orm_planners.base.physics.find_physics`. Executed controls are not judged by
+            :func:`d4orm_env.verify` then.
         observation: Arguments of the environment on what robots observe, as ``{"observed_rays": 32}``.
         trial_timeout: Seconds after which a trial is ended with an error; ``None`` waits.
         workers: Processes of one thread each, by default as many as there are cores; with 1, and without

@@ -29,7 +29,7 @@ class TrialKey(NamedTuple):
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         seed: Seed of the episode: of the policy and of the noise.
         disturbances: Further disturbances, as JSON: a list of ``[name, attributes]``.
-        physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
+        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
     """
 
     policy: str

@@ -44,7 +44,7 @@ class Compared:
         control_noise_std: Standard deviation of the execution noise, in the controls' units.
         disturbance: Further disturbance, such as ``"push.speed"``; empty for nothing.
         level: Its level.
-        physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
+        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
         undisturbed: True if no disturbance changed anything, as at level zero.
         trials: Trials, those with an error included.
         successes: Those that succeeded.

@@ -50,7 +50,7 @@ class Condition:
         disturbances: Further disturbances.
         name: Varied quantity, such as ``"push.speed"``; empty for nothing.
         level: Its level; of disturbances that differ in more than a number, their index among the levels.
-        physics: Physics of the robots, one of :data:`d4orm_planners.base.episode.PHYSICS`.
+        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
     """
 
     control_noise_std: float = 0.0

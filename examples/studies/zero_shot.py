@@ -6,8 +6,8 @@ Teams of `robot="crazyflie"`, with its radius, limits and margin: a swap of ten 
 slab of 0.5 m, and ten that rise from a grid to a figure of eight, in an order drawn anew. Plans of `hybrid` are sampled
 at 100 Hz and flown as they are, in calm air, and with gusts of 0.02 N and 5% more mass than the drones' controller
 reckons with. With those, D4orm-C2F flies the teams in a `Controller`, whose reference the drones follow: in mode
-"nominal" without looking at them, in mode "measured" the reference goes towards them. It needs crazyflow, `--trials`
-does not.
+"nominal" without looking at them, in mode "measured" the reference goes towards them; so they do with a low battery,
+which takes 12% of the thrust, in calm air. It needs crazyflow, `--trials` does not.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ CONDITIONS: dict[str, dict[str, float]] = {
     "open loop, disturbed": DISTURBED,
     "nominal, disturbed": DISTURBED,
     "measured, disturbed": DISTURBED,
+    "nominal, low battery": {"thrust_factor": 0.88},
+    "measured, low battery": {"thrust_factor": 0.88},
 }
 HORIZON = 150
 CALM = 10

@@ -337,8 +337,25 @@ def test_an_environment_is_opened_by_its_physics() -> None:
     problem = line_problem([1.0])
     assert type(open_env(problem)) is navigation_v0.parallel_env
     assert type(open_env(problem, "mujoco")) is mujoco.parallel_env
-    with pytest.raises(ValueError, match="physics is 'bullet'; choose one of model, mujoco, crazyflow"):
-        open_env(problem, "bullet")
+    assert open_env(problem, "mujoco:drag=0.5,time_step=0.01")._physics == mujoco.Physics(drag=0.5, time_step=0.01)
+
+
+@pytest.mark.parametrize(
+    ("physics", "complaint"),
+    [
+        ("bullet", "physics is 'bullet'; choose one of model, mujoco, crazyflow"),
+        (3, "physics is 3; choose one of model, mujoco, crazyflow"),
+        ("model:drag=1", "physics is 'model:drag=1', and the model has no settings; give disturbances"),
+        ("mujoco:", "physics is 'mujoco:'; settings are of the form mujoco:name=value,name=value"),
+        ("mujoco:drag", "physics is 'mujoco:drag'; settings are of the form mujoco:name=value,name=value"),
+        ("mujoco:drags=1", "'drags' is no setting of physics 'mujoco'; it takes .*; did you mean 'drag'?"),
+        ("mujoco:drag=-1", "drag is -1"),
+        ("mujoco:drag=]", "is not YAML"),
+    ],
+)
+def test_an_unknown_physics_is_named(physics: Any, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        open_env(line_problem([1.0]), physics)
 
 
 @pytest.mark.parametrize(
