@@ -139,7 +139,10 @@ def refuse_robots(wrong: BoolArray, name: str, values: FloatArray, wanted: str, 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Frozen:
-    """Data that are set once. Copies, unpickled ones too, have read-only arrays and no cached values."""
+    """Data that are set once, and equal where their values are.
+
+    Copies, unpickled ones too, have read-only arrays and no cached values.
+    """
 
     def _set(self, **values: object) -> None:
         for name, value in values.items():
@@ -156,6 +159,21 @@ class Frozen:
 
     def __setstate__(self, state: dict[str, object]) -> None:
         self._set(**state)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and _content(self.__getstate__()) == _content(other.__getstate__())
+
+    def __hash__(self) -> int:
+        return hash(_content(self.__getstate__()))
+
+
+def _content(value: object) -> object:
+    """``value`` as something hashable that is equal where shapes and bits of its arrays are."""
+    if isinstance(value, Mapping):
+        return frozenset((name, _content(part)) for name, part in value.items())
+    if isinstance(value, tuple):
+        return tuple(map(_content, value))
+    return (value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
 
 
 LARGEST_NUMBER = 1e18

@@ -15,6 +15,7 @@ from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
 from d4orm_env.engine.choice import rollout
+from d4orm_env.footprints import Box
 from d4orm_env.scenarios import load_problem, save_problem
 
 NAN, INF = float("nan"), float("inf")
@@ -451,6 +452,28 @@ def test_copies_are_equal_and_as_read_only_as_the_original(duplicate: Any) -> No
                 array[...] = 0
     assert twin == problem
     assert twin.name == problem.name
+    assert (twin.team, twin.world) == (problem.team, problem.world)
+    assert {twin.team, twin.world} == {problem.team, problem.world}
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (Team(["car"]), Team(["car"], own_limits={"wheelbase": 0.4})),
+        (Team(["holonomic2d"]), Team(["holonomic2d"] * 2)),
+        (Team(["holonomic2d"]), Team(["holonomic2d"], footprint=Box(0.5, 0.25))),
+        (World(), World(3)),
+        (World(), World(lower=(-1, -1), upper=(1, 1))),
+        (World(circles=[(0, 0, 1)]), World(circles=[(0, 0, 2)])),
+        (World(polygons=[[(0, 0), (1, 0), (0, 1)]]), World(polygons=[[(0, 0), (1, 0), (0, 2)]])),
+        (World(), World(origin=(5, 0))),
+    ],
+)
+def test_teams_and_worlds_are_equal_by_value(one: Team | World, other: Team | World) -> None:
+    assert one == one.replace()
+    assert hash(one) == hash(one.replace())
+    assert one != other
+    assert one != 3
 
 
 def test_nothing_can_be_reassigned() -> None:
