@@ -12,6 +12,10 @@ class UnknownKeywordError(TypeError, ValueError):
     """A keyword or setting that does not exist: a TypeError, as Python raises, and bad input like any other."""
 
 
+class MissingFileError(ValueError, FileNotFoundError):
+    """A file that does not exist: a FileNotFoundError, as Python raises, and bad input like any other."""
+
+
 def first_line(error: BaseException) -> str:
     """The first line of the message, or the kind of an error without one."""
     return next(iter(str(error).splitlines()), type(error).__name__)

@@ -21,6 +21,8 @@ from typing import IO, Any
 import numpy as np
 import yaml
 
+from d4orm_env.core.errors import MissingFileError
+
 
 def checked_path(path: object, what: str) -> Path:
     """Return the path of ``what``.
@@ -54,15 +56,23 @@ def read_limited(path: Path, kind: str, most: int) -> bytes:
 
 @contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Raise errors within as a ``ValueError`` of one line that begins with the path of the file."""
+    """Raise errors within as a ``ValueError`` of one line that begins with the path of the file.
+
+    For a file that does not exist it is a ``FileNotFoundError`` too.
+    """
     try:
         yield
-    except OSError as error:
-        raise ValueError(
-            f"{error.filename or path}: cannot be read ({error.strerror}); check name and permissions"
-        ) from error
     except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+        kind = MissingFileError if isinstance(error, MissingFileError) else ValueError
+        raise kind(f"{path}: {' '.join(str(error).split())}") from error
+    except OSError as error:
+        raise _unreadable(error, f"{error.filename or path}: ") from error
+
+
+def _unreadable(error: OSError, where: str = "") -> ValueError:
+    """The error for a file that cannot be read."""
+    kind = MissingFileError if isinstance(error, FileNotFoundError) else ValueError
+    return kind(f"{where}cannot be read ({error.strerror}); check name and permissions")
 
 
 def target_of(path: Path) -> Path:
@@ -211,7 +221,7 @@ def read_yaml(path: str | os.PathLike[str]) -> object:
     try:
         content = read_limited(Path(path), "a YAML file", MAX_BYTES)
     except OSError as error:
-        raise ValueError(f"cannot be read ({error.strerror}); check name and permissions") from error
+        raise _unreadable(error) from error
     try:
         return parse_yaml(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from d4orm_env.core.errors import first_line
+from d4orm_env.core.errors import MissingFileError, first_line
 from d4orm_env.core.files import ArrayArchive, checked_path, replaced_when_done, require_file
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
@@ -69,7 +69,7 @@ def read_plan(path: str | os.PathLike[str]) -> Plan:
         provenance = None if made is None else Provenance(**made)
         return _evaluated(problem, history, claimed, _checked(header) | {"provenance": provenance})
     except FileNotFoundError:
-        raise FileNotFoundError(f"there is no plan at {source}; write one with Plan.save or d4orm plan") from None
+        raise MissingFileError(f"there is no plan at {source}; write one with Plan.save or d4orm plan") from None
     except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise errors of a dozen kinds
         raise ValueError(
             f"{source} is not a readable plan ({first_line(error)}); mend that, or write it anew with Plan.save"

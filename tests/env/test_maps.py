@@ -123,6 +123,8 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             load_map(path)  # type: ignore[arg-type]
+    with pytest.raises(FileNotFoundError, match=r"no\.map: cannot be read"):
+        load_map(tmp_path / "no.map")
     for cell in (0, -1, float("nan"), "wide", 1e9):
         with pytest.raises(ValueError, match="cell"):
             load_map(MAP, cell=cell)  # type: ignore[arg-type]
