@@ -238,10 +238,11 @@ class CoarsePlanTracker:
         """Accept a finished refinement, and begin another if that is ``due``; whether one was accepted."""
         index = self.index + self._config.subgoal_offset
         guidance, over = self.guidance, index >= len(self.guidance.path) - 1
-        if self._config.refine == "off" or over or not isinstance(guidance, CoarsePlan):
+        refine = self._config.refine or ("sync" if self._config.deadline is None else "background")
+        if refine == "off" or over or not isinstance(guidance, CoarsePlan):
             return False
         seed = derived_seed(self._seed, Stream.REFINEMENT, step)
-        if self._config.refine == "sync":
+        if refine == "sync":
             if due:
                 self.guidance = self._refined(guidance, index, seed)
             return self.guidance is not guidance

@@ -83,7 +83,8 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
             others drive around.
         last_resort: Whether robots whose plan would end in contact are told to brake or to evade instead.
         refine: Whether the guidance is refined while it is followed: in a ``"background"`` thread, ``"sync"`` between
-            control loops, which gives the same controls every time, or ``"off"``.
+            control loops, which gives the same controls every time, or ``"off"``. ``None`` is ``"background"`` with a
+            ``deadline`` and ``"sync"`` without.
         refine_every: Least number of control loops between refinements, which take time from the loops.
         replan: Whether the guidance is planned anew for robots that are stuck or astray, and for a team that has lost
             it or has come to its end; for robots with new goals it always is.
@@ -130,7 +131,7 @@ class D4ormC2FConfig(SoftmaxSettings, DiffusionSettings):
     expect_losses: bool = True
     stalls: bool = True
     last_resort: bool = True
-    refine: Annotated[str, one_of(("background", "sync", "off"))] = "background"
+    refine: Annotated[str, one_of(("background", "sync", "off"))] | None = None
     refine_every: Count = 5
     replan: bool = True
     replan_distance: Positive = 10.0

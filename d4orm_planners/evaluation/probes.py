@@ -232,7 +232,8 @@ def measure_big_loops(num_robots: int, loops: int, share: float | None) -> Measu
     """
     env = navigation_v0.parallel_env("random", num_robots=num_robots)
     dt = env.problem.dt
-    policy = make_policy("d4orm-c2f", deadline=None if share is None else share * dt)
+    deadline = None if share is None else share * dt
+    policy = make_policy("d4orm-c2f", deadline=deadline, refine="background")
     assert isinstance(policy, D4ormC2F)
     seconds, contacts = [], 0
     observations, _ = env.reset(seed=0)

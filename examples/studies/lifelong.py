@@ -49,7 +49,7 @@ def drive(problem: Problem, seed: int, minutes: float, seconds: float) -> tuple[
     env = navigation_v0.parallel_env(problem=problem, lifelong=True)
     env.max_cycles = max(round(60 * minutes / problem.dt), 1)
     observations, _ = env.reset(seed=seed)
-    policy: Any = make_policy("d4orm-c2f")
+    policy: Any = make_policy("d4orm-c2f", refine="background")
     policy.reset(env, seed=seed)
 
     joint = split_state(problem, env.state())

@@ -81,16 +81,25 @@ def test_everyone_arrives_and_keeps_the_margin(case: dict[str, Any]) -> None:
     assert_verified(problem, executed)
 
 
-@pytest.mark.parametrize("refine", ["sync", "background"])
-def test_refined_guidance_leads_home_too(refine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = circle(8)
-    policy = controller(refine=refine, refine_every=2)
+@pytest.mark.parametrize(
+    ("config", "beside"),
+    [
+        ({"refine": "sync"}, False),
+        ({"refine": "background"}, True),
+        ({"refine": None}, False),
+        ({"refine": None, "deadline": 60.0}, True),
+    ],
+)
+def test_refined_guidance_leads_home_too(config: dict[str, Any], beside: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, jobs = circle(8), []
+    policy = controller(refine_every=2, **config)
     act = policy.act
 
     def act_and_let_the_background_work(*arguments: Any) -> Any:
         actions = act(*arguments)
         if policy._refinement._job is not None:
             policy._refinement._job.exception()
+            jobs.append(policy._refinement._job)
         return actions
 
     # On a busy machine it might not come to an end before the episode does.
@@ -98,6 +107,7 @@ def test_refined_guidance_leads_home_too(refine: str, monkeypatch: pytest.Monkey
     executed = episode(policy, problem)
     assert_verified(problem, executed)
     assert any(loop.refined for loop in policy.loops)
+    assert bool(jobs) == beside
 
 
 @pytest.mark.parametrize("config", [{"coarse_factor": 4}, {"coarse_factor": 1}, {"check_interval": 10}], ids=str)
@@ -131,10 +141,10 @@ def test_noise_may_be_added_by_the_controller() -> None:
     assert not np.allclose(quiet.trajectory.controls[:steps], noisy.trajectory.controls[:steps], atol=0.05)
 
 
-def test_synchronous_refinement_gives_the_same_episode_again() -> None:
+def test_a_seed_gives_the_same_episode_again() -> None:
     problem = circle(6)
     first, again = (
-        episode(controller(refine="sync", refine_every=2), problem, seed=3, control_noise_std=0.2) for _ in range(2)
+        episode(make_policy("d4orm-c2f", refine_every=2), problem, seed=3, control_noise_std=0.2) for _ in range(2)
     )
     np.testing.assert_array_equal(first.trajectory.states, again.trajectory.states)
     np.testing.assert_array_equal(first.trajectory.controls, again.trajectory.controls)
