@@ -13,7 +13,7 @@ from d4orm_planners.base.display import markdown_text
 from d4orm_planners.evaluation.comparison import PairedPolicies, compare_pairs
 from d4orm_planners.evaluation.disturbance_figures import draw_lines, draw_map, draw_noise, quantity_of, write_figure
 from d4orm_planners.evaluation.summary import SuccessRate, TrialGroup, success_rates
-from d4orm_planners.evaluation.tables import errors, markdown, panels, table, target, write_csv, write_rates
+from d4orm_planners.evaluation.tables import errors, interval, markdown, panels, table, target, write_csv, write_rates
 
 THRESHOLD = 0.9
 """Share of the undisturbed success rate below which a policy is said to tolerate a disturbance no longer."""
@@ -134,9 +134,6 @@ def _pair_tables(rates: Sequence[SuccessRate], pairs: Sequence[PairedPolicies]) 
 
 
 def _pair_cells(pair: PairedPolicies) -> tuple[str, ...]:
-    slower = "-" if pair.slower is None else f"{pair.slower:.2f}"
-    if pair.slower_lower is not None:
-        slower += f" ({pair.slower_lower:.2f} to {pair.slower_upper:.2f})"
     return (
         pair.first,
         pair.second,
@@ -146,7 +143,7 @@ def _pair_cells(pair: PairedPolicies) -> tuple[str, ...]:
         *(str(count) for count in (pair.trials, pair.only_first, pair.only_second)),
         f"{pair.p_value:.3g}",
         f"{pair.difference:+.0%} ({pair.lower:+.0%} to {pair.upper:+.0%})",
-        slower,
+        interval(pair.slower, pair.slower_lower, pair.slower_upper, 2),
     )
 
 

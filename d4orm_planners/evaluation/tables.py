@@ -171,18 +171,18 @@ def _cells(rate: SuccessRate, disturbed: bool) -> tuple[str, ...]:
         f"{rate.lower:.0%} to {rate.upper:.0%}",
         "-" if rate.verified is None else str(rate.verified),
         *(str(count) for count in (rate.contacts, rate.late, rate.errors)),
-        _interval(rate.travel_time, rate.travel_time_lower, rate.travel_time_upper, 2),
+        interval(rate.travel_time, rate.travel_time_lower, rate.travel_time_upper, 2),
         "-" if rate.stretch is None else f"{rate.stretch:.2f}",
         "-" if rate.denoising_steps is None else f"{rate.denoising_steps:g}",
         "-" if rate.denoising_share is None else f"{rate.denoising_share:.0%}",
         "-" if rate.wall_time is None else f"{rate.wall_time:.2f}",
         "-" if rate.decision is None else f"{1e3 * rate.decision:.2f}",
         "-" if rate.training_time is None else f"{rate.training_time / 60:.0f}",
-        _interval(rate.compute, rate.compute_lower, rate.compute_upper, 3),
+        interval(rate.compute, rate.compute_lower, rate.compute_upper, 3),
     )
 
 
-def _interval(mean: float | None, lower: float | None, upper: float | None, digits: int) -> str:
+def interval(mean: float | None, lower: float | None, upper: float | None, digits: int) -> str:
     """A mean with its interval in brackets; a dash where nothing was measured."""
     if mean is None:
         return "-"
