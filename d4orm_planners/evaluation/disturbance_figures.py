@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -108,15 +108,18 @@ def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
     return paths
 
 
-def _grid(
-    count: int, across: int, size: Callable[[int], tuple[float, float]], **options: Any
-) -> tuple[Figure, Sequence[Axes]]:
-    """A figure of so many axes, in inches by its rows; made without pyplot, which keeps state and wants a display."""
+def _grid(count: int, across: int, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
+    """A figure of so many axes of success, so wide, and so high by row [inches].
+
+    Made without pyplot, which keeps state and wants a display.
+    """
     rows = -(-count // across)
-    figure: Figure = figures.Figure(figsize=size(rows), layout="constrained")
-    axes = figure.subplots(rows, across, squeeze=False, **options).ravel()
+    figure: Figure = figures.Figure(figsize=(width, 0.3 + height * rows), layout="constrained")
+    axes: list[Axes] = figure.subplots(rows, across, squeeze=False, sharey=True).ravel().tolist()
     for ax in axes[count:]:
         ax.set_visible(False)
+    for ax in axes[::across]:
+        ax.set_ylabel("success rate")
     return figure, axes[:count]
 
 
@@ -128,13 +131,11 @@ def draw_noise(groups: Mapping[str, Sequence[SuccessRate]]) -> Figure:
     """
     across = min(3, len(groups))
     labels = list(dict.fromkeys(rate.label for group in groups.values() for rate in group))
-    width = PAGE if across > 1 else COLUMN
-    figure, axes = _grid(len(groups), across, lambda rows: (width, 0.3 + 1.9 * rows), sharey=True)
-    for number, (ax, (title, group)) in enumerate(zip(axes, groups.items())):
+    figure, axes = _grid(len(groups), across, PAGE if across > 1 else COLUMN, 1.9)
+    for ax, (title, group) in zip(axes, groups.items()):
         rates = [replace(rate, level=rate.control_noise_std) for rate in group]
         _draw_panel(ax, "control_noise", labels, sorted(rates, key=lambda rate: rate.control_noise_std))
         ax.set(title=title if len(groups) > 1 else "", xlabel="standard deviation of the control noise")
-        ax.set_ylabel("success rate" if number % across == 0 else "")
     _add_legend(figure, axes, across)
     return figure
 
@@ -147,11 +148,9 @@ def draw_lines(rates: Sequence[SuccessRate]) -> Figure:
     """
     names, labels = (list(dict.fromkeys(all_of)) for all_of in zip(*((one.disturbance, one.label) for one in rates)))
     across = min(4, len(names))
-    width = PAGE if across > 2 else COLUMN
-    figure, axes = _grid(len(names), across, lambda rows: (width, 0.3 + 1.45 * rows), sharey=True)
-    for number, (ax, name) in enumerate(zip(axes, names)):
+    figure, axes = _grid(len(names), across, PAGE if across > 2 else COLUMN, 1.45)
+    for ax, name in zip(axes, names):
         _draw_panel(ax, name, labels, [rate for rate in rates if rate.disturbance == name])
-        ax.set_ylabel("success rate" if number % across == 0 else "")
     _add_legend(figure, axes, across)
     return figure
 
