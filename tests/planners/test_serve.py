@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import math
 import socket
 import struct
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -538,3 +541,13 @@ def test_bad_files_are_one_line(text: str, complaint: str, tmp_path: Path, capsy
     assert ended.value.code == 2
     assert complaint in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_fleet_is_served_by_another_process() -> None:
+    script = Path(__file__).parents[1] / "release" / "soak_serve.py"
+    done = subprocess.run([sys.executable, script, "0.2"], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout[done.stdout.index("{") :])
+    assert told["goals"] > 0
+    assert told["least gap [m], while"][0] > 0

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from d4orm_env import Problem, Team, save_problem
 from tests.planners.test_serve import DT, Fleet, until
