@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from d4orm_env.core.arrays import positive_number, whole_number
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import checked_path, replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import DisturbanceEvents, Trajectory
 from d4orm_env.render.frames import FrameRenderer
@@ -58,7 +58,7 @@ def save_animation(
         OSError: If the folder does not exist or cannot be written to, or ffmpeg fails.
     """
     checked_trajectory(problem, trajectory)
-    with replaced_when_done(path := Path(path), ANIMATION_SUFFIXES) as temporary:
+    with replaced_when_done(path := checked_path(path, "an animation"), ANIMATION_SUFFIXES) as temporary:
         kind = path.suffix.lower()
         check_ffmpeg(path)
         most = _MOST_FRAMES_PER_SECOND[kind]

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from d4orm_env.core.arrays import short_repr
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import checked_path, replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
@@ -234,7 +234,7 @@ def save_picture(
         ValueError: For another suffix, or as :func:`plot_trajectory`.
         OSError: If the folder does not exist or cannot be written to.
     """
-    path = Path(path)
+    path = checked_path(path, "a picture")
     kind = path.suffix.lower()[1:]
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with replaced_when_done(path, PICTURE_SUFFIXES) as temporary:

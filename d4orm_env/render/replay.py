@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import checked_path, replaced_when_done
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.trajectory import Trajectory
@@ -165,7 +165,7 @@ class Replay:
             ValueError: For another suffix.
             OSError: If it cannot be written; nothing is left behind then.
         """
-        with replaced_when_done(path := Path(path), REPLAY_SUFFIXES) as temporary:
+        with replaced_when_done(path := checked_path(path, "a replay"), REPLAY_SUFFIXES) as temporary:
             temporary.write_text(self.html, encoding="utf-8")
         return path
 
@@ -282,7 +282,7 @@ def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, pan
         panel.axes.set_title(denoising.labels[step].partition(" of ")[0], fontsize=10)
         panel.axes.label_outer()
         _draw_step(TeamLayer(panel, problem), denoising, int(step))
-    with replaced_when_done(path := Path(path), PICTURE_SUFFIXES) as temporary:
+    with replaced_when_done(path := checked_path(path, "a picture"), PICTURE_SUFFIXES) as temporary:
         figure.savefig(temporary, format=path.suffix.lower()[1:], dpi=120)
     return path
 

@@ -11,14 +11,13 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from d4orm_env.core.arrays import number_list, positive_number, short_repr
 from d4orm_env.core.errors import did_you_mean, first_line, unknown
-from d4orm_env.core.files import naming, read_yaml
+from d4orm_env.core.files import checked_path, naming, read_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.core.world import World
@@ -65,9 +64,10 @@ def load_cl_mapf(
     if not isinstance(clockwise, bool):
         raise ValueError(f"clockwise is {short_repr(clockwise)}; it must be True or False")
     own = VEHICLE | {name: positive_number(value, f"{name} of vehicle") for name, value in given.items()}
+    path = checked_path(path, "a problem of CL-CBS or CSDO")
     with naming(path):
         try:
-            return _problem(read_yaml(path), own, -1 if clockwise else 1, Path(path).stem)
+            return _problem(read_yaml(path), own, -1 if clockwise else 1, path.stem)
         except (KeyError, TypeError, IndexError) as error:
             reason = f"it lacks {error}" if isinstance(error, KeyError) else first_line(error)
             raise ValueError(

@@ -19,7 +19,7 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, number_list, short_repr
 from d4orm_env.core.errors import did_you_mean, first_line
-from d4orm_env.core.files import naming, read_yaml
+from d4orm_env.core.files import checked_path, naming, read_yaml
 from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
@@ -72,6 +72,7 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
             and all types that are unknown.
     """
     known = MODELS | checked_types({} if models is None else models)
+    path = checked_path(path, "a problem of dynobench")
     with naming(path):
         try:
             return _problem(read_yaml(path), known, path)
@@ -83,7 +84,7 @@ def load_dynobench(path: str | os.PathLike[str], models: Mapping[str, Mapping[st
             ) from error
 
 
-def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.PathLike[str]) -> Problem:
+def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: Path) -> Problem:
     robots, environment = content["robots"], content["environment"]
     entries = [(f"robot_{number}", robot, ROBOT_KEYS) for number, robot in enumerate(robots)]
     for what, entry, keys in [("environment", environment, KEYS), *entries]:
@@ -115,7 +116,7 @@ def _problem(content: Any, models: Mapping[str, dict[str, Any]], path: str | os.
     steps = math.ceil(SLOWEST * float((distance / team.max_speed).max()) / DT)
     return Problem(
         team, start, goal[:, :d], _world(environment, team, start, goal), DT, max(LEAST_STEPS, steps), margin=0.0,
-        goal_radius=GOAL_TOLERANCE, goal_speed=np.where(inertia, GOAL_TOLERANCE, np.inf), name=Path(path).stem,
+        goal_radius=GOAL_TOLERANCE, goal_speed=np.where(inertia, GOAL_TOLERANCE, np.inf), name=path.stem,
         arrival="stay", goal_heading=np.where(turning, _wrapped(goal[:, min(2, team.state_size - 1)]), np.nan),
         goal_heading_tolerance=GOAL_TOLERANCE, goal_hitches=_hitches(team, goal),
     )  # fmt: skip

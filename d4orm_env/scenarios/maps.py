@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from d4orm_env.core.arrays import Floats, short_repr
-from d4orm_env.core.files import is_yaml_path, naming, read_limited
+from d4orm_env.core.arrays import Floats
+from d4orm_env.core.files import checked_path, is_yaml_path, naming, read_limited
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
 from d4orm_env.scenarios.grid_map import MAX_BYTES, MAX_CELLS, GridMap, grid_of_fields, read_occupancy_image
@@ -147,9 +147,7 @@ def load_map(path: PathLike, cell: float = 0.6, resolution: float | None = None)
 def read_map(path: PathLike, cell: float = 0.6, resolution: float | None = None) -> GridMap:
     """Read a map as :func:`load_map`; the same object for the same content."""
     cell = bounded(cell, "cell")
-    if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"the path of a map must be text or a path, not {short_repr(path)}")
-    file = Path(path)
+    file = checked_path(path, "a map")
     with naming(file):
         if file.suffix.lower() in IMAGES:
             if resolution is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 from numpy.typing import ArrayLike
@@ -242,7 +241,7 @@ class Plan(DisplayMixin):
             OSError: If it cannot be written; nothing is left behind then.
         """
         lines = list(dynobench.result_lines(self.problem, self.trajectory))
-        with replaced_when_done(Path(path)) as temporary:
+        with replaced_when_done(checked_path(path, "a result of dynobench")) as temporary:
             temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from d4orm_env.core.arrays import duration, whole_number
+from d4orm_env.core.files import checked_path
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.d_d4orm.ray_planner import import_ray
@@ -136,9 +137,10 @@ def run_study(
     groups = _checked_groups(study, trial_timeout, workers)
     if ray is not None:
         import_ray(RAY_USE)  # before there is a store
-    Path(out).mkdir(parents=True, exist_ok=True)
-    store = TrialStore(Path(out) / STORE)
-    for path in sorted(Path(out).glob(SHARD_STORES)):
+    folder = checked_path(out, "the folder of results")
+    folder.mkdir(parents=True, exist_ok=True)
+    store = TrialStore(folder / STORE)
+    for path in sorted(folder.glob(SHARD_STORES)):
         store.add(*TrialStore(path, alone=True).trials())
     _complete(store, [job for group in groups for job in group], workers, ray, trial_timeout, progress)
     stored, results = {trial.key: trial for trial in store.trials()}, []
@@ -178,8 +180,9 @@ def run_shard(
     count = whole_number(shard[1], "number of shards", 1)
     index = whole_number(shard[0], "shard", 1, count)
     jobs = [job for group in _checked_groups(study, trial_timeout, workers) for job in group][index - 1 :: count]
-    Path(out).mkdir(parents=True, exist_ok=True)
-    path = Path(out) / SHARD_STORES.replace("*", f"{index}-of-{count}")
+    folder = checked_path(out, "the folder of results")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / SHARD_STORES.replace("*", f"{index}-of-{count}")
     store = TrialStore(path, alone=True)
     _complete(store, jobs, workers, None, trial_timeout, progress)
     return path

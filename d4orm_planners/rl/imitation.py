@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env import navigation_v0
 from d4orm_env.core.arrays import FloatArray, as_float32
+from d4orm_env.core.files import checked_path
 from d4orm_env.core.seeds import Stream, derived_seed, generator
 from d4orm_planners.base.planner_registry import make_policy, setting_names
 from d4orm_planners.base.policy import Policy, robot_indices
@@ -117,7 +118,8 @@ def imitate(
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
         OSError: If the folder cannot be used.
     """
-    run = _ImitationRun(settings, Path(out), progress or (lambda what, done, total: None), command)
+    folder = checked_path(out, "the folder of a training")
+    run = _ImitationRun(settings, folder, progress or (lambda what, done, total: None), command)
     for index in range(len(run.evaluations), settings.rounds):
         run.learn(index)
     return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from d4orm_env.core.arrays import FloatArray
-from d4orm_env.core.files import replaced_when_done
+from d4orm_env.core.files import checked_path, replaced_when_done
 from d4orm_env.core.observation_layout import ObservationSlices
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.envs.features import Features
@@ -156,7 +156,7 @@ class Network:
             ValueError: If the name does not end in ``.safetensors``.
             OSError: If it cannot be written.
         """
-        with replaced_when_done(Path(path), (SUFFIX,)) as temporary:
+        with replaced_when_done(checked_path(path, "a network"), (SUFFIX,)) as temporary:
             # As bytes, because the library's own files are for the owner's eyes only.
             temporary.write_bytes(save(dict(self.arrays), metadata={"d4orm": self.header.text()}))
 

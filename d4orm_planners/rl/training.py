@@ -21,6 +21,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import FloatSchedule, set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
+from d4orm_env.core.files import checked_path
 from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm, network_of, set_network
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
@@ -60,7 +61,8 @@ def train(
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
         OSError: If the folder cannot be used.
     """
-    run = _TrainingRun(settings, Path(out), progress or (lambda what, done, total: None), command)
+    folder = checked_path(out, "the folder of a training")
+    run = _TrainingRun(settings, folder, progress or (lambda what, done, total: None), command)
     for index in range(len(run.evaluations), len(run.stages)):
         run.learn(index)
     return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)

@@ -14,6 +14,7 @@ import pytest
 from d4orm_env import (
     Problem,
     Team,
+    load_dynobench,
     load_map,
     load_problem,
     make_problem,
@@ -25,7 +26,9 @@ from d4orm_env import (
 from d4orm_env.disturbances import MovingObstacle
 from d4orm_env.envs.rewards import TrainingReward
 from d4orm_env.footprints import Box, Train
-from d4orm_planners import Controller, Policy, load_plan, make_planner, make_policy, run_episode
+from d4orm_env.render import save_animation, save_picture
+from d4orm_env.scenarios import load_cl_mapf
+from d4orm_planners import Controller, Episode, Policy, evaluate, load_plan, make_planner, make_policy, run_episode
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3, from_torch
 
 
@@ -50,6 +53,11 @@ class Spring(Policy):
 
 def make_vec() -> Any:
     return gymnasium.make_vec("d4orm/Navigation-v0", num_envs=2, vectorization_mode="vector_entry_point")
+
+
+def episode() -> Episode:
+    """Two robots at rest for a step."""
+    return run_episode(navigation_v0.parallel_env(problem=PROBLEM.replace(horizon=1)), "go-to-goal")
 
 
 def controller() -> Controller:
@@ -96,7 +104,6 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: rollout(5, []), "problem is 5; give a Problem"),
         (lambda: save_problem(5, "problem.yaml"), "problem is 5; give a Problem"),
         (lambda: navigation_v0.parallel_env(problem=5), "problem is 5; give a Problem"),
-        (lambda: load_plan(5), "the path of a plan file must be text or a path, not 5"),
         (lambda: controller().step(PROBLEM.start, "now"), "time is 'now'; give the seconds of one clock"),
         (lambda: controller().step(PROBLEM.start, np.nan), "time is nan; give the seconds of one clock"),
         (lambda: controller().step("abc", 0.0), "states must be an array of numbers, not 'abc'"),
@@ -111,6 +118,30 @@ PROBLEM = make_problem("circle", num_robots=2)
 def test_what_python_says(call: Callable[[], object], message: str) -> None:
     with pytest.raises((ValueError, TypeError), match=message):
         call()
+
+
+@pytest.mark.parametrize("path", [5, None, ""])
+@pytest.mark.parametrize(
+    ("call", "what"),
+    [
+        (load_plan, "a plan file"),
+        (load_problem, "a scenario file"),
+        (load_map, "a map"),
+        (load_dynobench, "a problem of dynobench"),
+        (load_cl_mapf, "a problem of CL-CBS or CSDO"),
+        (lambda path: save_problem(PROBLEM, path), "a scenario file"),
+        (lambda path: episode().to_html(path), "a replay"),
+        (lambda path: save_picture(PROBLEM, episode().trajectory, path), "a picture"),
+        (lambda path: save_animation(PROBLEM, episode().trajectory, path), "an animation"),
+        (
+            lambda path: evaluate(policies=["go-to-goal"], scenarios=["circle"], seeds=[0], out=path),
+            "the folder of results",
+        ),
+    ],
+)
+def test_what_is_no_path_is_named(call: Callable[[Any], object], what: str, path: object) -> None:
+    with pytest.raises(ValueError, match=f"^the path of {what} must be text or a path, not {path!r}$"):
+        call(path)
 
 
 def test_a_goal_too_far_for_the_horizon_is_told() -> None:
