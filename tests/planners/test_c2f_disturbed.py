@@ -416,6 +416,35 @@ def test_robots_of_first_order_stray_until_their_next_command_only(model: str, w
     assert deviation.margin_inflation(0.4) == problem.team.largest_radius
 
 
+def unestimated(problem: Problem) -> Deviation:
+    """Compares robots with a model of which nothing is found out."""
+    config = D4ormC2FConfig(delay=0, filter_states=False, learn_limits=False, expect_losses=False, stalls=False)
+    return Deviation(problem, get_sampling_engine("cpu"), config, docks=True)
+
+
+def test_pushes_of_five_steps_add_up() -> None:
+    """Something makes a robot that is told to stay at rest faster by 2 cm/s in every step."""
+    problem, still = hop_problem(1, dt=0.1), np.zeros((1, 2), np.float32)
+    deviation, states, drifts = unestimated(problem), problem.start.copy(), []
+    for _ in range(8):
+        deviation.observe(joint(problem, states))
+        deviation.send(still)
+        drifts.append(deviation.drift)
+        states[:, 0] += states[:, 2] * np.float32(problem.dt)
+        states[:, 2] += np.float32(0.02)
+    # A single push counts half as much again.
+    np.testing.assert_allclose(drifts, [0, 0.03, 0.04, 0.06, 0.08, 0.1, 0.1, 0.1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("drift", "slack"), [(0.019, 0.0), (0.021, 0.021), (0.39, 0.39), (5.0, 0.4)])
+def test_no_more_is_believed_than_two_fifths_of_the_speed_and_no_less_than_a_fiftieth(
+    drift: float, slack: float
+) -> None:
+    deviation = unestimated(hop_problem(1))
+    deviation.drift = drift
+    assert deviation.speed_slack == pytest.approx(slack)
+
+
 def test_who_stands_whatever_it_is_told_is_taken_for_docked_until_it_moves() -> None:
     problem = hop_problem(3)
     stall, states = StallEstimator(problem), problem.start.copy()
@@ -538,6 +567,18 @@ def test_with_caution_robots_could_still_brake_a_step_later_and_faster(wide: flo
     wanted = np.array([[-0.9, 0.2]], np.float32)
     safe = safe_velocities(problem, joint(problem, np.zeros((1, 4))), wanted, np.ones(1, bool), 0.02, 0.3)
     np.testing.assert_allclose(safe, [[-allowed, 0.2]], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("apart", "allowed"),  # sqrt(2 * 2 * 1.13 + 0.2**2) - 0.2 - 0.3 for both together, by 1 m/s^2 each
+    [(1.45, (np.sqrt(4.56) - 0.5) / 2), (1.55, 1.0)],
+)
+def test_robots_mind_each_other_from_ten_thirds_of_a_radius_and_two_stops_on(apart: float, allowed: float) -> None:
+    problem, states = hop_problem(2, dt=0.1), np.zeros((2, 4), np.float32)
+    states[1, 0] = apart
+    wanted = np.array([[1, 0], [-1, 0]], np.float32)
+    safe = safe_velocities(problem, joint(problem, states), wanted, np.ones(2, bool), 0.02, 0.3)
+    np.testing.assert_allclose(safe, [[allowed, 0], [-allowed, 0]], atol=1e-4)
 
 
 def test_robots_of_first_order_stop_within_a_time_step() -> None:

@@ -29,11 +29,11 @@ from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.d4orm_c2f import fine_plan
 from d4orm_planners.d4orm_c2f.coarse_plan import CoarsePlanning, coarse_problem
 from d4orm_planners.d4orm_c2f.direct_final_approach import direct_final_approach
-from d4orm_planners.d4orm_c2f.fine_plan import Window
+from d4orm_planners.d4orm_c2f.fine_plan import Situation, Window
 from d4orm_planners.d4orm_c2f.receding_horizon import D4ormC2F
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
-from d4orm_planners.engine.sampling_types import get_sampling_engine
+from d4orm_planners.engine.sampling_types import SamplingResult, get_sampling_engine
 from d4orm_planners.tracking.steering import straight_drives
 
 CASES = [
@@ -462,6 +462,26 @@ def replanned(
 
 def straight(problem: Problem, joint: JointState, factor: int) -> Any:
     return straight_drives(coarse_problem(problem.with_state(joint.states, joint.goals), factor)).controls[:, :, 0]
+
+
+class Still(CpuSamplingEngine):
+    """Sampling that changes nothing."""
+
+    def denoise(self, task: Any, rules: Any, mean: Any, noise_scale: Any, *more: Any, **options: Any) -> SamplingResult:
+        return SamplingResult(np.zeros_like(task.base), np.zeros(len(noise_scale), np.float32), 0)
+
+
+def test_who_cannot_follow_its_path_carefully_moves_as_sampled() -> None:
+    """Its path leads into a wall; what was sampled leads along that."""
+    wall = World(2, boxes=[[0.9, -5, 1, 5]])
+    problem = Problem(Team(("holonomic2d",)), np.zeros((1, 4)), [[0, 9]], wall, horizon=100, dt=0.1)
+    window = Window(problem, D4ormC2FConfig(), Still(), docks=True)
+    along, into = window.no_controls(), window.no_controls()
+    along[:, 0, 1], into[:, 0, 0] = 0.3, 1.0
+    nobody, nothing = np.zeros(1, bool), np.zeros((1, 2), np.float32)
+    present = JointState(states=problem.start, goals=problem.goal, controls=nothing, arrived=nobody, steps=0)
+    now = Situation(present, nobody, problem.goal / 3, along, along[:0], into, np.ones(1, bool), inflation=0.0)
+    np.testing.assert_array_equal(window.predict(now, seed=0).controls[: len(along)], along)
 
 
 def test_robots_within_the_margin_of_each_other_part() -> None:
