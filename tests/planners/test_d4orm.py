@@ -14,6 +14,7 @@ from d4orm_planners import Plan, make_planner
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.engine.cpu_sampling import CpuSamplingEngine
 from d4orm_planners.engine.sampling_types import SamplingTask, get_sampling_engine
+from d4orm_planners.sampling.d4orm import D4orm
 
 BUDGET = 25
 """Five times the iterations that any of some twenty seeds takes: other rounding makes another plan."""
@@ -156,6 +157,17 @@ def test_without_a_solution_the_teams_reward_and_more_samples_take_turns() -> No
     in_turn = [("robot", 8), ("team", 8)] * 4
     expected = [*in_turn, *[("team", 32)] * 8, *in_turn, *[("team", 32)] * 2]
     assert asked[-26:] == expected, "the first of all compiles, if nothing has before"
+
+
+def test_the_teams_reward_has_all_samples_at_every_step_where_no_solution_is_found() -> None:
+    planner = make_planner("d4orm", engine="cpu", credit="alternate", num_samples=8, num_steps=10, late_samples=0.5)
+    assert isinstance(planner, D4orm)
+    search = SolveRun(planner, walled_in_problem(), 0)
+    drawn = []
+    for _ in range(9):
+        drawn.append([(len(scale), samples) for scale, samples in planner.stages(search)])
+        search.advance()
+    assert drawn == [[(3, 8), (7, 4)]] * 8 + [[(10, 32)]]
 
 
 def test_who_pays_for_both_sides_of_a_contact_makes_way() -> None:

@@ -513,6 +513,19 @@ def test_the_paper_presets_of_the_methods_own_parameters() -> None:
     assert mbd.num_steps == mbd.check_every * mbd.max_iterations == 10_000
 
 
+def test_the_authors_presets_are_what_they_published() -> None:
+    d4orm = make_planner("d4orm", preset="authors").config
+    assert (d4orm.penalty_per_pair, d4orm.penalty, d4orm.random_start, d4orm.late_samples) == (True, 1, False, 1)
+    cem = make_planner("cem", preset="authors").config
+    assert (cem.penalty_per_pair, cem.adapt_variance, cem.carry_variance, cem.sigma_floor) == (True, True, True, 0.1)
+
+
+@WITH_PRESETS
+def test_every_preset_makes_a_planner(name: str) -> None:
+    for preset in PLANNERS[name].presets:
+        assert make_planner(name, preset=preset).name == name
+
+
 @WITH_PRESETS
 def test_settings_override_the_preset(name: str) -> None:
     config = make_planner(name, preset="paper", engine="cpu", max_iterations=7).config

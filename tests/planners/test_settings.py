@@ -206,3 +206,10 @@ def test_policies_are_told_by_the_file_that_they_act_by(tmp_path: Path) -> None:
 def test_noise_beyond_all_limits_is_refused() -> None:
     with pytest.raises(ValueError, match=r"beta_end is 0\.999999, with noise of .* times the limits; give less"):
         make_planner("d4orm", beta_end=0.999999)
+
+
+def test_the_noise_that_is_refused_is_the_largest_of_all_steps() -> None:
+    """A million times the limits in the first denoising step, three quarters of that in the next."""
+    make_planner("d4orm", beta_end=0.455)
+    with pytest.raises(ValueError, match=r"beta_end is 0\.46, with noise of 1e\+06 times the limits; give less"):
+        make_planner("d4orm", beta_end=0.46)
