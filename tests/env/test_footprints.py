@@ -17,7 +17,7 @@ from shapely import affinity
 from shapely import geometry as shapely
 
 from d4orm_env import Problem, Team, World, load_problem, make_problem, navigation_v0, rollout, save_problem, verify
-from d4orm_env.core.bodies import world_gap
+from d4orm_env.core.bodies import pair_gap, world_gap
 from d4orm_env.engine.choice import get_engine
 from d4orm_env.footprints import Box, Capsule, Disc, Ellipsoid, Footprint, Polygon
 from d4orm_env.scenarios.settings import parsed
@@ -66,6 +66,22 @@ def gaps(states: np.ndarray) -> np.ndarray:
         others = [core.distance(thing) - rounding - size for thing, size in things]
         least[robot] = min(least[robot], ends.min(), *others)
     return least
+
+
+def test_gaps_of_footprints_at_rest_are_those_of_shapely() -> None:
+    random, apart = np.random.default_rng(0), 0
+    for _ in range(40):
+        poses = np.column_stack([random.uniform(-0.6, 0.6, (len(SHAPES), 2)), random.uniform(-3, 3, len(SHAPES))])
+        bodies = [outline(footprint, *pose) for footprint, pose in zip(SHAPES, poses, strict=True)]
+        for i, j in combinations(range(len(SHAPES)), 2):
+            (one, its), (other, others) = bodies[i], bodies[j]
+            gap = pair_gap(SHAPES[i], poses[i], SHAPES[j], poses[j])
+            if one.disjoint(other):
+                assert gap == pytest.approx(one.distance(other) - its - others, abs=1e-9)
+                apart += 1
+            else:
+                assert gap <= 0
+    assert 100 < apart < 390
 
 
 @pytest.mark.parametrize("engine", ENGINE_NAMES)

@@ -112,6 +112,15 @@ def test_obstacles_and_walls_come_nearest_first() -> None:
     assert set(part(first, "obstacle_6").values()) == {0.0}
 
 
+def test_polygons_are_seen_among_other_obstacles() -> None:
+    triangles = [[(-1, 1), (1, 1), (0, 2)], [(-5, 0), (-6, 1), (-6, -1)], [(0, -7), (-1, -8), (1, -8)]]
+    world = World(2, circles=[[3, -4, 1]], polygons=triangles)
+    seen = observe(PLANAR.replace(world=world), num_obstacles=4)[0]
+    # A side 1 m above, the circle as before, and then two corners.
+    for i, (x, y, gap) in enumerate([(0, 1, 0.75), (2.4, -3.2, 3.75), (-5, 0, 4.75), (0, -7, 6.75)]):
+        assert part(seen, f"obstacle_{i}") == close({"present": 1, "position_x": x, "position_y": y, "gap": gap})
+
+
 def test_the_nearest_point_of_a_box_may_be_its_corner() -> None:
     obstacle = part(observe(PLANAR, [[4, 6, 0, 0], [0, 3, 0, 1], [-5, 0, 0, 0]])[0], "obstacle_1")
     # From (4, 6) to the corner (1, 2): 5 m; the upper wall at 2 m comes before it.

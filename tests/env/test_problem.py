@@ -312,6 +312,11 @@ def test_limits_of_a_mixed_team() -> None:
     assert team.radius.tolist() == [np.float32(0.1)] * 3
 
 
+def test_lengths_are_measured_by_the_largest_radius() -> None:
+    assert Team(("velocity2d",) * 2).largest_radius == 0.15
+    assert Team(("velocity2d",) * 3, radius=[0.2, 0.6, 0.3]).largest_radius == pytest.approx(0.6, rel=1e-7)
+
+
 def test_control_limits_are_zero_on_padding(monkeypatch: pytest.MonkeyPatch) -> None:
     # All planar models have two controls today; a model with one shows what padding means.
     from d4orm_env.dynamics import models as dynamics

@@ -19,6 +19,20 @@ def test_a_team_of_robots_by_name(name: str) -> None:
         np.testing.assert_allclose(getattr(team, limit), getattr(robot, limit), rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "radius"),
+    [
+        ("crazyflie", 0.07),
+        ("crazyflie_brushless", 0.08),
+        ("turtlebot3_burger", 0.105),
+        ("robomaster", np.hypot(0.32, 0.24) / 2),
+        ("jackal", np.hypot(0.508, 0.43) / 2),
+    ],
+)
+def test_robots_are_as_large_as_their_makers_say(name: str, radius: float) -> None:
+    assert ROBOTS[name].radius == pytest.approx(radius, abs=5e-4)
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_sources_name_attributes(name: str) -> None:
     robot = ROBOTS[name]
