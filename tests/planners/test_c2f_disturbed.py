@@ -405,6 +405,16 @@ def test_no_manoeuvre_leads_through_what_stands() -> None:
     np.testing.assert_array_equal(chosen, controls)
 
 
+@pytest.mark.parametrize(("aside", "home"), [(0.36, True), (0.34, False)])
+def test_a_car_drives_home_past_who_has_docked_only_as_far_from_it_as_it_must_be(aside: float, home: bool) -> None:
+    """At 1 m/s and in a straight line it is nearest to the other, 1 cm more or less than the margin, after a step."""
+    start = np.float32([[0, 0, 0, 1, 0], [0.1, -aside, 0, 0, 0]])
+    problem = Problem(Team(("car", "car")), start, [[4, 0], start[1, :2]], horizon=60, dt=0.1, margin=0.05)
+    controls, first = np.zeros((60, 2, 2), np.float32), np.array([True, False])
+    _, final = direct_final_approach(problem, get_sampling_engine("cpu"), controls, first, ~first)
+    assert final.tolist() == [home, False]
+
+
 @pytest.mark.parametrize(("model", "within"), [("unicycle", 0.1), ("differential_drive", 0.4)])
 def test_robots_of_first_order_stray_until_their_next_command_only(model: str, within: float) -> None:
     policy, problem = controller(), make_problem("random", num_robots=2, seed=1, model=model)

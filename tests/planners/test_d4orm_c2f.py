@@ -484,6 +484,21 @@ def test_who_cannot_follow_its_path_carefully_moves_as_sampled() -> None:
     np.testing.assert_array_equal(window.predict(now, seed=0).controls[: len(along)], along)
 
 
+@pytest.mark.parametrize(("aside", "goes_on"), [(0.36, False), (0.34, True)])
+def test_who_would_come_too_near_in_the_first_step_goes_on_with_its_last_plan(aside: float, goes_on: bool) -> None:
+    """It passes a robot that has docked, and is nearest to it, 1 cm more or less than the margin, after one step."""
+    start = np.float32([[0, 0, 1, 0], [0.1, -aside, 0, 0]])
+    problem = Problem(Team(("holonomic2d",) * 2), start, [[9, 0], start[1, :2]], horizon=100, dt=0.1, margin=0.05)
+    window = Window(problem, D4ormC2FConfig(), Still(), docks=True)
+    sampled, left = window.no_controls(), window.no_controls()
+    left[:, 0, 1] = 0.3
+    docked, nothing = np.array([False, True]), np.zeros((2, 2), np.float32)
+    present = JointState(states=problem.start, goals=problem.goal, controls=nothing, arrived=docked, steps=0)
+    now = Situation(present, docked, problem.goal, sampled, left, None, np.zeros(2, bool), inflation=0.0)
+    expected = left if goes_on else sampled
+    np.testing.assert_array_equal(window.predict(now, seed=0).controls[: len(left)], expected)
+
+
 def test_robots_within_the_margin_of_each_other_part() -> None:
     start = np.array([[0, 0, 0, 0], [0.33, 0, 0, 0]], np.float32)
     problem = Problem(Team(("holonomic2d",) * 2), start, start[:, :2] + [[-1, 0], [1, 0]], horizon=60, margin=0.05)

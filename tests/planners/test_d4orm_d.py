@@ -185,6 +185,20 @@ class Recorded(Astray):
         return super().denoise(task, rules, mean, noise_scale, *more, **options)
 
 
+def test_the_paper_preset_goes_on_with_the_whole_team_once_there_was_a_solution() -> None:
+    """Even from a worse plan: sampling goes wrong, and nobody comes to its goal on the left in the first iteration."""
+    problem, engine = hop_problem(3), Recorded()
+    problem = problem.replace(goal=problem.start[:, :2] - [0.5, 0])
+    controls = np.zeros((problem.horizon, 3, 2), np.float32)
+    controls[..., 0] = -1
+    search = SolveRun(make_planner("d4orm-d", preset="paper", engine="cpu", improve=True), problem, 0, controls, engine)
+    assert search.best.solved
+    search.advance()
+    assert search.current.failed.all()
+    search.advance()
+    assert [task.problem.num_robots for task in engine.tasks] == [3, 3]
+
+
 def test_robots_that_were_repaired_in_vain_are_repaired_jointly_and_every_other_noise_is_wider() -> None:
     """Two robots meet in a lane where neither can pass the other, whatever they are told."""
     start = [[0, 0, 0, 0], [2, 0, 0, 0]]
