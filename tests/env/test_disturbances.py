@@ -761,6 +761,15 @@ def test_an_episode_records_the_truth_and_where_it_was_disturbed(tmp_path: Any) 
     assert run_episode(navigation_v0.parallel_env(problem=EARLY), "random").events is None
 
 
+def test_events_until_a_step_end_with_it() -> None:
+    env = navigation_v0.parallel_env("circle", 3, disturbances=[Push(2.0, 0.3), Intruder(2)], max_cycles=8)
+    events = run_episode(env, "go-to-goal").events
+    for step in (0, 5):
+        first = events.until(step)
+        assert len(first.pushed) == len(first.stalled) == len(first.bodies) == step + 1
+        np.testing.assert_array_equal(first.bodies, events.bodies[: step + 1])
+
+
 @pytest.mark.parametrize("scenario", ["circle", "sphere"])
 def test_pictures_show_where_it_was_disturbed(scenario: str, tmp_path: Any) -> None:
     disturbances = [Push(2.0, 0.3), Stall(1.0, robots=1), Intruder(2)]

@@ -337,3 +337,19 @@ def test_gaps_of_ellipsoids_along_their_axes(obstacles: Any, gap: float) -> None
     """Of semi-axes 0.1, 0.2, 0.3 m at the origin: that much less than to the obstacle."""
     world = World(3, **obstacles)
     assert world_gap(world, Ellipsoid(0.1, 0.2, 0.3), np.zeros(4)) == pytest.approx(gap, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "gap"),
+    [
+        ({"spheres": [[3, 1, 3, 0.2]]}, 0.7),
+        ({"cylinders": [[2, 0, 0.2]]}, 0.6),
+        ({"boxes": [[1, 0, 3.5, 3, 2, 5]]}, 0.2),
+        ({"lower": [-9, -9, 2], "upper": [9, 9, 9]}, 0.7),
+        ({"lower": [-9, -9, -9], "upper": [2.5, 9, 9]}, 0.4),
+    ],
+)  # fmt: skip
+def test_gaps_of_ellipsoids_elsewhere(obstacles: Any, gap: float) -> None:
+    """The same one at (2, 1, 3)."""
+    pose = np.array([2.0, 1.0, 3.0, 0.0])
+    assert world_gap(World(3, **obstacles), Ellipsoid(0.1, 0.2, 0.3), pose) == pytest.approx(gap, abs=1e-3)

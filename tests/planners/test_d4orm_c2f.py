@@ -499,6 +499,17 @@ def test_who_would_come_too_near_in_the_first_step_goes_on_with_its_last_plan(as
     np.testing.assert_array_equal(window.predict(now, seed=0).controls[: len(left)], expected)
 
 
+@pytest.mark.parametrize(("apart", "touches"), [(0.44, True), (0.46, False)])
+def test_robots_at_rest_touch_what_moves_within_the_gap(apart: float, touches: bool) -> None:
+    """A robot of 0.15 m, a body of 0.25 m that passes it at that distance, and a gap of 5 cm."""
+    problem = Problem(Team(("holonomic2d",)), np.zeros((1, 4)), [[9, 0]], horizon=100, dt=0.1)
+    window = Window(problem, D4ormC2FConfig(), get_sampling_engine("cpu"), docks=True)
+    nobody, nothing = np.zeros(1, bool), np.zeros((1, 2), np.float32)
+    body = np.float32([[-1, apart, 1, 0, 0.25]])
+    present = JointState(problem.start, problem.goal, nothing, nobody, 0, body)
+    assert window.touching(present, nobody, window.no_controls(), gap=0.05).tolist() == [touches]
+
+
 def test_robots_within_the_margin_of_each_other_part() -> None:
     start = np.array([[0, 0, 0, 0], [0.33, 0, 0, 0]], np.float32)
     problem = Problem(Team(("holonomic2d",) * 2), start, start[:, :2] + [[-1, 0], [1, 0]], horizon=60, margin=0.05)
