@@ -80,6 +80,18 @@ def test_arc_tangent_in_every_quadrant() -> None:
     np.testing.assert_array_equal(np.signbit(angle), np.signbit(expected))
 
 
+def test_normal_numbers_are_those_of_box_and_muller() -> None:
+    few = portable.standard_normal(np.random.default_rng(0), (5,))
+    expected = [1.21496853, -0.62155869, -0.03716189, -0.17575347, 1.68164778]
+    np.testing.assert_allclose(few, expected, rtol=1e-6)
+    many = portable.standard_normal(np.random.default_rng(0), (4, 25_000))
+    assert (many.shape, many.dtype) == ((4, 25_000), np.float32)
+    # Moments of the normal distribution, and how much of it lies within one, two and three standard deviations.
+    np.testing.assert_allclose([np.mean(many**power) for power in (1, 2, 3, 4)], [0, 1, 0, 3], atol=0.05)
+    within = [np.mean(np.abs(many) < deviations) for deviations in (1, 2, 3)]
+    np.testing.assert_allclose(within, [0.6827, 0.9545, 0.9973], atol=0.005)
+
+
 def test_special_values() -> None:
     assert np.signbit(portable.sin(-0.0))
     assert portable.cos(0.0) == portable.exp(0.0) == portable.exp(-0.0) == 1
