@@ -110,7 +110,8 @@ def approach_by_manoeuvres(
     found = length[every, best] <= len(moves)
     chosen = rollouts.controls[: len(controls), every, best]
     controls = controls.copy()
-    controls[:, robots[found], : chosen.shape[2]] = chosen[:, found]
+    controls[: len(chosen), robots[found], : chosen.shape[2]] = chosen[:, found]
+    controls[len(chosen) :, robots[found]] = 0  # by then they have arrived
     manoeuvring[robots[found]] = True
     return controls, manoeuvring
 

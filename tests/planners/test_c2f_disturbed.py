@@ -376,6 +376,18 @@ def test_a_car_beside_its_goal_drives_away_and_comes_again(beside: float) -> Non
     assert run_episode(env, controller(), seed=0).metrics["success"]
 
 
+@pytest.mark.parametrize(("beside", "steps"), [(0.1, 21), (0.6, 30)])
+def test_of_manoeuvres_the_first_to_arrive_is_taken_however_far_is_predicted(beside: float, steps: int) -> None:
+    """The longest that are tried have 55 steps."""
+    window, arrived, engine = parked_cars(beside=beside), np.array([False, True]), get_sampling_engine("cpu")
+    still = np.zeros((100, 2, 2), np.float32)
+    controls, home = direct_final_approach(window, engine, still, np.zeros(2, bool), arrived)
+    assert home.tolist() == [True, False]
+    assert np.argmax(engine.rollout(window, controls).arrived[:, 0]) == steps
+    sooner, _ = direct_final_approach(window.replace(horizon=20), engine, still[:20], np.zeros(2, bool), arrived)
+    np.testing.assert_array_equal(sooner, controls[:20])
+
+
 def test_manoeuvres_lead_by_points_a_quarter_one_and_two_turning_radii_away(monkeypatch: pytest.MonkeyPatch) -> None:
     window, tried = parked_cars(beside=0.1).replace(horizon=20), []
 
@@ -430,6 +442,19 @@ def unestimated(problem: Problem) -> Deviation:
     """Compares robots with a model of which nothing is found out."""
     config = D4ormC2FConfig(delay=0, filter_states=False, learn_limits=False, expect_losses=False, stalls=False)
     return Deviation(problem, get_sampling_engine("cpu"), config, docks=True)
+
+
+@pytest.mark.parametrize(("filters", "lowest", "highest"), [(True, 0.0, 0.014), (False, 0.016, 0.024)])
+def test_noisy_states_of_robots_are_filtered_if_asked_for(filters: bool, lowest: float, highest: float) -> None:
+    """Robots stand, and are measured with errors of 2 cm and 2 cm/s."""
+    problem, still, random = hop_problem(3), np.zeros((3, 2), np.float32), np.random.default_rng(0)
+    config = D4ormC2FConfig(delay=0, filter_states=filters, learn_limits=False, expect_losses=False, stalls=False)
+    deviation, errors = Deviation(problem, get_sampling_engine("cpu"), config, docks=True), []
+    for _ in range(100):
+        seen = deviation.observe(joint(problem, problem.start + random.normal(0, 0.02, (3, 4))))
+        deviation.send(still)
+        errors.append(seen.states - problem.start)
+    assert lowest < np.std(errors[50:]) < highest
 
 
 def test_pushes_of_five_steps_add_up() -> None:
