@@ -39,8 +39,8 @@ def find_physics(physics: str) -> tuple[Any, dict[str, Any]]:
     kind, settings = getattr(module, PHYSICS[name]), {}
     for part in listed.split(","):
         setting, equals, text = part.partition("=")
-        if not equals:
-            raise ValueError(f"physics is {short_repr(physics)}; settings are of the form {name}:name=value,name=value")
+        if not equals or setting in settings:
+            raise ValueError(f"physics is {short_repr(physics)}; give settings once each, as {name}:name=value,...")
         if setting not in kind.__dataclass_fields__:
             raise no_setting(setting, f"physics {name!r}", kind.__dataclass_fields__)
         settings[setting] = parse_yaml(text)
