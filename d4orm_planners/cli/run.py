@@ -142,7 +142,7 @@ def run(options: RunOptions) -> None:
         episode.to_html(options.out)
     if not options.quiet:
         print_table("Execution", episode_rows(episode))
-        tell_written(options.out)
+        tell_written(options.out, options.picture, options.animation)
     if isinstance(policy, OpenLoop) and policy.plan is not None:
         require_solved(policy.plan)
     require_success(episode, problem)

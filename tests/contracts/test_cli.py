@@ -128,6 +128,13 @@ def test_run_executes_a_plan_file(d4orm) -> None:
     assert "success" in outcome.out
 
 
+def test_run_tells_which_pictures_it_has_written(d4orm) -> None:
+    files = ("--out", "run.html", "--picture", "run.png", "--animation", "run.gif")
+    outcome = d4orm("run", "--policy", "go-to-goal", "--num-robots", "1", *files)
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.splitlines()[-3:] == [f"wrote {name}" for name in files[1::2]]
+
+
 def test_run_of_a_policy_that_collides_exits_with_one(d4orm) -> None:
     outcome = d4orm("run", "--policy", "go-to-goal", "--num-robots", "2")
     assert outcome.status == 1
