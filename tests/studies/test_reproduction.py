@@ -19,7 +19,8 @@ from examples.studies.paper.figure import Figure, Group, Section, grouped
 from examples.studies.paper.figure_report import markdown, write_figure
 from examples.studies.paper.numbers import METRICS, first_solution, measured
 from examples.studies.paper.paper_figures import FIGURES
-from examples.studies.paper.plots import PLOTS, best_reward
+from examples.studies.paper.plots import PLOTS, add_legend, best_reward
+from matplotlib.figure import Figure as Canvas
 
 from d4orm_planners import list_planners
 from d4orm_planners.evaluation import evaluate
@@ -321,6 +322,18 @@ def test_what_is_never_can_be_drawn(tmp_path: Path) -> None:
     drawn = figure(plots=("runtime", "survival"))
     paths = write_figure(tmp_path, drawn, [Group("Circle", "ipopt", [solved, solved, never])])
     assert paths[-1].read_bytes().startswith(PNG)
+
+
+LABELS = [("d4orm cem", 2), ("d4orm " * 6, 4), ("as_published_by_them " * 6, 2)]
+
+
+@pytest.mark.parametrize(("labels", "columns"), LABELS)
+def test_a_legend_has_the_columns_that_fit(labels: str, columns: int) -> None:
+    canvas = Canvas(figsize=(5.0, 3.0), layout="constrained")
+    lines = [canvas.subplots().plot([0, 1])[0] for _ in labels.split()]
+    legend = add_legend(canvas, lines, labels.split(), most=4)
+    assert legend.get_window_extent().width <= canvas.bbox.width
+    assert legend._ncols == columns
 
 
 def test_every_policy_is_run_with_every_number_of_nodes(tmp_path: Path) -> None:

@@ -18,7 +18,10 @@ from d4orm_planners.evaluation.comparison import survival
 from d4orm_planners.evaluation.store import BestSoFar, Trial
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+    from matplotlib.legend import Legend
 
 NUMERIC: Mapping[str, str] = MappingProxyType(
     {"num_robots": "robots", "nodes": "nodes", "control_noise_std": "standard deviation of the noise"}
@@ -52,8 +55,19 @@ def draw(path: Path, figure: Figure, groups: Sequence[Group], rows: Sequence[Mea
                 ax.label_outer()
     handles, labels = axes[0, 0].get_legend_handles_labels()
     if len(labels) > 1:
-        canvas.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 2 + 2 * len(titles)))
+        add_legend(canvas, handles, labels, most=2 + 2 * len(titles))
     canvas.savefig(path, dpi=130)
+
+
+def add_legend(canvas: Canvas, handles: Sequence[Artist], labels: Sequence[str], most: int) -> Legend:
+    """A legend below the plots, with as many columns as there are labels, the figure is wide, and ``most`` allows."""
+    columns = min(len(labels), most)
+    legend = canvas.legend(handles, labels, loc="outside lower center", ncols=columns)
+    while columns > 1 and legend.get_window_extent().width > canvas.bbox.width:
+        legend.remove()
+        columns -= 1
+        legend = canvas.legend(handles, labels, loc="outside lower center", ncols=columns)
+    return legend
 
 
 Shown = Sequence[tuple[Group, Measured]]
