@@ -166,13 +166,17 @@ class ProblemOptions:
         )
 
 
+_EXAMPLES = {"--scenario-set": "diameter=8", "--reward-set": "contact=5", "--learner-set": "gradient_steps=8"}
+
+
 def parse_settings(settings: list[str] | None, option: str = "--set") -> dict[str, Any]:
     """``name=value`` texts, given to an option, as a dictionary, the values read as YAML 1.2."""
     values: dict[str, object] = {}
     for setting in settings or []:
         name, separator, text = setting.partition("=")
         if not separator or not name:
-            raise ValueError(f"{option} {setting!r} is not of the form name=value, as num_samples=512")
+            example = _EXAMPLES.get(option, "num_samples=512")
+            raise ValueError(f"{option} {setting!r} is not of the form name=value, as {example}")
         _add(values, name, text if text.strip() else "null", option, f"{setting!r}: the value")
     return values
 

@@ -221,7 +221,7 @@ BAD = [
     (("plan", "--scenario", "map"), "scenario 'map' needs map=, the path of a .map file"),
     (("plan", "--scenario", "map", "--scenario-set", "map=missing.map"), "missing.map: cannot be read"),
     (("run", "--scenario", "map", "--scenario-set", "map=nan.yaml"), "nan.yaml: has no field 'image'"),
-    (("plan", "--scenario", "maze", "--scenario-set", "loops"), "--scenario-set 'loops' is not of the form name=value"),
+    (("plan", "--scenario", "maze", "--scenario-set", "loops"), "'loops' is not of the form name=value, as diameter=8"),
     (("plan", "--scenario", "maze", "--scenario-set", "loop=1"), "takes no argument 'loop'"),
     (("plan", "--scenario-set", "num_robots=3"), "--scenario-set num_robots is said by --num-robots; use that"),
     (("plan", "--scenario", "good.yaml", "--scenario-set", "dt=1"), "--scenario-set does not go with a scenario"),
