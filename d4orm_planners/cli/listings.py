@@ -32,8 +32,8 @@ def planners(
 
 
 def _or_error(describe: Callable[[str], str], name: str) -> str:
-    """A description, or why there is none: what another package brings may be broken."""
+    """A description as plain text, or why there is none: what another package brings may be broken."""
     try:
-        return describe(name)
+        return describe(name).replace("``", "")
     except ValueError as error:
         return f"unusable: {error}"

@@ -193,6 +193,7 @@ def test_lists(d4orm, command: str) -> None:
     outcome = d4orm(command)
     assert outcome.status == 0
     assert {"scenarios": "amswarm_5", "planners": "d4orm"}[command] in outcome.out
+    assert "``" not in outcome.out
 
 
 @pytest.mark.parametrize(
