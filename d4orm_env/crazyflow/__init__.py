@@ -5,6 +5,8 @@ controller of the Crazyflie (D. Mellinger and V. Kumar, "Minimum snap trajectory
 ICRA, 2011), both at 500 Hz.
 """
 
+import contextlib
+import io
 import os
 import sys
 from importlib.util import find_spec
@@ -19,6 +21,9 @@ if os.environ.get("SCIPY_ARRAY_API") != "1":
             "SCIPY_ARRAY_API=1, or import d4orm_env.crazyflow first"
         )
     os.environ["SCIPY_ARRAY_API"] = "1"
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX's own words on libraries that it goes without
+    import crazyflow.sim  # noqa: F401
 
 from d4orm_env.crazyflow.environment import DroneBodies, DronePhysics, check_problem, parallel_env
 from d4orm_env.crazyflow.flight import FlightRecord

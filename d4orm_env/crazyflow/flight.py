@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from crazyflow.control import Control
 from crazyflow.drones import Drone
@@ -76,11 +79,22 @@ class Flight:
         self.position, self.velocity = (np.asarray(part[0], np.float64) for part in (states.pos, states.vel))
 
 
+@contextmanager
+def _no_warnings_of_mujoco() -> Iterator[None]:
+    """What MuJoCo warns of is neither printed nor written to a MUJOCO_LOG.TXT in the current folder."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
+
+
 @cache
 def _compiled(num_drones: int, drone: str) -> tuple[Any, Any]:
     """The simulation of so many drones, and the function that flies setpoints; both take seconds to make."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # MuJoCo's, of the scene that crazyflow draws
+    with warnings.catch_warnings(), _no_warnings_of_mujoco():
+        warnings.simplefilter("ignore")  # of the scene that crazyflow draws
         sim = Sim(
             n_drones=num_drones,
             drone=Drone(drone),

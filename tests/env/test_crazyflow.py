@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -54,6 +56,18 @@ def test_another_physics_in_place_of_an_environments_own() -> None:
     assert not np.array_equal(own.trajectory.states, other.trajectory.states)
     with pytest.raises(ValueError, match="physics is 'bullet'; choose one of model, mujoco, crazyflow"):
         run_episode(env, "go-to-goal", physics="bullet")
+
+
+@needs_crazyflow
+def test_its_libraries_print_nothing_and_leave_no_file(tmp_path: Path) -> None:
+    program = (
+        "from d4orm_env.crazyflow import DronePhysics\n"
+        "from d4orm_env.crazyflow.flight import Flight\n"
+        "Flight(2, DronePhysics().drone, 1.0, 1.0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+    assert not list(tmp_path.iterdir())
 
 
 @needs_crazyflow
