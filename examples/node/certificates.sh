@@ -1,17 +1,22 @@
 #!/usr/bin/env bash
-# Makes a certificate authority and a certificate for each robot, signed by it:
+# Makes a certificate authority, if the folder has none yet, and a certificate for each robot, signed by it:
 #
 #   certificates.sh FOLDER robot0=192.168.1.10 robot1=192.168.1.11
 #
 # Copy ca.pem and the robot's own robot.key and robot.pem to each robot. Keep ca.key where no robot can read it.
 set -euo pipefail
 umask 077
+if [ $# -lt 2 ]; then
+  echo "usage: certificates.sh FOLDER NAME=ADDRESS..., as robot0=192.168.1.10" >&2
+  exit 2
+fi
 folder=$1
 shift
 mkdir -p "$folder"
 
-openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 365 -subj "/CN=d4orm team" \
-  -keyout "$folder/ca.key" -out "$folder/ca.pem"
+[ -e "$folder/ca.key" ] ||
+  openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 365 -subj "/CN=d4orm team" \
+    -keyout "$folder/ca.key" -out "$folder/ca.pem"
 
 for robot in "$@"; do
   name=${robot%%=*}
