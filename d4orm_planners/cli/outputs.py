@@ -19,6 +19,7 @@ from rich.text import Text
 from d4orm_env import render
 from d4orm_env.core.files import target_of
 from d4orm_env.core.infeasibility import prove_infeasible
+from d4orm_env.core.summary_line import count
 from d4orm_planners.base.display import one_line
 from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.cli.options import Quiet
@@ -134,7 +135,7 @@ def print_table(title: str, rows: list[tuple[str, str]]) -> None:
 def require_solved(plan: Plan) -> None:
     """Say why, and end with status 1, if a plan is no solution."""
     if not plan.solved:
-        ended = f"no solution found ({plan.status.replace('_', ' ')} after {plan.iterations} iterations)"
+        ended = f"no solution found ({plan.status.replace('_', ' ')} after {count(plan.iterations, 'iteration')})"
         _tell_reasons("there is no solution" if plan.status == "infeasible" else ended, plan.failures)
         raise typer.Exit(1)
 

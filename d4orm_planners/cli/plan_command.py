@@ -127,11 +127,11 @@ def export(
     plan, rates = read_plan(plan_file, scenario), {} if rate is None else {"rate": rate}
     with output_folder(out):
         report = plan.export(format, out, height=height, max_acceleration=max_acceleration, max_jerk=max_jerk, **rates)
+    gaps = {"least gap between robots": report.min_separation, "least gap to obstacles": report.min_clearance}
     rows = [
         ("files", f"{len(report.files)} in {out}"),
         ("duration", f"{report.duration:.2f} s, {report.stretch:.2f} times the plan's"),
-        ("least gap between robots", f"{report.min_separation:.3f} m"),
-        ("least gap to obstacles", f"{report.min_clearance:.3f} m"),
+        *((name, f"{gap:.3f} m") for name, gap in gaps.items() if gap < np.inf),
         ("deviation from the plan", f"{report.deviation:.3f} m"),
     ]
     if plan.problem.dimension == 3:

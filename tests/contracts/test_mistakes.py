@@ -198,4 +198,4 @@ def test_what_the_command_line_says(d4orm: Callable[..., Any], arguments: tuple[
 def test_a_run_says_why_its_plan_is_no_solution(d4orm: Callable[..., Any]) -> None:
     outcome = d4orm("run", "--policy", "d4orm:max_iterations=1,num_samples=2,num_steps=1", "-k", "16")
     assert outcome.status == 1
-    assert "no solution found (iteration limit after 1 iterations)" in outcome.err
+    assert "no solution found (iteration limit after 1 iteration)" in outcome.err

@@ -478,6 +478,8 @@ def test_the_command(plans: dict[str, Plan], tmp_path: Path, d4orm: Any) -> None
                            "--height", "1")  # fmt: skip
     assert status == 0
     assert "polynomials a robot" in out
+    assert "least gap between robots" in out
+    assert "inf m" not in out  # nothing is in the way
     assert len(list((tmp_path / "out").iterdir())) == 5
     status, _, err = d4orm("export", str(tmp_path / "plan.npz"), "-f", "cvs", "-o", str(tmp_path / "other"))
     assert (status, err.count("\n")) == (2, 1)
