@@ -119,6 +119,15 @@ def test_a_path_round_the_wall_is_a_path() -> None:
     assert not prove_infeasible(Problem(outside.team, outside.start, outside.goal, World(boxes=outside.world.boxes)))
 
 
+@pytest.mark.parametrize(
+    ("walls", "proved"), [([[1, -210, 3, 210]], True), ([[1, -210, 3, -0.125], [1, 0.125, 3, 210]], False)]
+)
+def test_a_room_of_400_m_is_cut_into_coarser_cells_which_prove_less(walls: list[list[float]], proved: bool) -> None:
+    world = World(boxes=walls, lower=[-200, -200], upper=[200, 200])
+    problem = Problem(Team(("holonomic2d",)), [[0, 0, 0, 0]], [[4, 0]], world)
+    assert list(prove_infeasible(problem)) == [0] * proved
+
+
 def test_only_who_is_walled_off_is_named() -> None:
     sealed = sealed_problem()
     start, goal = np.array([[0, 0, 0, 0], [0, 2, 0, 0]]), np.array([[3, 0], [3, 2]])

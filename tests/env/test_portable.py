@@ -159,3 +159,13 @@ def test_the_bits_are_fixed(name: str) -> None:
     x = np.array([0.3, 2.0, 100.5, 12345.678, 1e22])
     arguments = {"exp": (-x[:3],), "arctan2": (x, np.array([1, -2, 70.0, 1e9, -1e22]))}.get(name, (x,))
     assert [value.hex() for value in getattr(portable, name)(*arguments).tolist()] == BITS[name]
+
+
+def test_the_bits_of_arc_tangents_are_fixed_next_to_where_another_formula_begins() -> None:
+    angles = {
+        0.415: "0x1.92cfa0ab9bc1dp-2",
+        0.44: "0x1.a8747d793c3dcp-2",
+        2.427: "0x1.2e11f261169fbp+0",
+        2.454: "0x1.2f1054d5d725ep+0",
+    }
+    assert {slope: portable.arctan2(slope, 1.0).hex() for slope in angles} == angles

@@ -296,6 +296,34 @@ def test_clearance(world: World, point: Any, distance: float) -> None:
     assert world.clearance([[point, point]]).shape == (1, 2)
 
 
+@pytest.mark.parametrize(
+    ("world", "lowest", "highest"),
+    [
+        (World(2, circles=[[1, 2, 3]], boxes=[[5, 0, 6, 1]]), [-2, -1], [6, 5]),
+        (World(3, spheres=[[1, 2, 3, 1]]), [0, 1, 2], [2, 3, 4]),
+        (World(3, cylinders=[[4, -1, 0.5]]), [3.5, -1.5, 0], [4.5, -0.5, 0]),
+        (World(3, cylinders=[[4, -1, 0.5]], lower=[-9, -8, -7], upper=[9, 8, 7]), [-9, -8, -7], [9, 8, 7]),
+    ],
+)
+def test_a_world_reaches_as_far_as_its_obstacles_and_bounds(
+    world: World, lowest: list[float], highest: list[float]
+) -> None:
+    points = np.concatenate(world.extremes())
+    assert points.min(axis=0).tolist() == lowest
+    assert points.max(axis=0).tolist() == highest
+
+
+def test_key_figures_say_how_large_the_world_is() -> None:
+    assert two_robots(world=World(boxes=[[-3, 2, 3, 3]], lower=[-4, -3], upper=[4, 5.5])).key_figures == [
+        ("robots", "1 holonomic2d, 1 velocity2d"),
+        ("world", "8 x 8.5 m, 1 obstacle"),
+        ("time", "100 steps of 0.1 s"),
+        ("margin", "0.05 m"),
+        ("arrival", "dock"),
+    ]
+    assert dict(two_robots(world=None).key_figures)["world"] == "open, 0 obstacles"
+
+
 def test_sizes_and_padding() -> None:
     problem = two_robots(dt=0.5, horizon=7)
     assert (problem.num_robots, problem.dimension, problem.state_size, problem.control_size) == (2, 2, 4, 2)
