@@ -295,6 +295,22 @@ def test_a_command_may_be_held_for_so_many_steps_before_robots_brake(steps: int,
     assert (gap >= -1e-3) == holds
 
 
+def test_who_cannot_go_on_for_another_step_is_told_the_nearest_safe_velocity() -> None:
+    """To the bit, however fast it is 10 cm before a wall."""
+    world = World(2, boxes=[[1, -5, 2, 5]])
+    problem = Problem(Team(("velocity2d",)), [[0.75, 2]], [[0, 2]], world, dt=0.1)
+    policy, env = controller(), navigation_v0.parallel_env(problem=problem)
+    env.reset(seed=0)
+    policy.reset(env, seed=0)
+    ahead = np.array([[0.9, 0.3]], np.float32)
+    for speed in np.linspace(0.1, 0.9, 9, dtype=np.float32):
+        present = joint(problem, problem.start, controls=np.float32([[speed, speed / 3]]))
+        later = joint(problem, problem.start + np.float32(0.1) * ahead)
+        safe = safe_velocities(problem, later, ahead, ALL[:1], 0.02)
+        assert safe[0, 0] < 0.6
+        np.testing.assert_array_equal(policy._braking_in_time(present, ahead, 0.02, 0.0, 1), safe)
+
+
 @pytest.mark.parametrize(("run", "looked_at"), [(0, [1]), (5, [6, 3, 1] * 2)])
 def test_so_many_steps_are_as_many_as_commands_may_be_lost(
     monkeypatch: pytest.MonkeyPatch, run: int, looked_at: list[int]
@@ -388,7 +404,9 @@ def test_of_manoeuvres_the_first_to_arrive_is_taken_however_far_is_predicted(bes
     np.testing.assert_array_equal(sooner, controls[:20])
 
 
-def test_manoeuvres_lead_by_points_a_quarter_one_and_two_turning_radii_away(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_manoeuvres_lead_by_points_all_around_a_quarter_one_and_two_turning_radii_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     window, tried = parked_cars(beside=0.1).replace(horizon=20), []
 
     def recorded(*arguments: Any) -> Any:
@@ -398,7 +416,10 @@ def test_manoeuvres_lead_by_points_a_quarter_one_and_two_turning_radii_away(monk
     monkeypatch.setattr("d4orm_planners.d4orm_c2f.direct_final_approach.drives", recorded)
     nobody, still = np.zeros(2, bool), np.zeros((20, 2, 2), np.float32)
     direct_final_approach(window, get_sampling_engine("cpu"), still, nobody, np.array([False, True]))
-    away = np.linalg.norm(tried[0][0, :, 0] - window.start[0, :2], axis=1).reshape(-1, 16)
+    offsets = (tried[0][0, :, 0] - window.start[0, :2]).reshape(-1, 16, 2)
+    directions = np.sort(np.arctan2(offsets[..., 1], offsets[..., 0]) % (2 * np.pi))
+    np.testing.assert_allclose(np.diff(directions), np.pi / 8, rtol=1e-4)
+    away = np.linalg.norm(offsets, axis=2)
     beyond = away - NEAR_VIA * window.team.largest_radius
     expected = np.array([[0.25], [1.0], [2.0]]) * window.team.turning_radius[0]
     np.testing.assert_allclose(beyond, np.broadcast_to(expected, (3, 16)), rtol=1e-5)

@@ -362,6 +362,22 @@ def test_a_failure_is_another_one_in_another_group() -> None:
     assert labels.tolist() == [1, 1, 0, -1, 2, 2]
 
 
+def test_groups_that_are_stuck_are_repaired_jointly_in_turn() -> None:
+    rows = 5 * np.arange(3)
+    start, goal = np.zeros((6, 4)), np.zeros((6, 2))
+    start[:, 1] = goal[:, 1] = np.repeat(rows, 2)
+    start[1::2, 0] = goal[::2, 0] = 2
+    towards = np.zeros((60, 6, 2), np.float32)
+    towards[:20, ::2, 0], towards[:20, 1::2, 0] = 0.5, -0.5
+    engine = Lost()
+    problem = Problem(Team(("holonomic2d",) * 6), start, goal, horizon=60)
+    search = SolveRun(make_planner("d4orm-d", engine="cpu"), problem, 0, towards, engine)
+    for _ in range(13):
+        search.advance()
+    jointly = [task.problem.start[:, 1].tolist() for task in engine.tasks if task.credit == "team"]
+    assert jointly == [[10, 10], [0, 0], [5, 5]]
+
+
 @pytest.mark.parametrize("start", ["team", "straight"])
 def test_after_the_probe_of_the_authors_preset_only_the_groups_stay(start: str) -> None:
     problem, _ = meeting_in_pairs()

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,6 +90,17 @@ def test_a_film_ends_where_the_plan_begins(problem) -> None:
     assert ((seen.alpha > 0) & (seen.alpha <= 1)).all()
     steps = np.linspace(0, problem.horizon, 26).round().astype(int)
     np.testing.assert_allclose(seen.paths[-1], plan.trajectory.positions[steps], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("weights", "alpha"), [([0.5, 0.25, 0.0], [0.42, 0.27, 0.12]), ([[0.5, 0.1], [0.25, 0.3]], [0.345, 0.24])]
+)
+def test_samples_are_the_more_opaque_the_more_they_count(problem, weights: list[Any], alpha: list[float]) -> None:
+    """With robot credit on average over the robots, and relative to what counts most for any."""
+    base = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)
+    film = DenoisingFilm(problem)
+    film(DenoisingStep(SamplingTask(problem, base), 1.0, base, np.stack([base] * len(alpha)), np.array(weights)))
+    np.testing.assert_allclose(film.developed().alpha, [alpha], rtol=1e-6)
 
 
 def test_a_film_without_a_step_says_so(problem) -> None:
