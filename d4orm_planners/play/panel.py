@@ -123,7 +123,7 @@ class Panel:
 
     def _add_clock(self) -> None:
         self.paused: Any = self._gui.add_checkbox("Paused", False)
-        self.paused.on_update(lambda _: self._session.pause(self.paused.value))
+        self.paused.on_update(lambda event: self._session.pause(self.paused.value) if event.client else None)
         step, reset = self._gui.add_button("Step"), self._gui.add_button("Reset")
 
         def one_step(_: object) -> None:

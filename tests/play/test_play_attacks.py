@@ -141,6 +141,10 @@ def test_after_a_step_that_fails_the_page_shows_a_pause(monkeypatch: pytest.Monk
         playground.session._advance_or_pause()
         playground._panel.update()
         assert playground._panel.paused.value
+        playground.session._obey()
+        assert (
+            playground.session.frame.status.message == "ZeroDivisionError: division by zero"
+        )  # and goes on saying why
     finally:
         playground.close()
 
