@@ -81,7 +81,7 @@ class Flight:
 
 @contextmanager
 def _no_warnings_of_mujoco() -> Iterator[None]:
-    """What MuJoCo warns of is neither printed nor written to a MUJOCO_LOG.TXT in the current folder."""
+    """Warnings of MuJoCo, neither printed nor written to a MUJOCO_LOG.TXT in the current folder."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:

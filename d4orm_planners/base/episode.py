@@ -21,7 +21,7 @@ from d4orm_env.envs.joint_env import JointNavigationEnv
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_env.envs.team_step import AgentInfos
 from d4orm_planners.base.display import DisplayMixin
-from d4orm_planners.base.physics import check_physics, find_physics
+from d4orm_planners.base.physics import find_physics
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy
 from d4orm_planners.base.policy import Policy, robot_indices
 
@@ -87,13 +87,12 @@ def open_env(problem: Problem, physics: str = "model", policy: Policy | None = N
         **options: Further arguments of :class:`d4orm_env.navigation_v0.parallel_env`.
 
     Raises:
-        ValueError: As :func:`~d4orm_planners.base.physics.check_physics`, or for a bad argument.
+        ValueError: As :func:`~d4orm_planners.base.physics.find_physics`, or for a bad argument.
         ImportError: If the physics needs a library that is not installed.
     """
-    check_physics(problem, physics)
+    module, bodies = find_physics(physics, problem)
     if isinstance(policy, Policy):  # a user's own may have no more than reset and act
         options = {**policy.observation_options(problem), **options}
-    module, bodies = find_physics(physics)
     return module.parallel_env(problem=problem, **options, **bodies)
 
 
@@ -166,10 +165,9 @@ def _parallel(env: gymnasium.Env[Any, Any]) -> ParallelEnv:
 
 def _moved_by(env: ParallelEnv, physics: str) -> ParallelEnv:
     """An environment with the options of another, moved by some physics."""
-    check_physics(env.unwrapped.problem, physics)
+    module, bodies = find_physics(physics, env.unwrapped.problem)
     if env is not env.unwrapped:
         raise ValueError(f"physics is {physics!r}, and the environment is wrapped; give one that is not")
-    module, bodies = find_physics(physics)
     return module.parallel_env(**env.options.keywords(), **bodies)
 
 

@@ -1,4 +1,4 @@
-"""What moves the robots of an episode, by name and settings."""
+"""Physics that moves the robots of an episode, by name and settings."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ PHYSICS = {"model": "", "mujoco": "Physics", "crazyflow": "DronePhysics"}
 """The equations that planners know, rigid bodies in MuJoCo, or drones in crazyflow; and the class of settings."""
 
 
-def find_physics(physics: str) -> tuple[Any, dict[str, Any]]:
+def find_physics(physics: str, problem: Problem | None = None) -> tuple[Any, dict[str, Any]]:
     """The module with the environment of a physics, and further arguments for this environment.
 
     Args:
         physics: One of :data:`PHYSICS`; behind a colon settings of :class:`d4orm_env.mujoco.Physics` or
             :class:`d4orm_env.crazyflow.DronePhysics`, as ``"crazyflow:gust=0.02,mass_factor=1.05"``.
+        problem: A problem whose robots it is to move.
 
     Raises:
-        ValueError: For an unknown physics or setting, or a setting out of range.
+        ValueError: For an unknown physics or setting, a setting out of range, or robots that have no bodies in it.
         ImportError: If it needs a library that is not installed.
     """
     name, colon, listed = physics.partition(":") if isinstance(physics, str) else ("", "", "")
@@ -34,6 +35,8 @@ def find_physics(physics: str) -> tuple[Any, dict[str, Any]]:
             raise ValueError(f"physics is {short_repr(physics)}, and the model has no settings; give disturbances")
         return navigation_v0, {}
     module = import_module(f"d4orm_env.{name}")
+    if problem is not None:
+        module.check_problem(problem)
     if not colon:
         return module, {}
     kind, settings = getattr(module, PHYSICS[name]), {}
@@ -45,15 +48,3 @@ def find_physics(physics: str) -> tuple[Any, dict[str, Any]]:
             raise no_setting(setting, f"physics {name!r}", kind.__dataclass_fields__)
         settings[setting] = parse_yaml(text)
     return module, {"physics": kind(**settings)}
-
-
-def check_physics(problem: Problem, physics: str) -> None:
-    """Refuse an unknown physics, or one in which the robots of a problem have no bodies.
-
-    Raises:
-        ValueError: As :func:`find_physics`, or if robots have no bodies in it.
-        ImportError: If it needs a library that is not installed.
-    """
-    module, _ = find_physics(physics)
-    if module is not navigation_v0:
-        module.check_problem(problem)

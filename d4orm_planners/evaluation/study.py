@@ -22,7 +22,7 @@ from d4orm_env.envs.options import OBSERVATION, EnvOptions
 from d4orm_env.envs.setup import EnvSetup
 from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.problems import is_scenario_file
-from d4orm_planners.base.physics import check_physics
+from d4orm_planners.base.physics import find_physics
 from d4orm_planners.base.planner_registry import PolicyLike, is_brought, list_policies, origin
 from d4orm_planners.base.policy_copies import fresh_policy
 from d4orm_planners.evaluation.trials import Condition, Configuration, Job
@@ -80,7 +80,7 @@ class Study:
         for problem in (problems[0] for _, problems in cells):
             for condition in under:
                 EnvSetup(EnvOptions.of(problem=problem, disturbances=condition.disturbances, **self.observation))
-            check_physics(problem, self.physics)
+            find_physics(self.physics, problem)
         texts = (one for one in _several(self.scenarios) if isinstance(one, str) and not is_scenario_file(one))
         imports = tuple(text for text in texts if ":" in text)
         return [

@@ -142,9 +142,8 @@ def test_after_a_step_that_fails_the_page_shows_a_pause(monkeypatch: pytest.Monk
         playground._panel.update()
         assert playground._panel.paused.value
         playground.session._obey()
-        assert (
-            playground.session.frame.status.message == "ZeroDivisionError: division by zero"
-        )  # and goes on saying why
+        # It goes on saying why.
+        assert playground.session.frame.status.message == "ZeroDivisionError: division by zero"
     finally:
         playground.close()
 
