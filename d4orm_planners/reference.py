@@ -32,6 +32,7 @@ class PlainTeam(NamedTuple):
     max_speed: Array  # (K,)
     max_acceleration: Array  # (K,)
     max_turn_rate: Array  # (K,)
+    max_reverse_speed: Array  # (K,) of differential drives
     balls: Array  # (., d + 1) centre and radius of circles or spheres
     cylinders: Array  # (., 3) axis and radius of vertical cylinders
     boxes: Array  # (., 2 d) lower and upper corner
@@ -57,6 +58,7 @@ def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
     team, world = problem.team, problem.world
     numbers = (
         problem.start, problem.goal, team.radius, team.max_speed, team.max_acceleration, team.max_turn_rate,
+        np.minimum(team.own_limits.get("max_reverse_speed", np.inf), team.max_speed),
         world.balls, world.cylinders, world.boxes, world.bounds, problem.dt, problem.margin, problem.goal_radius,
         docking_speed(problem.goal_speed, team.max_speed), problem.collision_penalty,
     )  # fmt: skip
@@ -79,9 +81,9 @@ def _shorten(vector: Array, limit: Array) -> Array:
     return jnp.where(length > limit, vector * (limit / jnp.where(length > 0, length, 1.0)), vector)
 
 
-def _step_robot(model: str, dt: Array, limits: tuple[Array, Array, Array], x: Array, u: Array) -> tuple[Array, Array]:
+def _step_robot(model: str, dt: Array, limits: tuple[Array, ...], x: Array, u: Array) -> tuple[Array, Array]:
     """State after one step and speed of one robot: clip, RK4, speed limit."""
-    speed, acceleration, turn_rate = limits
+    speed, acceleration, turn_rate, reverse = limits
     if model == "differential_drive":
         bound = jnp.stack([turn_rate, acceleration])
         u = jnp.clip(u, -bound, bound)
@@ -95,7 +97,7 @@ def _step_robot(model: str, dt: Array, limits: tuple[Array, Array, Array], x: Ar
     if model == "velocity2d":
         return x, jnp.linalg.norm(u)
     if model == "differential_drive":
-        x = x.at[3].set(jnp.clip(x[3], -speed, speed))
+        x = x.at[3].set(jnp.clip(x[3], -reverse, speed))
         return x, jnp.abs(x[3])
     size = x.shape[0] // 2
     x = x.at[size:].set(_shorten(x[size:], speed))
@@ -135,7 +137,7 @@ def _near_obstacle(team: PlainTeam, position: Array) -> Array:
 def team_rewards(model: str, collisions: bool, team: PlainTeam, controls: Array) -> Array:
     """``(K,)`` mean reward over time of one team under ``controls`` ``(H, K, m)``."""
     dimension = team.goal.shape[1]
-    limits = (team.max_speed, team.max_acceleration, team.max_turn_rate)
+    limits = (team.max_speed, team.max_acceleration, team.max_turn_rate, team.max_reverse_speed)
     distance_at_start = jnp.linalg.norm(team.start[:, :dimension] - team.goal, axis=1)
     scale = jnp.maximum(distance_at_start, team.goal_radius)
 

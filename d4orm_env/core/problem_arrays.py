@@ -12,6 +12,7 @@ from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, read_only
 from d4orm_env.core.bodies import FootprintArrays
 from d4orm_env.dynamics.models import MODEL_CODES, NUM_BUILT_IN, model_digest
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, UNLIMITED
 from d4orm_env.dynamics.transition import docking_speed
 from d4orm_env.geometry.world_index import WorldIndex
 
@@ -108,6 +109,14 @@ def digest_of(problem: Problem) -> str:
     goal_speed = None if np.isinf(problem.goal_speed).all() else problem.goal_speed.tolist()
     if goal_speed is None:
         arrays = arrays._replace(squared_goal_speed=np.array(np.inf, np.float32))
+    # As before models had limits that bound nothing.
+    bounding = {
+        column
+        for model, limits in zip(problem.team.robot_models, arrays.limits, strict=True)
+        for column, limit in enumerate(model.own_limits, OWN_LIMITS)
+        if not limits[column] == limit.default == UNLIMITED
+    }
+    arrays = arrays._replace(limits=arrays.limits[:, [*range(OWN_LIMITS), *sorted(bounding)]])
     world = problem.world
     obstacles = (world.balls, world.cylinders, world.boxes, *world.polygons)
     for value in (*arrays[:6], *obstacles, *arrays[9:14]):

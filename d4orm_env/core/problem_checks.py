@@ -118,7 +118,7 @@ def _check_state_limits(model: Model, limits: FloatArray, state: FloatArray, whe
     for column, components in model.limited_components.items():
         values, limit, bound = state[components], float(limits[column]), column
         if len(values) == 1 and values[0] < 0:
-            limit, bound = float(backwards[column]), lower.get(column, column)
+            limit, bound = float(backwards[column]), lower[column] if backwards[column] < limits[column] else column
         size = float(np.linalg.norm(values))
         if size > limit * (1 + 1e-5):
             name, unit = ("speed", " m/s") if column == SPEED else (model.state_names[components[0]], "")

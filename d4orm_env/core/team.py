@@ -130,6 +130,9 @@ class Team(Frozen):
         """A copy with some attributes changed, checked again; of radius and footprint, what is not given follows."""
         given: dict[str, Any] = self.__getstate__()
         shapes = given.pop("shapes")
+        if "models" in changes:  # others may not have what these have by default
+            default = Team(self.models).own_limits
+            given["own_limits"] = {name: own for name, own in self.own_limits.items() if (own != default[name]).any()}
         if shapes or "footprint" in changes:
             given |= {"radius": None, "footprint": None if "radius" in changes else shapes}
         return Team(**given | changes)

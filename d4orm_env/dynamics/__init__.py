@@ -11,9 +11,20 @@ from d4orm_env.dynamics.formulas import (
     stopping_speed,
     turn_towards,
 )
-from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE, Limit, Model, ModelFunctions, Ops
+from d4orm_env.dynamics.robot_model import (
+    ACCELERATION,
+    OWN_LIMITS,
+    SPEED,
+    TURN_RATE,
+    UNLIMITED,
+    Limit,
+    Model,
+    ModelFunctions,
+    Ops,
+)
 
 __all__ = [
-    "ACCELERATION", "OWN_LIMITS", "SPEED", "TURN_RATE", "Limit", "Model", "ModelFunctions", "Ops", "between", "clip",
-    "control_scale", "first_order_approach", "norm_scale", "planar_approach", "share", "stopping_speed", "turn_towards",
+    "ACCELERATION", "OWN_LIMITS", "SPEED", "TURN_RATE", "UNLIMITED", "Limit", "Model", "ModelFunctions", "Ops",
+    "between", "clip", "control_scale", "first_order_approach", "norm_scale", "planar_approach", "share",
+    "stopping_speed", "turn_towards",
 ]  # fmt: skip

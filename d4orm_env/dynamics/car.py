@@ -7,11 +7,12 @@ steering angle as states.
 
 from __future__ import annotations
 
-from d4orm_env.dynamics.formulas import clip, planar_approach, present_drive, turn_towards
+from d4orm_env.dynamics.formulas import clip, limit_drive, planar_approach, present_drive, turn_towards
 from d4orm_env.dynamics.robot_model import (
     ACCELERATION,
     OWN_LIMITS,
     SPEED,
+    UNLIMITED,
     Limit,
     Model,
     ModelFunctions,
@@ -21,7 +22,7 @@ from d4orm_env.dynamics.robot_model import (
     Vector,
 )
 
-MAX_STEERING, MAX_STEERING_RATE, WHEELBASE = range(OWN_LIMITS, OWN_LIMITS + 3)
+MAX_STEERING, MAX_STEERING_RATE, WHEELBASE, MAX_REVERSE_SPEED = range(OWN_LIMITS, OWN_LIMITS + 4)
 
 
 def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
@@ -34,7 +35,8 @@ def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
 
 
 def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
-    return (x[0], x[1], x[2], clip(x[3], limits[SPEED], ops), clip(x[4], limits[MAX_STEERING], ops))
+    speed = limit_drive(x[3], limits, limits[MAX_REVERSE_SPEED], ops)
+    return (x[0], x[1], x[2], speed, clip(x[4], limits[MAX_STEERING], ops))
 
 
 def _rest(x: Vector, zero: Number) -> Vector:
@@ -66,6 +68,8 @@ CAR = Model(
         Limit("max_steering", 0.6, most=1.5),
         Limit("max_steering_rate", 1.0),
         Limit("wheelbase", 0.3),
+        Limit("max_reverse_speed", UNLIMITED),
     ),
     state_limits=((4, MAX_STEERING),),
+    lower_limits=((SPEED, MAX_REVERSE_SPEED),),
 )

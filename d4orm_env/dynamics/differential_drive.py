@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from d4orm_env.dynamics.formulas import clip, planar_approach, present_drive, turn_towards
+from d4orm_env.dynamics.formulas import clip, limit_drive, planar_approach, present_drive, turn_towards
 from d4orm_env.dynamics.robot_model import (
     ACCELERATION,
+    OWN_LIMITS,
     SPEED,
     TURN_RATE,
+    UNLIMITED,
+    Limit,
     Model,
     ModelFunctions,
     Number,
@@ -14,6 +17,8 @@ from d4orm_env.dynamics.robot_model import (
     TimeStep,
     Vector,
 )
+
+MAX_REVERSE_SPEED = OWN_LIMITS
 
 
 def _derivative(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
@@ -43,7 +48,7 @@ def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
 
 
 def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
-    return (x[0], x[1], x[2], clip(x[3], limits[SPEED], ops))
+    return (x[0], x[1], x[2], limit_drive(x[3], limits, limits[MAX_REVERSE_SPEED], ops))
 
 
 def _rest(x: Vector, zero: Number) -> Vector:
@@ -67,4 +72,6 @@ DIFFERENTIAL_DRIVE = Model(
     functions=ModelFunctions(
         _derivative, _limit_control, _limit_state, present_drive, _rest, planar_approach, _track, _integrate
     ),
+    own_limits=(Limit("max_reverse_speed", UNLIMITED),),
+    lower_limits=((SPEED, MAX_REVERSE_SPEED),),
 )

@@ -13,7 +13,14 @@ import math
 from collections.abc import Callable
 from itertools import chain
 
-from d4orm_env.dynamics.formulas import at_once, between, clip, commanded_drive, first_order_approach, turn_towards
+from d4orm_env.dynamics.formulas import (
+    at_once,
+    clip,
+    commanded_drive,
+    first_order_approach,
+    limit_drive,
+    turn_towards,
+)
 from d4orm_env.dynamics.robot_model import (
     OWN_LIMITS,
     SPEED,
@@ -57,8 +64,7 @@ def _derivative_3(x: Vector, u: Vector, limits: Vector, ops: Ops) -> Vector:
 
 
 def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
-    reverse = ops.minimum(limits[MAX_REVERSE_SPEED], limits[SPEED])
-    return (between(u[0], -reverse, limits[SPEED], ops), clip(u[1], limits[MAX_STEERING], ops))
+    return (limit_drive(u[0], limits, limits[MAX_REVERSE_SPEED], ops), clip(u[1], limits[MAX_STEERING], ops))
 
 
 def _limit_state_0(x: Vector, limits: Vector, ops: Ops) -> Vector:

@@ -24,6 +24,11 @@ def between(value: Number, least: Number, most: Number, ops: Ops) -> Number:
     return ops.maximum(least, ops.minimum(most, value))
 
 
+def limit_drive(speed: Number, limits: Vector, reverse: Number, ops: Ops) -> Number:
+    """Return a speed within the limits of driving forwards and, no larger, in ``reverse``."""
+    return between(speed, -ops.minimum(reverse, limits[SPEED]), limits[SPEED], ops)
+
+
 def stopping_speed(distance: Number, limits: Vector, h: TimeStep, ops: Ops) -> Number:
     """Fastest speed from which a robot with a limited acceleration stops within a distance."""
     acceleration = limits[ACCELERATION]

@@ -121,12 +121,16 @@ class ModelFunctions(NamedTuple):
     """
 
 
+UNLIMITED = 1e6
+"""Default of a limit that bounds nothing unless it is given: the largest that a team may have."""
+
+
 class Limit(NamedTuple):
     """A limit or measure of its own that a model has, positive.
 
     Attributes:
         name: As in ``Team(own_limits={name: ...})``.
-        default: For robots that are given no other, in SI units.
+        default: For robots that are given no other, in SI units; may be :data:`UNLIMITED`.
         most: Largest value.
     """
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from d4orm_env.dynamics.formulas import between
+from d4orm_env.dynamics.formulas import between, limit_drive
 from d4orm_env.dynamics.robot_model import OWN_LIMITS, SPEED, TURN_RATE, Limit, Ops, Vector
 from d4orm_env.dynamics.unicycle import UNICYCLE
 
@@ -16,9 +16,8 @@ MAX_REVERSE_SPEED, MAX_RIGHT_TURN_RATE = range(OWN_LIMITS, OWN_LIMITS + 2)
 
 
 def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
-    reverse = ops.minimum(limits[MAX_REVERSE_SPEED], limits[SPEED])
     return (
-        between(u[0], -reverse, limits[SPEED], ops),
+        limit_drive(u[0], limits, limits[MAX_REVERSE_SPEED], ops),
         between(u[1], -limits[MAX_RIGHT_TURN_RATE], limits[TURN_RATE], ops),
     )
 

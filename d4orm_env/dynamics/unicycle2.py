@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from d4orm_env.dynamics.formulas import between, clip, planar_approach, present_drive, turn_towards
+from d4orm_env.dynamics.formulas import between, clip, limit_drive, planar_approach, present_drive, turn_towards
 from d4orm_env.dynamics.robot_model import (
     ACCELERATION,
     OWN_LIMITS,
@@ -34,8 +34,7 @@ def _limit_control(u: Vector, limits: Vector, ops: Ops) -> Vector:
 
 
 def _limit_state(x: Vector, limits: Vector, ops: Ops) -> Vector:
-    reverse = ops.minimum(limits[MAX_REVERSE_SPEED], limits[SPEED])
-    speed = between(x[3], -reverse, limits[SPEED], ops)
+    speed = limit_drive(x[3], limits, limits[MAX_REVERSE_SPEED], ops)
     return (x[0], x[1], x[2], speed, between(x[4], -limits[MAX_RIGHT_TURN_RATE], limits[TURN_RATE], ops))
 
 

@@ -106,6 +106,7 @@ for _function in (
     formulas.share,
     formulas.planar_approach,
     formulas.first_order_approach,
+    formulas.limit_drive,
     formulas.turn_towards,
     robot_model.runge_kutta,
     winding.unwound,

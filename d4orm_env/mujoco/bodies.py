@@ -185,19 +185,20 @@ class TeamBodies:
         rows = []
         for robot in self._drives.tolist():
             first, second = controls[robot, :2].tolist()
-            speeds = states[robot, list(self.problem.team.robot_models[robot].speed_indices)].tolist()
+            model = self.problem.team.robot_models[robot]
+            most, reverse = float(limits[robot, SPEED]), float(model.lower_bounds(limits[robot])[SPEED])
+            speeds = states[robot, list(model.speed_indices)].tolist()
             if not speeds:
-                rows.append((first, 0.0, second))
+                rows.append((first, 0.0, second, -reverse, most))
                 continue
             # From the speed that it was to have, which it nearly has unless something holds it up.
             behind = self._wanted[robot] - speeds[0]
-            most = float(limits[robot, ACCELERATION]) * self.problem.dt
-            begin = speeds[0] + min(max(behind, -most), most)
+            change = float(limits[robot, ACCELERATION]) * self.problem.dt
+            begin = speeds[0] + min(max(behind, -change), change)
             end = begin + self.problem.dt * second
-            self._wanted[robot] = min(max(end, -float(limits[robot, SPEED])), float(limits[robot, SPEED]))
-            rows.append((begin, second, first))
-        speed, acceleration, turn_rate = np.array(rows, np.float64).reshape(-1, 3).T
-        return WheelCommands(speed, acceleration, turn_rate, limits[self._drives, SPEED].astype(np.float64))
+            self._wanted[robot] = min(max(end, -reverse), most)
+            rows.append((begin, second, first, -reverse, most))
+        return WheelCommands(*np.array(rows, np.float64).reshape(-1, 5).T)
 
     def _note_contacts(self, touched: BoolArray) -> None:
         contact = self.data.contact
@@ -212,7 +213,8 @@ class WheelCommands(NamedTuple):
     speed: Floats  #: At the beginning [m/s]
     acceleration: Floats  #: From there on [m/s^2]
     turn_rate: Floats  #: [rad/s]
-    max_speed: Floats  #: [m/s]
+    least: Floats  #: Speed backwards at most, negative [m/s]
+    most: Floats  #: Speed forwards at most [m/s]
 
 
 class WheelControl:
@@ -255,7 +257,7 @@ class WheelControl:
         speeds of the wheels [rad/s].
         """
         wanted = commands.speed + time * commands.acceleration
-        speed = np.clip(wanted, -commands.max_speed, commands.max_speed)
+        speed = np.clip(wanted, commands.least, commands.most)
         turning = commands.turn_rate * self._half_track
         reference = np.stack([speed - turning, speed + turning], axis=1) / self.radius[:, None]
         ahead = np.where(speed == wanted, commands.acceleration, 0.0) / self.radius

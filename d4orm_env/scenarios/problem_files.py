@@ -17,6 +17,7 @@ from d4orm_env.core.goal_poses import DEFAULT_TOLERANCE
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
+from d4orm_env.dynamics.robot_model import UNLIMITED
 from d4orm_env.footprints import Disc
 from d4orm_env.scenarios.cl_mapf import load_cl_mapf
 from d4orm_env.scenarios.dynobench import load_dynobench
@@ -148,10 +149,11 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
     hitches = problem.goal_hitches[robot, : len(model.trailers)]
     if not np.isnan(hitches).all():
         entry["goal_hitches"] = [None if np.isnan(hitch) else _decimals([hitch])[0] for hitch in hitches]
-    if model.own_limits:
-        names = [limit.name for limit in model.own_limits]
-        values = _decimals([np.asarray(team.own_limits[name])[robot] for name in names])
-        entry["own_limits"] = dict(zip(names, values, strict=True))
+    own = {limit.name: team.own_limits[limit.name][robot] for limit in model.own_limits}
+    bounding = [limit.name for limit in model.own_limits if not own[limit.name] == limit.default == UNLIMITED]
+    if bounding:
+        values = _decimals([own[name] for name in bounding])
+        entry["own_limits"] = dict(zip(bounding, values, strict=True))
     return entry
 
 

@@ -48,6 +48,7 @@ class TeamMotion:
         self.max_speed, self.max_acceleration, self.max_turn_rate = (
             np.asarray(values, np.float64) for values in (team.max_speed, team.max_acceleration, team.max_turn_rate)
         )
+        self._max_reverse_speed = np.asarray(team.own_limits.get("max_reverse_speed", self.max_speed), np.float64)
         models = list(enumerate(team.robot_models))
         self.trailer_robots = [robot for robot, model in models for _ in model.trailers]
         self.hitches = [float(team.limits[robot, column]) for robot, model in models for _, column in model.trailers]
@@ -125,6 +126,7 @@ class TeamMotion:
         self.pace = np.where(self.wheeled, np.abs(self._speed), np.minimum(norm(self._velocity), self.max_speed))
         slow = np.flatnonzero(~self.first_order)  # by inertia
         most, drives = self.max_speed[slow], self._drives[slow]
+        reverse = np.minimum(self._max_reverse_speed[slow], most)
         velocity = np.where(drives[:, None], 0.0, state[slow, self.size : 2 * self.size])
         speed = np.where(drives, state[slow, 3], 0.0)
         for step in range(len(commands) if len(slow) else 0):
@@ -132,7 +134,7 @@ class TeamMotion:
             velocity = velocity + self._acceleration[step, slow] * dt
             pace = norm(velocity)
             velocity = velocity * (most / np.maximum(pace, most))[:, None]
-            speed = np.clip(speed + self._thrust[step, slow] * dt, -most, most)
+            speed = np.clip(speed + self._thrust[step, slow] * dt, -reverse, most)
             self.pace[step, slow] = np.where(drives, np.abs(speed), np.minimum(pace, most))
         heading = np.where(self.wheeled, state[:, 2], 0.0)
         self._heading = np.cumsum(np.concatenate([heading[None], self._turn_rate * dt]), axis=0)

@@ -152,11 +152,12 @@ def _unicycle(kind: Kind) -> Iterator[Move]:
 
 
 def _differential_drive(kind: Kind) -> Iterator[Move]:
-    speed, most = kind.limits[SPEED], kind.limits[TURN_RATE]
+    most = kind.limits[TURN_RATE]
     for count, rate in _turns(kind):
         yield (0.0,), (0.0,), held(count, rate, 0.0)
     turns = [0.0, *(side * sectors * SECTOR for sectors, side in product(TURNS, (1, -1)))]
     for way, turn in product((1, -1), turns):
+        speed = kind.pace(way)
         count = max(kind.speeding_up(speed), kind.steps(abs(turn), most))
         push, rate = way * speed / (count * kind.dt), turn / (count * kind.dt)
         yield (0.0,), (way * speed,), held(count, rate, push)
@@ -166,8 +167,10 @@ def _differential_drive(kind: Kind) -> Iterator[Move]:
             if peak <= speed and 2 * count >= kind.steps(abs(turn), most):
                 rate, push = turn / (2 * count * kind.dt), way * peak / (count * kind.dt)
                 yield (0.0,), (0.0,), np.concatenate([held(count, rate, push), held(count, rate, -push)])
-    for (count, rate), way in product(_drives(kind, speed), (1, -1)):
-        yield (way * speed,), (way * speed,), held(count, rate, 0.0)
+    forwards, backwards = (list(_drives(kind, kind.pace(way))) for way in (1, -1))
+    for drives in zip(forwards, backwards, strict=True):
+        for way, (count, rate) in zip((1, -1), drives, strict=True):
+            yield (way * kind.pace(way),), (way * kind.pace(way),), held(count, rate, 0.0)
 
 
 def _swing(kind: Kind, side: int, turn: float, least: int) -> tuple[int, float]:
@@ -206,15 +209,15 @@ def _unicycle2(kind: Kind) -> Iterator[Move]:
 
 
 def _car(kind: Kind) -> Iterator[Move]:
-    speed, (most, quickest, _) = kind.limits[SPEED], kind.limits[OWN_LIMITS : OWN_LIMITS + 3]
+    most, quickest = kind.limits[OWN_LIMITS : OWN_LIMITS + 2]
     wheels = (-most, 0.0, most)
     swing = kind.steps(most, quickest)
     for old, new in ((0, 1), (1, 0), (1, 2), (2, 1)):
         rate = (wheels[new] - wheels[old]) / (swing * kind.dt)
-        for pace in (0.0, speed, -speed):
+        for pace in (0.0, kind.pace(1), -kind.pace(-1)):
             yield (pace, wheels[old]), (pace, wheels[new]), held(swing, 0.0, rate)
     for way, wheel in product((1, -1), wheels):
-        yield from _paced(kind, way, speed, wheel)
+        yield from _paced(kind, way, kind.pace(way), wheel)
 
 
 def _compass() -> Iterator[tuple[float, float]]:

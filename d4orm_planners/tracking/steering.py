@@ -16,7 +16,7 @@ from d4orm_env.core.portable import NUMPY_OPS
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_env.dynamics.models import MODELS
-from d4orm_env.dynamics.robot_model import OWN_LIMITS, STANDARD_LIMITS, Model, ModelFunctions
+from d4orm_env.dynamics.robot_model import OWN_LIMITS, STANDARD_LIMITS, UNLIMITED, Model, ModelFunctions
 from d4orm_env.dynamics.transition import TimeStep
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.paths.shortest_paths import along_paths
@@ -125,7 +125,7 @@ def weaker(team: Team, share: ArrayLike, control_share: Floats | None = None) ->
         for column, backwards in model.lower_limits:
             factors[robot, backwards] = factors[robot, column]
         for column, limit in enumerate(model.own_limits, OWN_LIMITS):
-            own[limit.name][robot] *= factors[robot, column]
+            own[limit.name][robot] = min(own[limit.name][robot] * factors[robot, column], UNLIMITED)
     standard = {name: getattr(team, name) * factors[:, column] for column, name in enumerate(STANDARD_LIMITS)}
     return team.replace(own_limits=own, **standard)
 

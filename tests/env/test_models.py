@@ -17,7 +17,7 @@ from registry_support import forgetting
 
 from d4orm_env import Problem, Team, load_problem, make_problem, register_model, rollout, save_problem, verify
 from d4orm_env.core.observation_layout import ObservationLayout
-from d4orm_env.dynamics import OWN_LIMITS, SPEED, Limit, Model, ModelFunctions, clip
+from d4orm_env.dynamics import OWN_LIMITS, SPEED, UNLIMITED, Limit, Model, ModelFunctions, clip
 from d4orm_env.dynamics.holonomic2d import HOLONOMIC2D
 from d4orm_env.dynamics.models import MODEL_CODES, MODELS, get_model, model_digest
 from d4orm_env.dynamics.transition import TimeStep, advance
@@ -382,8 +382,9 @@ def car_problem(**own: Any) -> Problem:
 
 def test_own_limits_have_defaults_and_belong_to_the_robots_that_have_them() -> None:
     team = car_problem(wheelbase=[0.4, 9.0, 0.5]).team
-    assert list(team.own_limits) == ["max_steering", "max_steering_rate", "wheelbase"]
-    assert team.limits[:, OWN_LIMITS:].tolist() == np.float32([[0.6, 1, 0.4], [1, 1, 1], [0.6, 1, 0.5]]).tolist()
+    assert list(team.own_limits) == ["max_steering", "max_steering_rate", "wheelbase", "max_reverse_speed"]
+    expected = [[0.6, 1, 0.4, UNLIMITED], [1, 1, 1, 1], [0.6, 1, 0.5, UNLIMITED]]
+    assert team.limits[:, OWN_LIMITS:].tolist() == np.float32(expected).tolist()
     assert team.control_limits.tolist() == [[1, 1]] * 3
     assert team.select([2]).own_limits["wheelbase"].tolist() == [0.5]
     assert team.select([1]).own_limits == {}
@@ -400,6 +401,15 @@ def test_the_functional_step_reads_own_limits() -> None:
     assert abs(after[0, 2] - problem.start[0, 2]) > 0.02
 
 
+def test_a_team_of_other_models_has_their_limits_not_the_defaults_of_the_former() -> None:
+    team = Team(("car", "differential_drive"), own_limits={"wheelbase": [0.4, 1.0]})
+    changed = team.replace(models=("car", "unicycle1"))
+    assert (changed.own_limits["wheelbase"][0], changed.own_limits["max_reverse_speed"][1]) == (np.float32(0.4), 0.5)
+    assert Team(("car",)).replace(models=("holonomic2d",)).own_limits == {}
+    with pytest.raises(ValueError, match="own_limits holds 'wheelbase', which no model of the team has"):
+        team.replace(models=("holonomic2d",) * 2)
+
+
 def test_own_limits_survive_a_file(tmp_path: Path) -> None:
     problem = car_problem(wheelbase=[0.4, 1.0, 0.5])
     start = problem.start.copy()
@@ -407,6 +417,24 @@ def test_own_limits_survive_a_file(tmp_path: Path) -> None:
     problem = problem.replace(start=start)
     save_problem(problem, tmp_path / "cars.yaml")
     assert load_problem(tmp_path / "cars.yaml") == problem
+
+
+@pytest.mark.parametrize("engine", ["cpu", "jax"])
+@pytest.mark.parametrize("model", ["car", "differential_drive"])
+def test_a_robot_reverses_as_fast_as_forwards_unless_told_otherwise(tmp_path: Path, model: str, engine: str) -> None:
+    state = np.zeros((1, Team((model,)).state_size))
+    state[0, 3] = -0.9
+    fast = Problem(Team((model,)), state, [[-9.0, 0.0]])
+    slow = fast.replace(team=Team((model,), own_limits={"max_reverse_speed": 0.25}), start=0 * state)
+    assert fast.replace(team=Team((model,), own_limits={"max_reverse_speed": 1.5})).digest != fast.digest
+    with pytest.raises(ValueError, match=r"start speed of robot_0 is 0\.9 m/s, above its max_reverse_speed of 0\.25"):
+        slow.replace(start=state)
+    backwards = np.full((100, 1, 2), [-1.0, 0.0] if model == "car" else [0.0, -1.0], np.float32)
+    for problem, speed in ((fast, -1.0), (slow, -0.25)):
+        assert rollout(problem, backwards, engine=engine).states[-1, 0, 3] == speed
+        save_problem(problem, path := tmp_path / "robot.yaml")
+        assert load_problem(path) == problem
+        assert ("max_reverse_speed" in path.read_text()) == (problem is slow)
 
 
 @pytest.mark.parametrize(

@@ -140,6 +140,13 @@ def test_headings_wind_up() -> None:
     assert driven(alone("unicycle", [0, 0, 0]), [0.0, -1.5], 80)[2] == pytest.approx(-12.0, abs=0.2)
 
 
+@pytest.mark.parametrize(("own", "speed"), [({}, -1.0), ({"max_reverse_speed": 0.3}, -0.3)])
+def test_a_drive_reverses_no_faster_than_it_may(own: dict[str, float], speed: float) -> None:
+    env = mujoco.parallel_env(problem=Problem(Team(("differential_drive",), own_limits=own), [[0] * 4], [[5, 5]]))
+    env.reset(seed=0)
+    assert driven(env, [0.0, -1.0], 25)[3] == pytest.approx(speed, abs=0.01)
+
+
 def test_a_drive_keeps_to_its_circle() -> None:
     # At 0.5 m/s and 1 rad/s it is one of half a metre; after a whole turn the drive is back.
     x, y, heading, speed = driven(alone("differential_drive", [0, 0, 0, 0.5]), [1.0, 0], 63)

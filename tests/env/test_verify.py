@@ -87,6 +87,13 @@ def test_differential_drive_limits_its_speed_backwards_too():
     assert verify(problem, hold(problem, (0, -1))).arrival_times == pytest.approx([1.9])
 
 
+def test_differential_drive_may_be_slower_backwards():
+    # 0.125 m in the first half second, then 0.05 + 0.005 m a step: 1.445 m after twenty-four more.
+    slow = Team(("differential_drive",), own_limits={"max_reverse_speed": 0.5})
+    problem = make(["differential_drive"], [(0, 0, 0, 0)], [(-1.5, 0)], horizon=40).replace(team=slow)
+    assert verify(problem, hold(problem, (0, -1))).arrival_times == pytest.approx([2.9])
+
+
 def test_differential_drive_follows_its_circle():
     # A turn of pi/2 rad/s at 1 m/s is a circle of radius 2/pi around (0, 2/pi); x is largest at 1 s, inside a step.
     radius = 2 / math.pi

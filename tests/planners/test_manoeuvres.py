@@ -241,6 +241,17 @@ def test_a_car_that_stops_to_steer_parks_in_a_gap_hardly_longer_than_itself() ->
     solved(Problem(team, [[-2, 0, 0, 0, 0]], [[0, -0.7]], world, horizon=300, goal_heading=0.0))
 
 
+@pytest.mark.parametrize("model", ["car", "differential_drive"])
+def test_a_robot_that_reverses_slowly_backs_out_of_a_dead_end(model: str) -> None:
+    """It is too narrow to turn in."""
+    walls = [[-1.0, 0.3, 1.0, 0.6], [-1.0, -0.6, 1.0, -0.3], [-1.3, -0.6, -1.0, 0.6]]
+    team = Team((model,), footprint=Box(0.8, 0.3), own_limits={"max_reverse_speed": 0.2})
+    start = [[-0.5, 0.0, np.pi, *[0.0] * (team.state_size - 3)]]
+    world = World(boxes=walls, lower=(-1.3, -2.0), upper=(4.0, 2.0))
+    plan = solved(Problem(team, start, [[3.0, 0.0]], world, horizon=400, goal_heading=0.0))
+    assert plan.trajectory.states[..., 3].min() == pytest.approx(-0.2)
+
+
 def test_discs_without_headings_are_planned_otherwise() -> None:
     """Others have the same plans as ever, and nothing new to compile."""
     team = Team(("unicycle", "unicycle"))

@@ -266,6 +266,7 @@ def test_curves_end_at_goal_headings_and_hitch_angles(heading: float, tolerance:
     [
         ("unicycle2", {"max_turn_acceleration": 0.3}, [0, 0.3], 3.14, "turn_acceleration"),
         ("unicycle1", {"max_reverse_speed": 0.2}, [-0.6, 0], 0.0, "reverse_speed"),
+        ("differential_drive", {"max_reverse_speed": 0.2}, [-0.6, 0], 0.0, "reverse_speed"),
         ("unicycle1", {"max_right_turn_rate": 0.4}, [0, -0.6], -1.5, "right_turn_rate"),
     ],
 )
