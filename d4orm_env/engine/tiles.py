@@ -198,15 +198,16 @@ def _is_apart(corners: FloatArray, k: Whole, other: Whole, distance: np.float32)
 @inlined
 def mark_pairs(
     arrays: ProblemArrays,
+    lanes: np.uint64,
     extra: np.float32,
     w: FloatArray,
     buffer: FloatArray,
     boxes: TeamBoxes,
     near: NDArray[np.uint64],
 ) -> None:
-    """Flag every two robots closer than their footprints plus ``extra``; ``buffer`` is two rows to overwrite.
+    """Flag every two robots closer than their footprints plus ``extra`` in some lanes.
 
-    ``boxes`` are those of :func:`enclose_team`.
+    ``buffer`` is two rows to overwrite, ``boxes`` are those of :func:`enclose_team`.
     """
     f, poses, dimension = arrays.footprints, arrays.radius.shape[0] * STRIDE, arrays.goal.shape[1]
     corners, order, largest = boxes.corners, boxes.order, ZERO
@@ -224,7 +225,7 @@ def mark_pairs(
                     continue
             a, b, distance = k * STRIDE, other * STRIDE, arrays.radius[k] + arrays.radius[other] + extra
             square = distance * distance
-            touch = within_2(w, a, b, square) if dimension == 2 else within_3(w, a, b, square)
+            touch = lanes & (within_2(w, a, b, square) if dimension == 2 else within_3(w, a, b, square))
             touch = refine_pair(f, k, other, touch, extra, dimension, w, a, b, w, POSE * TILE, poses, buffer)
             near[k, ROBOT] |= touch
             near[other, ROBOT] |= touch

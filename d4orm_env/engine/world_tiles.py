@@ -104,13 +104,15 @@ def _meets_body(
 
 
 @inlined
-def _mark_static(arrays: ProblemArrays, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]) -> None:
-    """Flag every robot closer to an obstacle or the bounds than its radius plus ``extra``."""
+def _mark_static(
+    arrays: ProblemArrays, lanes: np.uint64, extra: np.float32, w: FloatArray, near: NDArray[np.uint64]
+) -> None:
+    """Flag every robot closer to an obstacle or the bounds than its radius plus ``extra``, in some lanes."""
     num_robots, f = arrays.radius.shape[0], arrays.footprints
     for k in range(num_robots):
         robot = w[k * STRIDE : (k + 1) * STRIDE]
         positions, buffer = robot[STATE * TILE : CONTROL * TILE], robot[BUFFER * TILE : ROWS * TILE]
-        touch = obstacles.near_obstacles(arrays, arrays.radius[k] + extra, positions, buffer)
+        touch = lanes & obstacles.near_obstacles(arrays, arrays.radius[k] + extra, positions, buffer)
         touch = refine_static(f, arrays, k, touch, extra, positions, w, POSE * TILE, num_robots * STRIDE, buffer)
         near[k, OBSTACLE] |= touch
 
@@ -160,11 +162,12 @@ def check_contacts(
     enclose_team(count, w, boxes)
     for k in range(num_robots):
         near[k, ROBOT] = near[k, OBSTACLE] = near[k, DYNAMIC] = NOWHERE
+    lanes = np.uint64(0xFFFFFFFFFFFFFFFF) >> np.uint64(TILE - count)  # there are no worlds in others, only numbers
     # Whatever is in contact is within the margin too, so the second level adds to the flags of the first.
     for level in range(2):
         extra = ZERO if level == 0 else arrays.margin
-        mark_pairs(arrays, extra, w, w[BUFFER * TILE : ROWS * TILE], boxes, near)
-        _mark_static(arrays, extra, w, near)
+        mark_pairs(arrays, lanes, extra, w, w[BUFFER * TILE : ROWS * TILE], boxes, near)
+        _mark_static(arrays, lanes, extra, w, near)
         _mark_bodies(arrays, worlds.bodies, first, extra, w, near)
         flags = worlds.collided if level == 0 else worlds.violated
         for s in range(count):

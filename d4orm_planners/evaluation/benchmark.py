@@ -25,6 +25,7 @@ from d4orm_planners.evaluation.env_steps import (
     DISTURBANCES,
     RAY_BOXES,
     RAYS,
+    RECTANGLE,
     RIGID,
     measure_env,
     measure_functional,
@@ -158,6 +159,7 @@ def _environment_parts(settings: BenchmarkSettings) -> Iterator[Part]:
     for what, measurement in (("one environment", measure_env), (f"{settings.num_worlds} worlds", measure_worlds)):
         disturbed = partial(measurement, settings, 0, DISTURBANCES)
         yield "environments", f"{what} with {len(DISTURBANCES)} disturbances", disturbed
+        yield "environments", f"{what} of rectangles", partial(measurement, settings, 0, footprint=RECTANGLE)
         for num_boxes in (0, RAY_BOXES):
             among = f" among {num_boxes} boxes" if num_boxes else ""
             sensing = partial(measurement, settings, num_boxes, num_rays=RAYS)

@@ -12,6 +12,7 @@ from d4orm_env import navigation_v0
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.disturbances import Delay, Dropout, StateNoise
 from d4orm_env.disturbances.disturbance import AnyDisturbance
+from d4orm_env.footprints import Box, Footprint
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.evaluation.measuring import BenchmarkSettings, Measurement, Spread, measure
@@ -34,18 +35,25 @@ RIGID = ("holonomic2d", "differential_drive")
 """Models that are stepped as rigid bodies, where MuJoCo is installed."""
 
 
+RECTANGLE = Box(0.36, 0.24)
+"""Footprint of robots that are stepped beside discs."""
+
 RAYS, RAY_BOXES = 32, 100
 """Rays of the range sensors of environments that are stepped beside those without, and boxes that they meet."""
 
 
 def measure_env(
-    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = (), num_rays: int = 0
+    settings: BenchmarkSettings,
+    num_boxes: int,
+    disturbances: Sequence[AnyDisturbance] = (),
+    num_rays: int = 0,
+    footprint: Footprint | None = None,
 ) -> Measurement:
     """One PettingZoo environment of 8 robots under random controls, resets included."""
-    problem = boxed_problem(num_boxes, "near")
+    problem = boxed_problem(num_boxes, "near", footprint)
     env = navigation_v0.parallel_env(problem=problem, disturbances=disturbances, observed_rays=num_rays)
     seconds = _measure_steps(settings, env, settings.env_steps)
-    return _rate("parallel_env" + _with_rays(num_rays), 1, num_boxes, disturbances, seconds)
+    return _rate("parallel_env" + _variant(num_rays, footprint), 1, num_boxes, disturbances, seconds)
 
 
 def measure_rigid(settings: BenchmarkSettings, model: str) -> Measurement:
@@ -77,12 +85,16 @@ def _measure_steps(settings: BenchmarkSettings, env: ParallelEnv, count: int) ->
 
 
 def measure_worlds(
-    settings: BenchmarkSettings, num_boxes: int, disturbances: Sequence[AnyDisturbance] = (), num_rays: int = 0
+    settings: BenchmarkSettings,
+    num_boxes: int,
+    disturbances: Sequence[AnyDisturbance] = (),
+    num_rays: int = 0,
+    footprint: Footprint | None = None,
 ) -> Measurement:
     """The batched environment of 8 robots per world under random controls, auto-reset included."""
-    size, problem = settings.num_worlds, boxed_problem(num_boxes, "near")
+    size, problem = settings.num_worlds, boxed_problem(num_boxes, "near", footprint)
     seconds = _measure_batch(settings, size, problem=problem, disturbances=disturbances, observed_rays=num_rays)
-    return _rate("make_vec" + _with_rays(num_rays), size, num_boxes, disturbances, seconds)
+    return _rate("make_vec" + _variant(num_rays, footprint), size, num_boxes, disturbances, seconds)
 
 
 def measure_rooms(settings: BenchmarkSettings) -> Measurement:
@@ -138,8 +150,8 @@ def measure_functional(settings: BenchmarkSettings) -> Measurement:
     return _rate("FunctionalEnv", size, 0, (), spread.times(1 / (calls * size)))
 
 
-def _with_rays(num_rays: int) -> str:
-    return f", {num_rays} rays" if num_rays else ""
+def _variant(num_rays: int, footprint: Footprint | None) -> str:
+    return (f", {num_rays} rays" if num_rays else "") + (", rectangles" if footprint else "")
 
 
 def _rate(

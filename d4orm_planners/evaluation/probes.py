@@ -16,7 +16,7 @@ import numpy as np
 from d4orm_env import navigation_v0
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.world import World
-from d4orm_env.footprints import Box
+from d4orm_env.footprints import Box, Footprint
 from d4orm_env.geometry.world_index import build_index
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.controller import Controller, Mode
@@ -162,9 +162,9 @@ def _driven(problem: Problem, controller: Controller, seed: int) -> list[tuple[f
     return steps
 
 
-def boxed_problem(num_boxes: int, where: Where) -> Problem:
+def boxed_problem(num_boxes: int, where: Where, footprint: Footprint | None = None) -> Problem:
     """The circle of 8 robots with small boxes in its middle, where all paths cross, or far away from all robots."""
-    problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=100)
+    problem = make_problem("circle", num_robots=NUM_ROBOTS, horizon=100, footprint=footprint)
     random = np.random.default_rng(0)
     if where == "near":
         distance, angle = 2.0 * np.sqrt(random.uniform(0, 1, num_boxes)), random.uniform(0, 2 * np.pi, num_boxes)

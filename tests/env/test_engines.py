@@ -250,7 +250,7 @@ def test_float32_stays_close_to_float64_over_a_whole_horizon(model: str) -> None
     )
     controls = random_controls(problem, 8, scale=0.4)
     functions = MODELS[model].functions
-    limits, h = (1.0, 1.0, np.pi / 2), TimeStep(0.1, 0.05, 0.1 / 3, 0.1 / 6)
+    limits, h = tuple(problem.team.limits[0].astype(np.float64)), TimeStep(0.1, 0.05, 0.1 / 3, 0.1 / 6)
     x = tuple(problem.start[0].astype(np.float64))
     for control in controls[:, 0].astype(np.float64):
         x = advance(functions, x, functions.limit_control(tuple(control), limits, NUMPY_OPS), limits, h, NUMPY_OPS)
