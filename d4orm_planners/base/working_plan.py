@@ -14,7 +14,7 @@ from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory, arrival_steps
 from d4orm_env.verify import VerificationReport
-from d4orm_planners.base.candidate import Candidate, Graph, graph_of
+from d4orm_planners.base.candidate import Candidate, Graph, evaluate_controls, graph_of
 from d4orm_planners.tracking.steering import Rollouts, drives, prepare_drives
 
 if TYPE_CHECKING:
@@ -192,22 +192,26 @@ def drive_further_in(search: SolveRun, candidate: Candidate, evaluate: Callable[
         prepare_drives(search.problem)
     arrivals = arrival_steps(candidate.trajectory.arrived)
     for robot in sorted(late):
+        part = search.problem.select([robot])
         for earlier, share in product(EARLIER, SHARES):
             step = int(arrivals[robot]) - earlier
             if step < 0 or search.should_stop():
                 break
-            other = evaluate(_driven(search, candidate, robot, step, share))
+            own = _driven(search, part, candidate.controls[:, [robot], : part.control_size], step, share)
+            # A big team takes seconds to evaluate, and most of these robots do not arrive alone either.
+            if not evaluate_controls(search.engine, part, own).solved:
+                continue
+            controls = candidate.controls.copy()
+            controls[:, [robot], : part.control_size] = own
+            other = evaluate(controls)
             if other.rank[:2] > candidate.rank[:2]:
                 candidate = other
                 break
     return candidate
 
 
-def _driven(search: SolveRun, candidate: Candidate, robot: int, step: int, share: float) -> FloatArray:
-    """The team's controls, in which a robot takes a share of its control at a step and then drives to the goal."""
-    part, controls = search.problem.select([robot]), candidate.controls.copy()
-    own = np.ascontiguousarray(controls[:, [robot], : part.control_size])
+def _driven(search: SolveRun, part: Problem, controls: FloatArray, step: int, share: float) -> FloatArray:
+    """A robot's controls ``(H, 1, m)``, but for a share of one at a step, after which it drives to its goal."""
+    own = np.ascontiguousarray(controls)
     own[step] *= np.float32(share)
-    path = drives(part, search.engine.rollout(part, own).states, own, [[step + 1]])
-    controls[:, robot, : part.control_size] = path.controls[:, 0, 0]
-    return controls
+    return drives(part, search.engine.rollout(part, own).states, own, [[step + 1]]).controls[:, :, 0]
