@@ -124,7 +124,7 @@ class Problem(Frozen):
             world=world,
             goal_speed=goal_speeds(team, numbers["dt"], goal_speed),
             **checked_goal_poses(team, goal_heading, goal_heading_tolerance, goal_hitches),
-            name=name,
+            name=str(name),  # a path is a name too
             arrival=arrival,
         )
         # Asked for first, so that all clearances are found by the index of the engines.

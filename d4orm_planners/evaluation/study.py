@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from numbers import Real
@@ -100,9 +100,8 @@ class Study:
         if not chosen:
             raise ValueError("policies is empty; give at least one")
         if self.time_limit is not None and not any(choice.planned for choice in chosen):
-            raise ValueError(
-                f"time_limit {self.time_limit:g} is for planners, and none of the policies is one; leave it out"
-            )
+            limit = duration(self.time_limit, "time_limit")
+            raise ValueError(f"time_limit {limit:g} is for planners, and none of the policies is one; leave it out")
         _check_distinct(chosen)
         return chosen
 
@@ -123,11 +122,11 @@ class Study:
             if name in self.scenario_settings:
                 raise ValueError(f"scenario_settings has {name!r}; give {own!r} itself instead")
         said = ", ".join(f"{name}={value}" for name, value in self.scenario_settings.items())
-        sizes = dict.fromkeys(_several(self.num_robots))
-        models: tuple[str | None, ...] = _several(self.model)
+        sizes = dict.fromkeys(_several(self.num_robots, "num_robots"))
+        models: tuple[str | None, ...] = _several(self.model, "model")
         cells = []
         named = False
-        scenarios: tuple[Scenario, ...] = _several(self.scenarios)
+        scenarios: tuple[Scenario, ...] = _several(self.scenarios, "scenarios")
         # Problems are equal whatever they are called.
         named_apart = {(one.name if isinstance(one, Problem) else None, one): one for one in scenarios}
         for scenario in named_apart.values():
@@ -216,8 +215,8 @@ def _load(path: Path) -> Problem:
 
 def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     """Seeds, each once."""
-    if not isinstance(seeds, Iterable):
-        raise ValueError(f"seeds is {seeds!r}; give the seeds themselves, as range(50)")
+    if not isinstance(seeds, Iterable) or getattr(seeds, "ndim", 1) == 0:
+        raise ValueError(f"seeds is {short_repr(seeds)}; give the seeds themselves, as range(50)")
     checked = tuple(dict.fromkeys(whole_number(seed, "seed", 0) for seed in seeds))
     if not checked:
         raise ValueError("seeds is empty; give at least one")
@@ -226,11 +225,14 @@ def _checked_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     return checked
 
 
-def _several(values: T | Iterable[T]) -> tuple[T, ...]:
-    """One value, or several."""
-    if isinstance(values, str | os.PathLike) or not isinstance(values, Iterable):
-        return (values,)
-    return tuple(values)
+def _several(values: T | Iterable[T], name: str = "") -> tuple[T, ...]:
+    """One value, or several; with a ``name``, they are refused by it unless they can be told apart."""
+    one = isinstance(values, str | os.PathLike) or not isinstance(values, Iterable) or getattr(values, "ndim", 1) == 0
+    several = (values,) if one else tuple(values)  # type: ignore[arg-type] # iterable
+    for value in several if name else ():
+        if not isinstance(value, Hashable):
+            raise ValueError(f"{name} holds {short_repr(value)}; give one value, or a list of them, not of lists")
+    return several  # type: ignore[return-value]
 
 
 def conditions(
@@ -241,8 +243,7 @@ def conditions(
     Raises:
         ValueError: For an unknown name, a level that makes no sense, or nothing to do.
     """
-    given = control_noise_std if isinstance(control_noise_std, Iterable) else (control_noise_std,)
-    given = (control_noise_std,) if isinstance(control_noise_std, str) else given
+    given: tuple[float, ...] = _several(control_noise_std)
     noise = tuple(dict.fromkeys(positive_number(std, "control_noise_std", zero_allowed=True) for std in given))
     if not noise:
         raise ValueError("control_noise_std is empty; give at least one level")

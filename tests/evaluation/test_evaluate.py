@@ -117,6 +117,13 @@ def test_scenarios_with_other_arguments_are_other_trials(tmp_path: Path) -> None
     }
 
 
+@pytest.mark.parametrize("name", [Path("maps/hall"), None, 3, b"hall"])
+def test_a_problem_may_be_called_anything(name: Any, tmp_path: Path) -> None:
+    problem = make_problem("circle", num_robots=2).replace(name=name)
+    (rate,) = evaluate("go-to-goal", problem, out=tmp_path, seeds=[0], workers=1)
+    assert rate.scenario == problem.name == str(name)
+
+
 def test_a_problem_with_two_names_runs_once(tmp_path: Path) -> None:
     problem = make_problem("circle", num_robots=2)
     counts: list[tuple[int, int]] = []
@@ -657,6 +664,12 @@ def test_bad_input_is_one_line_and_status_two(d4orm, tmp_path: Path, arguments: 
         ({"disturbances": {"": [Delay(1)]}}, "give levels by name, as {'delay'"),
         ({"disturbances": {3: [1]}}, "disturbances is {3: .*; give levels by name, as {'delay'"),
         ({"scenario_settings": [1]}, r"scenario_settings is \[1\]; give arguments by name"),
+        ({"num_robots": [[2, 3]]}, r"num_robots holds \[2, 3\]; give one value, or a list of them, not of lists"),
+        ({"scenarios": [["circle"]]}, r"scenarios holds \['circle'\]; give one value, or a list"),
+        ({"num_robots": np.array(2.5)}, r"num_robots holds array\(2.5\); give one value"),
+        ({"seeds": np.array(5)}, r"seeds is array\(5\); give the seeds themselves"),
+        ({"control_noise_std": np.array("a")}, "control_noise_std must be a number, not array"),
+        ({"time_limit": "soon"}, "time_limit must be a number, not 'soon'"),
         ({"observation": ["observed_rays"]}, r"observation is \['observed_rays'\]; give arguments by name"),
     ],
 )
