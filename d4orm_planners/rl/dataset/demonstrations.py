@@ -83,7 +83,12 @@ class Demonstrations:
     def __post_init__(self) -> None:
         if self.agents not in AGENTS:
             raise ValueError(f"agents is {short_repr(self.agents)}; choose 'team' or 'robot'")
-        if not isinstance(self.seeds, Iterable):
+        for name in ("settings", "environment"):
+            if not isinstance(given := getattr(self, name), Mapping):
+                raise ValueError(f"{name} is {short_repr(given)}; give arguments by name, in a mapping")
+        if self.only_success not in (True, False):
+            raise ValueError(f"only_success is {short_repr(self.only_success)}; it must be True or False")
+        if not isinstance(self.seeds, Iterable) or getattr(self.seeds, "ndim", 1) == 0:
             raise ValueError(f"seeds is {short_repr(self.seeds)}; give the seeds themselves, as range(100)")
         seeds = tuple(dict.fromkeys(whole_number(seed, "seed", 0, LARGEST_WHOLE) for seed in self.seeds))
         if not seeds:
@@ -95,7 +100,8 @@ class Demonstrations:
         if self.only_success and self.environment.get("lifelong"):
             raise ValueError("only_success and lifelong do not go together: a lifelong episode never ends in success")
         fresh_policy(self._source, **self.settings)
-        self.make_env().close()
+        with closing(self.make_env()) as env:
+            env.unwrapped.options.require_physical_units()
 
     def make_env(self) -> ParallelEnv:
         """A new environment to record in."""
