@@ -235,11 +235,11 @@ class parallel_env(BaseEnv, ParallelEnv[str, FloatArray, FloatArray]):
         try:
             array = as_float32(action)
         except ValueError:
-            return f"action of {agent} is {action!r}; it must be {shape[0]} numbers"
+            return f"action of {agent} is {short_repr(action)}; it must be {shape[0]} numbers"
         if array.shape != shape or not usable(array).all():
             return (
-                f"action of {agent} is {action!r}; it must be {shape[0]} finite numbers of at most {MAX_ACTION:g} in "
-                f"magnitude, of shape {shape}"
+                f"action of {agent} is {short_repr(action)}; it must be {shape[0]} finite numbers of at most "
+                f"{MAX_ACTION:g} in magnitude, of shape {shape}"
             )
         return ""
 

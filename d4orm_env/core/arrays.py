@@ -121,11 +121,12 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
         ValueError: As :func:`frozen_array`, or if a value is not positive, or not from :data:`SMALLEST` to
             :data:`LARGEST`; the message names the robot.
     """
-    if np.ndim(value) == 0:
-        value = np.repeat(value, num_robots)
-    elif np.shape(value) != (num_robots,):
-        raise ValueError(f"{name} has shape {np.shape(value)}; expected one number, or ({num_robots},)")
-    array = frozen_array(value, name, (num_robots,))
+    numbers = numbers_of(value, f"{name} must be one number, or one for each robot")
+    if numbers.ndim == 0:
+        numbers = np.repeat(numbers, num_robots)
+    elif numbers.shape != (num_robots,):
+        raise ValueError(f"{name} has shape {numbers.shape}; expected one number, or ({num_robots},)")
+    array = frozen_array(numbers, name, (num_robots,))
     refuse_robots(array <= 0, name, array, "positive")
     refuse_robots((array < np.float32(SMALLEST)) | (array > LARGEST), name, array, f"from {SMALLEST:g} to {LARGEST:g}")
     return array

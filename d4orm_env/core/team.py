@@ -66,7 +66,7 @@ class Team(Frozen):
         footprint: Footprint | Sequence[Footprint] | None = None,
     ) -> None:
         if isinstance(models, str) or not isinstance(models, Sequence):
-            raise ValueError(f"models must be a sequence of model names, not {models!r}")
+            raise ValueError(f"models must be a sequence of model names, not {short_repr(models)}")
         if not models:
             raise ValueError("a team needs at least one robot; models is empty")
         if len({get_model(name).dimension for name in models}) > 1:

@@ -68,7 +68,7 @@ class World(Frozen):
         origin: ArrayLike | None = None,
     ) -> None:
         if isinstance(dimension, float) or dimension not in (2, 3):
-            raise ValueError(f"dimension of the world is {dimension!r}; it must be 2 or 3")
+            raise ValueError(f"dimension of the world is {short_repr(dimension)}; it must be 2 or 3")
         if (lower is None) != (upper is None):
             raise ValueError("bounds need both lower and upper; give both, or neither for an open world")
         rows = {
@@ -242,7 +242,7 @@ def _rounded_up(distance: float) -> float:
 
 def _polygons(given: Sequence[ArrayLike]) -> tuple[FloatArray, ...]:
     if not isinstance(given, Iterable):
-        raise ValueError(f"polygons must be a list of polygons, each a list of corners, not {given!r}")
+        raise ValueError(f"polygons must be a list of polygons, each a list of corners, not {short_repr(given)}")
     corners = (frozen_array(one, f"polygons[{index}]", (None, 2), largest=LARGEST) for index, one in enumerate(given))
     return tuple(corners)
 

@@ -15,6 +15,7 @@ from d4orm_env.core.arrays import (
     FloatArray,
     as_float32,
     frozen_array,
+    short_repr,
     usable,
     whole_number,
 )
@@ -64,7 +65,7 @@ def check_options(options: object, known: tuple[str, ...] = (), ignored: tuple[s
     if options is None:
         return
     if not isinstance(options, dict):
-        raise TypeError(f"options must be a dictionary or None, not {options!r}")
+        raise TypeError(f"options must be a dictionary or None, not {short_repr(options)}")
     for name in options:
         if name not in known + ignored:
             raise ValueError(
@@ -86,7 +87,8 @@ def joint_controls(actions: ArrayLike, shape: tuple[int, ...], num_robots: int) 
     try:
         controls = as_float32(actions)
     except ValueError as error:
-        raise ValueError(f"{noun.split()[0]} must be an array of {shape} numbers, not {actions!r}: {error}") from None
+        wanted = f"{noun.split()[0]} must be an array of {shape} numbers"
+        raise ValueError(f"{wanted}, not {short_repr(actions)}: {error}") from None
     if controls.shape != shape:
         raise ValueError(f"{noun} shape {controls.shape}; expected {axes} = {shape}")
     controls = controls.reshape(*shape[:-1], num_robots, -1)
@@ -106,7 +108,7 @@ def reset_mask(options: Mapping[str, object] | None, running: BoolArray) -> Bool
         return np.ones_like(running)
     mask = options["reset_mask"]
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-        raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, not {mask!r}")
+        raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, not {short_repr(mask)}")
     if mask.shape != running.shape or not mask.any():
         raise ValueError(
             f"options['reset_mask'] has shape {mask.shape} and {int(mask.sum())} worlds; it must have shape "
@@ -121,7 +123,7 @@ def world_seeds(seed: int | Sequence[int | None] | None, num_worlds: int) -> lis
     """One seed for each world, from the argument of ``reset``."""
     if seed is None:
         return [None] * num_worlds
-    if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str):
+    if not isinstance(seed, (Sequence, np.ndarray)) or isinstance(seed, str) or getattr(seed, "ndim", 1) == 0:
         first = whole_number(seed, "seed", 0)
         return [first + world for world in range(num_worlds)]
     if len(seed) != num_worlds:

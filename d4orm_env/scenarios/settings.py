@@ -80,7 +80,7 @@ class Settings:
             get_model(self.model)
             return (self.model,) * self.num_robots
         if not isinstance(self.model, Sequence) or not all(isinstance(name, str) for name in self.model):
-            raise ValueError(f"model must be the name of a model or one name per robot, not {self.model!r}")
+            raise ValueError(f"model must be the name of a model or one name per robot, not {short_repr(self.model)}")
         if len(self.model) != self.num_robots:
             raise ValueError(f"model lists {len(self.model)} names for {self.num_robots} robots; give one per robot")
         return tuple(self.model)
@@ -149,7 +149,7 @@ def require_scale(settings: Settings, travel: float) -> None:
 def grid_size(value: object, name: str) -> tuple[int, int]:
     """Columns and rows from what was given for them: two whole numbers, and not too many squares."""
     if not isinstance(value, tuple | list) or len(value) != 2:
-        raise ValueError(f"{name} must be two whole numbers, columns and rows, not {value!r}")
+        raise ValueError(f"{name} must be two whole numbers, columns and rows, not {short_repr(value)}")
     columns, rows = (whole_number(count, name, 1, MAX_COUNT) for count in value)
     if columns * rows > MAX_COUNT:
         raise ValueError(f"{name} is {columns} x {rows}; scenarios make at most {MAX_COUNT} in all")

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import BPoly, PPoly
 
-from d4orm_env.core.arrays import LARGEST, Floats, positive_number
+from d4orm_env.core.arrays import LARGEST, Floats, positive_number, short_repr
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.verify import VerificationReport
@@ -252,10 +252,10 @@ def export_motion(motion: SmoothMotion, form: str, folder: Path, rate: float, he
         ModuleNotFoundError: If a library for it is missing; the message names it.
         OSError: If it cannot be written; nothing is left behind then.
     """
-    if form not in FORMATS:
+    if not isinstance(form, str) or form not in FORMATS:
         raise unknown("format", form, FORMATS)
     if not isinstance(height, Real) or not abs(height) <= LARGEST:
-        raise ValueError(f"height is {height!r}; it must be a number of at most {LARGEST:g} m in magnitude")
+        raise ValueError(f"height is {short_repr(height)}; it must be a number of at most {LARGEST:g} m in magnitude")
     if height and motion.problem.dimension == 3:
         raise ValueError(f"height is {height:g} m, and this team has heights of its own; leave it out")
     if folder.exists() and not folder.is_dir():

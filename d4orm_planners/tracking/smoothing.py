@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 
-from d4orm_env.core.arrays import Floats
+from d4orm_env.core.arrays import Floats, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE
@@ -92,9 +92,11 @@ def _each(name: str, value: ArrayLike | None, otherwise: Floats) -> Floats:
     try:
         each: Floats = np.broadcast_to(np.asarray(value, np.float64), otherwise.shape)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be one number or one per robot ({len(otherwise)}), not {value!r}") from None
+        raise ValueError(
+            f"{name} must be one number or one per robot ({len(otherwise)}), not {short_repr(value)}"
+        ) from None
     if not (each > 0).all():
-        raise ValueError(f"{name} is {value!r}; it must be positive")
+        raise ValueError(f"{name} is {short_repr(value)}; it must be positive")
     return each
 
 

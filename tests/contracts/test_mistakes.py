@@ -28,7 +28,17 @@ from d4orm_env.envs.rewards import TrainingReward
 from d4orm_env.footprints import Box, Train
 from d4orm_env.render import save_animation, save_picture
 from d4orm_env.scenarios import load_cl_mapf
-from d4orm_planners import Controller, Episode, Policy, evaluate, load_plan, make_planner, make_policy, run_episode
+from d4orm_planners import (
+    Controller,
+    Episode,
+    Plan,
+    Policy,
+    evaluate,
+    load_plan,
+    make_planner,
+    make_policy,
+    run_episode,
+)
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3, from_torch
 
 
@@ -58,6 +68,11 @@ def make_vec() -> Any:
 def episode() -> Episode:
     """Two robots at rest for a step."""
     return run_episode(navigation_v0.parallel_env(problem=PROBLEM.replace(horizon=1)), "go-to-goal")
+
+
+def episode_plan() -> Plan:
+    """A plan of two robots."""
+    return make_planner(engine="cpu").solve(PROBLEM)
 
 
 def controller() -> Controller:
@@ -113,11 +128,22 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: TrainingReward(contact=-3), "contact of TrainingReward is -3; it must be zero or more"),
         (lambda: MovingObstacle([2, 1], [[0, 0], [1, 1]]), r"times are \[2.0, 1.0\]; give two or more that increase"),
         (lambda: verify(PROBLEM, np.zeros((7, 2, 2))), r"problem.replace\(horizon=7\)"),
+        (lambda: make_problem("circle", radius=[[0.1], [0.1, 0.2]]), r"radius must be one number, or one for each rob"),
+        (
+            lambda: run_episode(navigation_v0.parallel_env(problem=PROBLEM), lambda seen: seen),
+            "it must be 2 finite num",
+        ),
+        (lambda: make_vec().reset(options={"reset_mask": np.ones(99)}), "must be a NumPy array of bool, not array"),
+        (lambda: make_vec().reset(seed=np.array(1)), r"seed must be a whole number, not array\(1\)"),
+        (lambda: Team(np.zeros((9, 9))), "models must be a sequence of model names, not array"),
+        (lambda: episode_plan().sample(max_acceleration=np.zeros((9, 9))), "max_acceleration must be one number or"),
+        (lambda: episode_plan().export([], "out"), r"format \[\] is unknown; choose one of csv"),
     ],
 )
 def test_what_python_says(call: Callable[[], object], message: str) -> None:
-    with pytest.raises((ValueError, TypeError), match=message):
+    with pytest.raises((ValueError, TypeError), match=message) as said:
         call()
+    assert "\n" not in str(said.value)
 
 
 @pytest.mark.parametrize("path", [5, None, ""])
