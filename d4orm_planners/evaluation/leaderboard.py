@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 from d4orm_planners.base.display import markdown_text
@@ -40,7 +41,7 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     """
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")
-    groups = _groups(trials)
+    groups = _groups(_told_apart(trials))
     rates = success_rates(TrialGroup(key[0], group, key[-1]) for key, group in groups.items())
     blocks = [INTRODUCTION, "## Success", *_matrices(rates), "## Scenario by scenario"]
     for title, panel in panels(rates).items():
@@ -50,6 +51,28 @@ def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str
     if deadlines:
         blocks += ["## Success within a deadline for planning", WITHIN, *_deadlines(groups, deadlines)]
     return "\n\n".join([*blocks, *errors((rate.label, rate.error) for rate in rates), origin(trials)]) + "\n"
+
+
+def _told_apart(trials: Sequence[Trial]) -> list[Trial]:
+    """The trials, with numbers behind the names of scenarios that stand for several problems of one team and seed.
+
+    A scenario that has changed since, or two of one name, would otherwise count as one with more trials.
+    """
+    problems: dict[tuple[str, int, str, int], dict[str, None]] = {}
+    for trial in sorted(trials, key=lambda trial: trial.date):
+        problems.setdefault((trial.scenario, trial.num_robots, trial.model, trial.seed), {})[trial.problem] = None
+    numbers = {
+        (scenario, problem): number
+        for (scenario, *_), several in problems.items()
+        for number, problem in enumerate(several, 1)
+        if len(several) > 1
+    }
+    return [
+        replace(trial, scenario=f"{trial.scenario}, problem {numbers[trial.scenario, trial.problem]}")
+        if (trial.scenario, trial.problem) in numbers
+        else trial
+        for trial in trials
+    ]
 
 
 Key: TypeAlias = tuple[str, str, int, str, str, float, str]

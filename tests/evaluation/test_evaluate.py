@@ -510,6 +510,19 @@ def test_the_leaderboard_holds_everything_in_the_store(d4orm, tmp_path: Path) ->
     assert (tmp_path / "once.md").read_text() == page
 
 
+def test_problems_of_one_name_are_no_one_row_of_the_leaderboard() -> None:
+    """As of a scenario file that was changed between two calls."""
+    old = [trial(seed, problem="a", date="2026-11-01") for seed in range(4)]
+    new = [trial(seed, problem="b", date="2026-11-02", success=False) for seed in range(2, 6)]
+    page = leaderboard(new + old)
+    assert "### circle, problem 1, 2 robots, holonomic2d" in page
+    assert page.count("4 of 4 (100%)") == page.count("0 of 4 (0%)") == 1
+    # Other seeds may have other problems.
+    drawn = [trial(seed, problem=f"{seed}") for seed in range(4)]
+    assert "| policy | circle, 2 robots, holonomic2d |" in leaderboard(drawn)
+    assert "4 of 4" in leaderboard(drawn)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
