@@ -22,6 +22,7 @@ from d4orm_env.core.arrays import (
     short_repr,
     whole_number,
 )
+from d4orm_env.core.files import checked_path
 from d4orm_env.core.observation_layout import BoundsSlack
 from d4orm_env.core.problem import Problem
 from d4orm_env.disturbances.disturbance import Disturbance, DisturbanceEffect, Kept, Scene, level, standard_deviation
@@ -257,29 +258,27 @@ def load_pedestrians(path: str | Path, radius: float = 0.25) -> MovingObstacle:
             two times, or somebody is at two places at one time.
     """
     try:
-        file = open(path, newline="", encoding="utf-8-sig")  # noqa: SIM115
-    except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be read ({error.strerror or error}); give a CSV file of pedestrians"
-        ) from None
-    with file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ValueError(f"{path} has no column {', '.join(missing)}; it needs a header with id, time, x and y")
-        people: dict[str, dict[float, tuple[float, float]]] = defaultdict(dict)
-        for row in reader:
-            try:
-                time, x, y = (float(row[name]) for name in _COLUMNS[1:])
-                if not np.isfinite((time, x, y)).all():
-                    raise ValueError("not finite")
-            except (TypeError, ValueError):
-                given = ", ".join(short_repr(row[name]) for name in _COLUMNS[1:])
-                raise ValueError(f"{path}, line {reader.line_num}: time, x and y are {given}; give numbers") from None
-            if people[row["id"]].setdefault(time, (x, y)) != (x, y):
-                raise ValueError(
-                    f"{path}, line {reader.line_num}: {row['id']} is at two places at {time:g} s; give one"
-                )
+        with checked_path(path, "a file of pedestrians").open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            names = reader.fieldnames or ()
+            rows = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"{path}: cannot be read ({reason}); give a CSV file of pedestrians, in UTF-8") from None
+    missing = [name for name in _COLUMNS if name not in names]
+    if missing:
+        raise ValueError(f"{path} has no column {', '.join(missing)}; it needs a header with id, time, x and y")
+    people: dict[str, dict[float, tuple[float, float]]] = defaultdict(dict)
+    for line, row in rows:
+        try:
+            time, x, y = (float(row[name]) for name in _COLUMNS[1:])
+            if not np.isfinite((time, x, y)).all():
+                raise ValueError("not finite")
+        except (TypeError, ValueError):
+            given = ", ".join(short_repr(row[name]) for name in _COLUMNS[1:])
+            raise ValueError(f"{path}, line {line}: time, x and y are {given}; give numbers") from None
+        if people[row["id"]].setdefault(time, (x, y)) != (x, y):
+            raise ValueError(f"{path}, line {line}: {row['id']} is at two places at {time:g} s; give one")
     times = np.unique([time for track in people.values() for time in track])
     if len(times) < 2:
         raise ValueError(f"{path} has rows at {len(times)} different times; give two at least")

@@ -23,7 +23,7 @@ from d4orm_env import (
     save_problem,
     verify,
 )
-from d4orm_env.disturbances import MovingObstacle
+from d4orm_env.disturbances import MovingObstacle, load_pedestrians
 from d4orm_env.envs.rewards import TrainingReward
 from d4orm_env.footprints import Box, Train
 from d4orm_env.render import save_animation, save_picture
@@ -153,6 +153,7 @@ def test_what_python_says(call: Callable[[], object], message: str) -> None:
         (load_plan, "a plan file"),
         (load_problem, "a scenario file"),
         (load_map, "a map"),
+        (load_pedestrians, "a file of pedestrians"),
         (load_dynobench, "a problem of dynobench"),
         (load_cl_mapf, "a problem of CL-CBS or CSDO"),
         (lambda path: save_problem(PROBLEM, path), "a scenario file"),

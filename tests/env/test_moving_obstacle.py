@@ -122,11 +122,13 @@ def test_pedestrians_are_read_from_a_file(tmp_path: Path) -> None:
         ("id,time,x,y\na,0,0,0\na,0,1,0\n", "line 3: a is at two places at 0 s"),
         ("id,time,x,y\na,0,0,0\n", "people.csv has rows at 1 different times; give two"),
         ("id,time,x,y\n", "people.csv has rows at 0 different times; give two"),
+        ("id,time,x,y\nJos\xe9,0,0,0\n", "people.csv: cannot be read .*give a CSV file of pedestrians, in UTF-8"),
+        (f"id,time,x,y\na,0,0,{'1' * 200_000}\n", "people.csv: cannot be read .*field larger than field limit"),
     ],
 )
 def test_a_bad_file_is_an_error(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "people.csv"
-    path.write_text(text)
+    path.write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=message):
         load_pedestrians(path)
 
