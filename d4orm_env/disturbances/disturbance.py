@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, dataclass, field, fields
-from functools import partial, reduce
+from functools import partial
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -226,7 +226,13 @@ def at_work(disturbances: Disturbances, problem: Problem) -> Disturbances:
 
 def total_slack(disturbances: Disturbances, problem: Problem) -> BoundsSlack:
     """Room that all of them need together."""
-    return reduce(BoundsSlack.joined, (one.slack(problem) for one in disturbances), BoundsSlack())
+    total = BoundsSlack()
+    for one in disturbances:
+        if not isinstance(slack := one.slack(problem), BoundsSlack):
+            returned = f"slack returned {short_repr(slack)}; expected a BoundsSlack"
+            raise ValueError(f"disturbance {type(one).__name__}: {returned}")
+        total = total.joined(slack)
+    return total
 
 
 def events_of(effects: Sequence[DisturbanceEffect], problem: Problem) -> DisturbanceEvents:

@@ -68,6 +68,16 @@ class _ActiveDisturbance:
         make = getattr(type(self.memory), "_make", tuple)
         return make(parts)
 
+    def effect(self, memory: Memory, scene: Scene) -> DisturbanceEffect:
+        """Its effect on the worlds of a scene, of which it remembers this."""
+        effect, (count, robots, d) = self.disturbance.effect(memory, scene), scene.goal.shape
+        if self.foreign:
+            wanted = ((count, robots, d), (count, robots), (count, robots), (count, None, 2 * d + 1))
+            if not isinstance(effect, DisturbanceEffect) or not all(map(_fits, effect, wanted)):
+                shapes = ", ".join(f"{name} {shape}" for name, shape in zip(DisturbanceEffect._fields, wanted))
+                raise self.wrong("effect", effect, f"a DisturbanceEffect of None or arrays, {shapes}")
+        return effect
+
     def wrong(self, method: str, returned: object, expected: str) -> ValueError:
         """The error for what a method of the disturbance returned."""
         name = type(self.disturbance).__name__
@@ -154,7 +164,7 @@ class DisturbedWorlds:
                     "begin", memory, f"a NamedTuple of arrays, each with a row for every one of {count} worlds"
                 )
             one.remember(memory, worlds, first=not self._begun)
-            bodies = one.disturbance.effect(memory, scene).bodies
+            bodies = one.effect(memory, scene).bodies
             if bodies is not None:
                 if not self._begun:
                     self._bringing.append(one)
@@ -177,14 +187,14 @@ class DisturbedWorlds:
         if states is not scene.states and scene.standing.any():
             states = np.where(scene.standing[..., None], scene.states, states)
         if self.bodies.shape[1]:
-            effects = (one.disturbance.effect(one.memory, scene).bodies for one in self._bringing)
+            effects = (one.effect(one.memory, scene).bodies for one in self._bringing)
             present = [bodies for bodies in effects if bodies is not None]
             self.bodies = present[0] if len(present) == 1 else np.concatenate(present, axis=1)
         return states, controls
 
     def effect(self, scene: Scene) -> DisturbanceEffect:
         """Return the joint effect of all up to now."""
-        effects = [one.disturbance.effect(one.memory, scene) for one in self._effective]
+        effects = [one.effect(one.memory, scene) for one in self._effective]
         return DisturbanceEffect(
             pushed=_together(np.add, [effect.pushed for effect in effects]),
             stalled=_together(np.logical_or, [effect.stalled for effect in effects]),
@@ -231,6 +241,12 @@ def _check_methods(kind: type[AnyDisturbance]) -> None:
         own, inherited = getattr(kind, name), getattr(Disturbance, name)
         if own is not inherited:
             check_call(own, f"disturbance {kind.__name__}: {name}", *signature(inherited).parameters)
+
+
+def _fits(part: ArrayLike | None, wanted: tuple[int | None, ...]) -> bool:
+    """Check whether something is ``None`` or of a shape, in which ``None`` is any length."""
+    shape = np.shape(part) if part is not None else wanted
+    return len(shape) == len(wanted) and all(want in (None, have) for want, have in zip(wanted, shape))
 
 
 def _together(join: Callable[[T, T], T], parts: Sequence[T | None]) -> T | None:
