@@ -35,6 +35,7 @@ from d4orm_planners.rl.algorithms import ALGORITHMS, network_of
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.dataset.minari_files import Samples, dataset_samples
 from d4orm_planners.rl.network import CLIP, EPSILON, Network
+from d4orm_planners.rl.only_writer import only_writer
 from d4orm_planners.rl.task_mixture import Instances
 from d4orm_planners.rl.train_config import VALIDATION_SEED, Many, TrainConfig
 from d4orm_planners.rl.training import Progress, TrainingResult
@@ -116,12 +117,13 @@ def imitate(
 
     Raises:
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
-        OSError: If the folder cannot be used.
+        OSError: If the folder cannot be used, or another process trains into it.
     """
     folder = checked_path(out, "the folder of a training")
     run = _ImitationRun(settings, folder, progress or (lambda what, done, total: None), command)
-    for index in range(len(run.evaluations), settings.rounds):
-        run.learn(index)
+    with only_writer(folder):
+        for index in range(len(run.evaluations), settings.rounds):
+            run.learn(index)
     return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)
 
 

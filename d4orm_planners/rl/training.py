@@ -26,6 +26,7 @@ from d4orm_env.core.seeds import Stream, derived_seed
 from d4orm_planners.rl.algorithms import ALGORITHMS, Algorithm, network_of, set_network
 from d4orm_planners.rl.checkpoints import Checkpoints, Evaluation, evaluate_network
 from d4orm_planners.rl.network import CLIP, EPSILON, Network, load_network, range_sensors
+from d4orm_planners.rl.only_writer import only_writer
 from d4orm_planners.rl.train_config import MIXTURE, VALIDATION_SEED, Drawn, Stage, TrainingSettings, make_stages
 
 __all__ = ["TrainingResult", "TrainingSettings", "train"]
@@ -59,12 +60,13 @@ def train(
 
     Raises:
         ValueError: For settings that make no sense, or other settings than those of the training in ``out``.
-        OSError: If the folder cannot be used.
+        OSError: If the folder cannot be used, or another process trains into it.
     """
     folder = checked_path(out, "the folder of a training")
     run = _TrainingRun(settings, folder, progress or (lambda what, done, total: None), command)
-    for index in range(len(run.evaluations), len(run.stages)):
-        run.learn(index)
+    with only_writer(folder):
+        for index in range(len(run.evaluations), len(run.stages)):
+            run.learn(index)
     return TrainingResult(run.checkpoints.policy(), tuple(run.evaluations), run.checkpoints.policy_path)
 
 

@@ -20,6 +20,7 @@ from d4orm_planners import Policy, make_policy
 from d4orm_planners.base.policy import GoToGoal
 from d4orm_planners.rl.dataset import Demonstrations, RecordedEpisode, record_episode, write_dataset
 from d4orm_planners.rl.dataset import write as write_module
+from d4orm_planners.rl.only_writer import only_writer
 
 minari = pytest.importorskip("minari")
 
@@ -293,6 +294,13 @@ def test_what_makes_no_sense_is_refused_before_anything_runs(
     with pytest.raises((ValueError, TypeError), match=complaint):
         written(tmp_path / "one", **changes)
     assert not list(tmp_path.iterdir())
+
+
+def test_two_recordings_into_one_folder_take_turns(tmp_path: Path) -> None:
+    (tmp_path / "recording").mkdir()
+    with only_writer(tmp_path / "recording"), pytest.raises(OSError, match="is being written to by another process"):
+        written(tmp_path)
+    assert written(tmp_path).total_episodes == len(IN_TIME["seeds"])
 
 
 def test_a_folder_with_another_dataset_is_left_alone(tmp_path: Path) -> None:

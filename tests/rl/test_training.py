@@ -56,6 +56,7 @@ def test_stages_take_whole_updates_and_all_of_them() -> None:
 
 
 pytest.importorskip("stable_baselines3")
+from d4orm_planners.rl.only_writer import only_writer  # noqa: E402
 from d4orm_planners.rl.training import TrainingSettings, train  # noqa: E402
 
 TINY = TrainingSettings(
@@ -202,6 +203,12 @@ def test_what_cannot_be_learned_is_refused_and_nothing_is_written(tmp_path: Path
     with pytest.raises(ValueError, match="mixes"):
         train(replace(TINY, scenario="heterogeneous"), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_two_trainings_into_one_folder_take_turns(trained: tuple[TrainingSettings, Path]) -> None:
+    with only_writer(trained[1]), pytest.raises(OSError, match="is being written to by another process; wait until"):
+        train(*trained)
+    assert train(*trained).curve
 
 
 def test_other_settings_in_the_same_folder_are_refused(trained: tuple[TrainingSettings, Path]) -> None:

@@ -30,6 +30,7 @@ from d4orm_planners.base.provenance import commit, versions
 from d4orm_planners.evaluation.pool import ProcessWorker, run_here, run_jobs
 from d4orm_planners.rl.dataset.demonstrations import Demonstrations, RecordedEpisode
 from d4orm_planners.rl.dataset.minari_files import DatasetFiles
+from d4orm_planners.rl.only_writer import only_writer
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -119,7 +120,7 @@ def write_dataset(
     Raises:
         ValueError: For a name or number that makes no sense, an episode that fails, or a folder with something else.
         ImportError: If Minari is not installed.
-        OSError: If the folder cannot be written to, or a worker process dies.
+        OSError: If the folder cannot be written to, or another process does so, or a worker process dies.
     """
     whole_number(shard_size, "shard_size", 1)
     if workers is not None:
@@ -130,9 +131,10 @@ def write_dataset(
     recording, files = Recording(folder / "recording"), dataset_files(demonstrations, folder / "data")
     recording.folder.mkdir(parents=True, exist_ok=True)
     claim_folder(recording.folder / IDENTITY, demonstrations.identity, "a dataset")
-    _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
-    _pack(recording, files, shard_size)
-    files.write_main(_metadata(demonstrations, name, len(recording.seeds(_DROPPED))))
+    with only_writer(recording.folder):
+        _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
+        _pack(recording, files, shard_size)
+        files.write_main(_metadata(demonstrations, name, len(recording.seeds(_DROPPED))))
 
     return minari.MinariDataset(folder / "data")
 
