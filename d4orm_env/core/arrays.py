@@ -121,7 +121,7 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
         ValueError: As :func:`frozen_array`, or if a value is not positive, or not from :data:`SMALLEST` to
             :data:`LARGEST`; the message names the robot.
     """
-    numbers = numbers_of(value, f"{name} must be one number, or one for each robot")
+    numbers = numbers_of(value, f"{name} must be an array of numbers")
     if numbers.ndim == 0:
         numbers = np.repeat(numbers, num_robots)
     elif numbers.shape != (num_robots,):

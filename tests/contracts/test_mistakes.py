@@ -128,7 +128,10 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: TrainingReward(contact=-3), "contact of TrainingReward is -3; it must be zero or more"),
         (lambda: MovingObstacle([2, 1], [[0, 0], [1, 1]]), r"times are \[2.0, 1.0\]; give two or more that increase"),
         (lambda: verify(PROBLEM, np.zeros((7, 2, 2))), r"problem.replace\(horizon=7\)"),
-        (lambda: make_problem("circle", radius=[[0.1], [0.1, 0.2]]), r"radius must be one number, or one for each rob"),
+        (
+            lambda: make_problem("circle", radius=[[0.1], [0.1, 0.2]]),
+            r"radius must be an array of numbers, not \[\[0.1\]",
+        ),
         (
             lambda: run_episode(navigation_v0.parallel_env(problem=PROBLEM), lambda seen: seen),
             "it must be 2 finite num",
