@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple, Protocol, Self, TypeAlias, TypeVar
 
-from d4orm_env.core.arrays import FloatArray
+from d4orm_env.core.arrays import LARGEST, FloatArray
 from d4orm_env.core.winding import Unwinding
 
 SPEED, ACCELERATION, TURN_RATE = range(3)
@@ -22,6 +22,8 @@ SPEED, ACCELERATION, TURN_RATE = range(3)
 STANDARD_LIMITS = ("max_speed", "max_acceleration", "max_turn_rate")
 OWN_LIMITS = len(STANDARD_LIMITS)
 """Column of the first limit that a model has for itself."""
+UNLIMITED = LARGEST
+"""Default of a limit that bounds nothing unless it is given."""
 
 Operand: TypeAlias = Any
 """Another number, or a constant of Python; what a library accepts differs from one to the next."""
@@ -115,14 +117,9 @@ class ModelFunctions(NamedTuple):
     track: ModelFunction
     """``(x, velocity, limits, h, ops) -> u`` that would bring it to that within a step; it may exceed the limits."""
     integrate: Any = None
-    """``(x, u, limits, h, ops) -> x`` after a :class:`TimeStep`: what classical Runge-Kutta makes of the derivative
-    with the control held constant, written out without the terms that cancel. A model that leaves it out is integrated
-    by :class:`RungeKutta`.
+    """``(x, u, limits, h, ops) -> x`` after a :class:`TimeStep`: classical Runge-Kutta, the control held constant,
+    written out without the terms that cancel. A model that leaves it out is integrated by :class:`RungeKutta`.
     """
-
-
-UNLIMITED = 1e6
-"""Default of a limit that bounds nothing unless it is given: the largest that a team may have."""
 
 
 class Limit(NamedTuple):
@@ -140,8 +137,6 @@ class Limit(NamedTuple):
 
 
 # ``x + h * k`` for states of two to six components, written out for the compiler.
-
-
 def _moved2(x: Vector, h: Number, k: Vector) -> Vector:
     return (x[0] + h * k[0], x[1] + h * k[1])
 
