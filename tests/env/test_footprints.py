@@ -353,3 +353,12 @@ def test_gaps_of_ellipsoids_elsewhere(obstacles: Any, gap: float) -> None:
     """The same one at (2, 1, 3)."""
     pose = np.array([2.0, 1.0, 3.0, 0.0])
     assert world_gap(World(3, **obstacles), Ellipsoid(0.1, 0.2, 0.3), pose) == pytest.approx(gap, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "gap"),
+    [([-0.5, -9], [9, 9], 0.2), ([-9, -0.7], [9, 9], 0.6), ([-9, -9], [0.6, 9], 0.3), ([-9, -9], [9, 0.9], 0.8)],
+)
+def test_round_ends_come_nearer_to_every_side_of_the_bounds(lower: list[float], upper: list[float], gap: float) -> None:
+    """Of a capsule at the origin that reaches 0.3 m ahead and behind, and 0.1 m to either side."""
+    assert world_gap(World(lower=lower, upper=upper), Capsule(0.4, 0.1), np.zeros(3)) == pytest.approx(gap)

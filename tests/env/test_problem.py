@@ -395,6 +395,8 @@ CHANGES: list[dict[str, Any]] = [
     {"goal": [[1, 0.1], [-1, 0]]},
     {"world": World(2, circles=[[0, 1, 0.25]], boxes=[[-3, 2, 3, 3]])},
     {"world": World(2, circles=[[0, 1, 0.25]], lower=[-4, -4], upper=[4, 4])},
+    {"world": two_robots().world.replace(origin=[5, 0])},
+    {"world": two_robots().world.replace(origin=[0, 5])},
     {"team": Team(("holonomic2d", "holonomic2d"), radius=[0.2, 0.3], max_speed=[1.0, 2.0])},
     {"team": Team(("holonomic2d", "velocity2d"), radius=[0.2, 0.3], max_speed=[1.0, 2.5])},
     {"team": Team(("holonomic2d", "velocity2d"), radius=[0.2, 0.3], max_speed=[1.0, 2.0], max_turn_rate=1)},
