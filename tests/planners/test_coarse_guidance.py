@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from planner_support import hop_problem
 
+from d4orm_env.core.problem import Problem
 from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.dynamics.models import COMMON
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.scenarios import make_problem
 from d4orm_planners.base.candidate import failed_robots
+from d4orm_planners.base.policy_threads import Background
 from d4orm_planners.base.solve import SolveRun
 from d4orm_planners.base.working_plan import WorkingPlan
 from d4orm_planners.d4orm_c2f.coarse_plan import (
@@ -22,6 +24,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     STUCK_AFTER,
     STUCK_WITHIN,
     CoarsePlan,
+    CoarseWaypoints,
     StagnationMonitor,
     coarse_problem,
     interpolate,
@@ -31,6 +34,8 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     subgoal_indices,
     visible_subgoals,
 )
+from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
+from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_d.planner import D4ormD, D4ormDConfig
 from d4orm_planners.engine.sampling_types import get_sampling_engine
 from d4orm_planners.tracking.steering import present_velocities
@@ -204,6 +209,41 @@ def test_who_does_not_get_on_is_stuck() -> None:
     idle, careful = monitor.observe(STUCK_AFTER + 2, indices, np.zeros(3, bool))
     assert idle[0] == 0
     assert careful[0]
+
+
+def tracker_along(path: np.ndarray, problem: Problem, **config: Any) -> CoarsePlanTracker:
+    """Leads robots along a path, from its first waypoints on."""
+    cheap = {"engine": "cpu", "coarse_samples": 16, "coarse_steps": 4, "coarse_repair_steps": 4}
+    tracker = CoarsePlanTracker(
+        problem, D4ormC2FConfig(**cheap, **config), 0, Background(), Background(), lifelong=False, last_step=200
+    )
+    tracker.begin(joint(problem, problem.start), np.zeros(problem.num_robots, bool))
+    tracker.guidance = CoarseWaypoints(path=path, ordered=False)
+    return tracker
+
+
+@pytest.mark.parametrize(("radii", "waits"), [(0.9, True), (1.1, False), (1.9, False)])
+def test_who_waits_within_a_radius_of_its_waypoint_keeps_its_path(radii: float, waits: bool) -> None:
+    problem = hop_problem(1)
+    tracker, states = tracker_along(right_angle(1), problem, patience=1000), problem.start.copy()
+    states[0, 1] = -radii * problem.team.largest_radius
+    replans = [
+        tracker.replan_if_needed(joint(problem, states, step), np.zeros(1, bool)) for step in range(1, STUCK_AFTER + 2)
+    ]
+    assert replans == [False] * STUCK_AFTER + [not waits]
+
+
+@pytest.mark.parametrize(
+    ("docked", "config", "at_the_end"), [(False, {}, True), (True, {}, False), (True, {"line_of_sight": False}, True)]
+)
+def test_unless_told_otherwise_robots_head_for_what_they_see(docked: bool, config: Any, at_the_end: bool) -> None:
+    """The end of the path of the first one is straight behind the second one."""
+    problem, states = hop_problem(2), np.zeros((2, 4), np.float32)
+    tracker = tracker_along(right_angle(2), problem, subgoal_offset=40, max_lag=None, **config)
+    states[1, :2] = [0.65, 0.35]
+    targets = tracker.subgoals(joint(problem, states), np.array([False, docked]))
+    assert (targets[0] == 40) == at_the_end
+    assert targets[0] > LEAST
 
 
 def test_a_path_is_followed() -> None:

@@ -124,6 +124,7 @@ def test_the_denoising_is_drawn_and_replayed(scenario: str, tmp_path: Path) -> N
     scene = plan.motion(denoising=seen).content
     assert scene["denoising"]["labels"] == list(seen.labels)
     assert scene["denoising"]["points"] == seen.paths.shape[1]
+    assert seen.samples.shape[:2] == (4, 4)
 
 
 SHARED = """

@@ -503,6 +503,16 @@ def test_the_tuned_presets_are_the_best_of_the_tuning() -> None:
         assert (config["num_samples"], config["credit"]) == (1024, "team")
 
 
+def test_the_paper_presets_are_among_the_settings_of_the_tuning() -> None:
+    with (Path(__file__).parents[2] / "docs" / "tables" / "tuning.csv").open(newline="") as file:
+        tried = [(row["method"], row["settings"]) for row in csv.DictReader(file)]
+    for name in TUNED:
+        config = make_planner(name, preset="paper").config.keywords()
+        own = [dict(part.split("=") for part in found.split(", ")) for method, found in tried if method == name]
+        assert len(own) == 27
+        assert {setting: str(config[setting]) for setting in own[0]} in own
+
+
 def test_the_paper_presets_of_the_methods_own_parameters() -> None:
     assert make_planner("d4orm", preset="paper").config.random_start is False
     assert make_planner("d4orm", preset="paper").config.late_samples == 1
