@@ -34,7 +34,7 @@ from d4orm_planners.d4orm_c2f.coarse_plan import (
     subgoal_indices,
     visible_subgoals,
 )
-from d4orm_planners.d4orm_c2f.coarse_plan_tracker import CoarsePlanTracker
+from d4orm_planners.d4orm_c2f.coarse_plan_tracker import NEARER, CoarsePlanTracker
 from d4orm_planners.d4orm_c2f.settings import D4ormC2FConfig
 from d4orm_planners.d4orm_d.planner import D4ormD, D4ormDConfig
 from d4orm_planners.engine.sampling_types import get_sampling_engine
@@ -231,6 +231,18 @@ def test_who_waits_within_a_radius_of_its_waypoint_keeps_its_path(radii: float, 
         tracker.replan_if_needed(joint(problem, states, step), np.zeros(1, bool)) for step in range(1, STUCK_AFTER + 2)
     ]
     assert replans == [False] * STUCK_AFTER + [not waits]
+
+
+@pytest.mark.parametrize(("num_robots", "lost"), [(1, True), (4, False)])
+def test_a_team_is_lost_once_all_together_get_no_nearer(num_robots: int, lost: bool) -> None:
+    """Each gets nearer to its goal by less in a step than counts."""
+    problem = hop_problem(num_robots)
+    tracker, states = tracker_along(right_angle(num_robots), problem, patience=2), problem.start.copy()
+    replans = []
+    for step in range(1, 5):
+        states[:, 0] += 0.3 * NEARER * problem.team.largest_radius
+        replans.append(tracker.replan_if_needed(joint(problem, states, step), np.zeros(num_robots, bool)))
+    assert replans == [False, False, False, lost]
 
 
 @pytest.mark.parametrize(
