@@ -5,11 +5,15 @@
 Both maximise the same function with many local maxima, with the same softmax over the same number of samples a step.
 MPPI samples with one standard deviation throughout, small or large; MBD's falls along the diffusion schedule: it looks
 around first and settles at the end. The schedule and the weights are the planners' own.
+
+A second table is of a function that traps: how often MBD, with more and more steps, and D4orm, with more and more
+iterations of MBD, end at its optimum.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from examples.common import COLOURS, argument_parser, count, plt, save_figure, save_table
@@ -18,11 +22,17 @@ from d4orm_planners.sampling.settings import annealed, constant
 from d4orm_planners.sampling.weights import SoftmaxWeights
 
 START = -2.5
+Objective: TypeAlias = Callable[[Any], Any]
 
 
 def reward(x: Any) -> Any:
     """A broad hill with ripples: about ten local maxima on [-4, 4], the highest near 1.6."""
     return -0.12 * (x - 1.5) ** 2 + 0.5 * np.cos(5 * x - 8) + 0.2 * np.cos(11 * x - 17.6)
+
+
+def trap(x: Any) -> Any:
+    """A broad hill where the search starts, and a higher, narrow one four on."""
+    return np.exp(-((x - START) ** 2) / 2) + 1.5 * np.exp(-((x - START - 4) ** 2) / (2 * 0.15**2))
 
 
 class Run(NamedTuple):
@@ -32,7 +42,7 @@ class Run(NamedTuple):
     samples: np.ndarray
 
 
-def optimise(noise_scale: np.ndarray, num_samples: int, seed: int) -> Run:
+def optimise(noise_scale: np.ndarray, num_samples: int, seed: int, objective: Objective = reward) -> Run:
     """Sample, weight and average once per entry of the schedule."""
     random = np.random.default_rng(seed)
     weigh = SoftmaxWeights(temperature=0.3)
@@ -40,8 +50,21 @@ def optimise(noise_scale: np.ndarray, num_samples: int, seed: int) -> Run:
     for sigma in noise_scale:
         x = means[-1] + sigma * random.standard_normal(num_samples)
         samples.append(x)
-        means.append(float(weigh(reward(x), np) @ x))
+        means.append(float(weigh(objective(x), np) @ x))
     return Run(np.array(means), np.array(samples))
+
+
+def trapped(steps: int, num_samples: int, seeds: int) -> list[dict[str, Any]]:
+    """How often MBD and D4orm reach the top of the trap's higher hill, by their steps in all."""
+    rows = []
+    for times in (1, 2, 4, 8):
+        scales = {"MBD": annealed(times * steps, 1e-4, 2e-2), "D4orm": np.tile(annealed(steps, 1e-4, 2e-2), times)}
+        for name, scale in scales.items():
+            final = np.array([optimise(scale, num_samples, seed, trap).means[-1] for seed in range(seeds)])
+            share = f"{(abs(final - START - 4) < 0.1).mean():.0%}"
+            iterations = times if name == "D4orm" else 1
+            rows.append({"method": name, "steps": len(scale), "iterations": iterations, "at the optimum": share})
+    return rows
 
 
 def draw(runs: dict[str, Run], scales: dict[str, np.ndarray], best: float, out: Any) -> None:
@@ -99,4 +122,5 @@ def main() -> None:
             }
         )
     save_table(rows, arguments.out / "one_dimension.csv")
+    save_table(trapped(arguments.steps, arguments.samples, seeds), arguments.out / "one_dimension_trap.csv")
     draw(shown, scales, best, arguments.out)

@@ -169,6 +169,9 @@ def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) ->
         rows["MPPI, large noise"]["movement in the last step"]
     )
     assert (out / "one_dimension.png").read_bytes().startswith(PNG)
+    trap = table(out / "one_dimension_trap.csv")
+    share = {(row["method"], row["steps"]): float(row["at the optimum"].rstrip("%")) for row in trap}
+    assert share["MBD", "50"] == share["D4orm", "50"] < min(share["MBD", "400"], share["D4orm", "400"])
 
 
 @pytest.mark.slow
