@@ -11,8 +11,9 @@ from d4orm_env.core.arrays import FloatArray, Floats, IntArray, Whole
 from d4orm_env.dynamics.robot_model import SPEED
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
-from d4orm_planners.manoeuvres.kinds import SECTOR, SECTORS, Kind
+from d4orm_planners.manoeuvres.kinds import Kind
 from d4orm_planners.manoeuvres.lattice import (
+    Patch,
     PoseLattice,
     RobotBody,
     buffer_size,
@@ -25,6 +26,8 @@ from d4orm_planners.manoeuvres.lattice import (
 from d4orm_planners.manoeuvres.primitives import Primitives, primitives_of
 from d4orm_planners.manoeuvres.snapping import Goal
 
+NEAR = 4
+"""Cells of the usual size from a start or a goal as far as which finer ones are."""
 LATER = 20
 """Steps by which a detour over a pose may be longer than the shortest path for its cost to be worked out."""
 TEAM_CELLS, LEAST_CELLS, MOST_CELLS = 4_000_000, 150_000, 400_000
@@ -38,10 +41,21 @@ class Area(NamedTuple):
     high: Floats
     cell: float
 
-    def lattice(self, cell: float, heading: float, sectors: int, modes: int) -> PoseLattice:
-        """Cells of this size over all of it."""
-        size = np.ceil((self.high - self.low) / cell).astype(int).tolist()
-        return PoseLattice(self.low, 1 / cell, (size[0], size[1]), heading, sectors, modes)
+    def lattice(self, kind: Kind, heading: float, start: Floats, goal: Goal, modes: int) -> PoseLattice:
+        """A robot's cells over all of it, finer ones near to its start and its goal."""
+        reach, cell = (NEAR * self.cell, kind.finest) if kind.finest else (0.0, self.cell)
+        first, last = (
+            _patch(middle - reach, middle + reach, cell, kind.sectors)
+            for middle in (start[:2], np.array([goal.x, goal.y]))
+        )
+        usual = _patch(self.low, self.high, kind.cell, kind.usual.sectors)
+        return PoseLattice(usual, heading, modes, (first, last))
+
+
+def _patch(low: Floats, high: Floats, cell: float, sectors: int) -> Patch:
+    """Cells of this size from one corner to another."""
+    size = np.ceil((high - low) / cell).astype(int).tolist()
+    return Patch(low, 1 / cell, (size[0], size[1]), sectors)
 
 
 class Costs(NamedTuple):
@@ -58,19 +72,19 @@ def costs_of(kind: Kind, area: Area, body: RobotBody, start: Floats, goal: Goal,
     """Steps to a goal for a robot that starts at a pose ``(6,)``, in a team of so many; ``bent`` if its trailers end in
     a bend.
     """
-    layers = SECTORS if kind.model.heading_index is not None else 1
     modes, cells = primitives_of(kind)[2], np.clip(TEAM_CELLS / team_size, LEAST_CELLS, MOST_CELLS)
-    size = np.prod(area.high - area.low) * len(modes) * layers
+    size = np.prod(area.high - area.low) * len(modes) * kind.usual.sectors
     cell = max(area.cell, float(np.sqrt(size / cells)))
-    lattice = area.lattice(cell, 0.0 if np.isnan(goal.heading) else goal.heading, layers, len(modes))
-    back, pace = primitives_of(replace(kind, cell=cell))[1], 1 / (kind.limits[SPEED] * kind.dt)
-    headings = [goal.heading] if not np.isnan(goal.heading) else (np.arange(lattice.sectors) * SECTOR).tolist()
+    wide = replace(kind, cell=cell)
+    lattice = area.lattice(wide, 0.0 if np.isnan(goal.heading) else goal.heading, start, goal, len(modes))
+    back, pace = primitives_of(wide)[1], 1 / (kind.limits[SPEED] * kind.dt)
+    headings = [goal.heading] if not np.isnan(goal.heading) else (np.arange(kind.sectors) * kind.sector).tolist()
     ends = range(len(modes) if bent else 1)
     goals = np.array([[goal.x, goal.y, heading, mode] for mode in ends for heading in headings])
-    count = lattice.modes * lattice.sectors * lattice.size[0] * lattice.size[1]
+    count = lattice.cells
     steps = np.full(count, np.inf, np.float32)
     far = fill_costs(
-        body, back, lattice, goals, start, pace, steps, np.empty((count, 3)), Heap.of(2 * count + 512),
+        body, back, lattice, goals, start, pace, steps, np.empty((count, 4)), Heap.of(2 * count + 512),
         modes.index(kind.start), np.zeros(buffer_size(body.footprints), np.float32),
     )  # fmt: skip
     if far == np.inf:
@@ -152,7 +166,7 @@ def _spread(
     # Nothing that is as wide as the robot fits in between the poses that are looked at.
     stride = max(1, int(2 * body.footprints.inner[body.robot] * pace))
     facing = unit_vector(heading)
-    mode = cell // (lattice.sectors * lattice.size[0] * lattice.size[1])
+    mode = int(poses[cell, 3])
     for number in range(primitives.begin[mode], primitives.begin[mode + 1]):
         first, end = primitives.first[number], primitives.first[number + 1]
         px, py, turned = moved_along(x, y, heading, facing, primitives.poses[end - 1])
@@ -163,6 +177,7 @@ def _spread(
             continue
         costs[other] = cost
         poses[other, 0], poses[other, 1], poses[other, 2] = px, py, turned
+        poses[other, 3] = primitives.mode[number]
         push(heap, cost + pace * np.sqrt((px - start[0]) ** 2 + (py - start[1]) ** 2), other)
 
 
@@ -181,7 +196,7 @@ def fill_costs(
         start: ``(3,)`` pose, towards which costs are spread first.
         pace: Steps that a metre takes at least.
         costs: ``(cells,)`` steps to the goal, filled; infinite to begin with, and beyond what was reached.
-        poses: ``(cells, 3)`` to overwrite.
+        poses: ``(cells, 4)`` and modes, to overwrite.
         heap: To overwrite.
         mode: That the robot starts in.
         buffer: To overwrite, see :func:`buffer_size`.
@@ -195,7 +210,7 @@ def fill_costs(
     for number in range(goals.shape[0]):
         cell = cell_of(lattice, goals[number, 0], goals[number, 1], goals[number, 2], int(goals[number, 3]))
         if cell >= 0 and costs[cell] > 0:
-            costs[cell], poses[cell] = 0, goals[number, :3]
+            costs[cell], poses[cell] = 0, goals[number]
             push(heap, 0.0, cell)
     most, last = np.inf, 0.0
     while 0 < heap.filled[0] < heap.value.shape[0] - 256 and last <= most:

@@ -15,14 +15,12 @@ import numpy as np
 from d4orm_env.core import portable
 from d4orm_env.core.arrays import FloatArray, Floats
 from d4orm_env.dynamics.first_order_cars import MAX_STEERING, WHEELBASE
-from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, SECTOR, Kind, Mode, Move, held
+from d4orm_planners.manoeuvres.kinds import LENGTHS, MAX_STEPS, OPS, Kind, Mode, Move, held
 
 SHARE = 0.95
 """Share of the largest hitch and steering angles that is used."""
 FINER = 0.1
 """Share of the tightest curvature in which it is sought."""
-LENGTHS = (1.5, 6.0)
-"""Lengths of straight moves, in cells."""
 ARCS = (1, 4)
 """Sectors by which arcs turn."""
 LONGEST = 2.5
@@ -173,7 +171,7 @@ def first_order_car_moves(kind: Kind) -> Iterator[Move]:
             continue
         left, right = tuple(hitches.tolist()), tuple((-hitches).tolist())
         for mode, side, sectors in ((mode, side, arc) for (mode, side), arc in product(((left, 1), (right, -1)), ARCS)):
-            count = kind.steps(sectors * SECTOR / curvature, abs(speed))
+            count = kind.steps(sectors * kind.sector / curvature, abs(speed))
             yield mode, mode, held(count, speed, steering(kind, side * curvature))
         changes = [(straight, left), (left, straight), (straight, right), (right, straight)]
         changes += [(left, right), (right, left)]

@@ -16,6 +16,10 @@ SECTORS = 32
 """Number of headings that are told apart."""
 SECTOR = 2 * pi / SECTORS
 """Angle between two of them [rad]."""
+FINER_SECTORS = 4 * SECTORS
+"""The number where cells are finest."""
+LENGTHS = (1.5, 6.0)
+"""Lengths of straight primitives, in cells."""
 MAX_STEPS = 2**14
 """Most steps of a move."""
 
@@ -41,6 +45,7 @@ class Kind:
     cell: float  #: Distance that should be told apart [m]
     start: Mode  #: Mode that the robot starts in
     stops: bool = False  #: Whether it has moves from rest to rest only
+    finest: float = 0.0  #: The same near to its start and its goal, where it has shorter moves besides; zero for none
 
     @property
     def model(self) -> Model:
@@ -50,7 +55,30 @@ class Kind:
     @property
     def base(self) -> Kind:
         """The same, whatever the cells and the start are."""
-        return replace(self, cell=0.0, start=())
+        return replace(self, cell=0.0, start=(), finest=0.0)
+
+    @property
+    def usual(self) -> Kind:
+        """The same with usual cells everywhere."""
+        return replace(self, finest=0.0)
+
+    @property
+    def careful(self) -> Kind:
+        """The same with moves as short as the finer cells need, and slower where a step at full speed leads farther."""
+        limits = list(self.limits)
+        if self.model.first_order:
+            limits[SPEED] = min(limits[SPEED], LENGTHS[0] * self.finest / self.dt)
+        return replace(self, limits=tuple(limits), cell=self.finest)
+
+    @property
+    def sectors(self) -> int:
+        """Headings that are told apart where cells are finest; one for a robot without a heading."""
+        return (FINER_SECTORS if self.finest else SECTORS) if self.model.heading_index is not None else 1
+
+    @property
+    def sector(self) -> float:
+        """Angle between two of them [rad]."""
+        return 2 * pi / FINER_SECTORS if self.finest else SECTOR
 
     @property
     def lower(self) -> list[float]:

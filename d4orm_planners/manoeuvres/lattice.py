@@ -13,7 +13,6 @@ from d4orm_env.engine.compiling import ZERO, compiled
 from d4orm_env.engine.elementary import cosine, sine
 from d4orm_env.engine.footprint_contacts import POSE, touches_static
 from d4orm_env.engine.simd import TILE
-from d4orm_planners.manoeuvres.kinds import SECTOR, SECTORS
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
 
 TURN = 2 * np.pi
@@ -42,15 +41,32 @@ Placed: TypeAlias = tuple[np.float32, np.float32, np.float32, np.float32]
 """A body's heading as a unit vector, and its position."""
 
 
-class PoseLattice(NamedTuple):
-    """Cells of positions and sectors of headings: poses in the same are taken for one."""
+class Patch(NamedTuple):
+    """Cells of positions and sectors of headings."""
 
     low: Floats  #: ``(2,)`` lowest corner [m]
     scale: float  #: One over the size of a cell [1/m]
     size: tuple[int, int]  #: ``(2,)`` cells along x and y
-    heading: float  #: Middle of the first sector [rad]
     sectors: int  #: Number of sectors; one for a robot without a heading
+
+    @property
+    def cells(self) -> int:
+        """Number of cells in a mode."""
+        return self.sectors * self.size[0] * self.size[1]
+
+
+class PoseLattice(NamedTuple):
+    """Cells of positions and sectors of headings: poses in the same are taken for one."""
+
+    usual: Patch  #: All over the area
+    heading: float  #: Middle of the first sector [rad]
     modes: int  #: Number of modes
+    near: tuple[Patch, Patch]  #: Finer ones in its place near to the robot's start and to its goal
+
+    @property
+    def cells(self) -> int:
+        """Number of cells in all modes."""
+        return self.modes * (self.usual.cells + sum(patch.cells for patch in self.near))
 
 
 @compiled
@@ -172,13 +188,28 @@ def pose_between(before: Floats, after: Floats, back: float) -> Pose:
 
 
 @compiled
-def cell_of(lattice: PoseLattice, x: float, y: float, heading: float, mode: Whole) -> int:
-    """Number of the cell of a pose in a mode, -1 outside."""
-    i = int(np.floor((x - lattice.low[0]) * lattice.scale))
-    j = int(np.floor((y - lattice.low[1]) * lattice.scale))
-    if i < 0 or j < 0 or i >= lattice.size[0] or j >= lattice.size[1]:
+def _cell_in(patch: Patch, heading: float, x: float, y: float) -> int:
+    """Number of a pose's cell in a patch, its heading from the middle of the first sector on; -1 outside."""
+    i = int(np.floor((x - patch.low[0]) * patch.scale))
+    j = int(np.floor((y - patch.low[1]) * patch.scale))
+    if i < 0 or j < 0 or i >= patch.size[0] or j >= patch.size[1]:
         return -1
     sector = 0
-    if lattice.sectors > 1:
-        sector = int(np.rint((heading - lattice.heading) / SECTOR)) % SECTORS
-    return ((int(mode) * lattice.sectors + sector) * lattice.size[0] + i) * lattice.size[1] + j
+    if patch.sectors > 1:
+        sector = int(np.rint(heading / (TURN / patch.sectors))) % patch.sectors
+    return (sector * patch.size[0] + i) * patch.size[1] + j
+
+
+@compiled
+def cell_of(lattice: PoseLattice, x: float, y: float, heading: float, mode: Whole) -> int:
+    """Number of the cell of a pose in a mode, -1 outside."""
+    before, turn = 0, heading - lattice.heading
+    for patch in lattice.near:
+        cell = _cell_in(patch, turn, x, y)
+        size = patch.sectors * patch.size[0] * patch.size[1]
+        if cell >= 0:
+            return before + int(mode) * size + cell
+        before += lattice.modes * size
+    cell = _cell_in(lattice.usual, turn, x, y)
+    size = lattice.usual.sectors * lattice.usual.size[0] * lattice.usual.size[1]
+    return before + int(mode) * size + cell if cell >= 0 else -1

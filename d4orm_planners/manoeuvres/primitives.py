@@ -21,15 +21,13 @@ from d4orm_env.core.goal_poses import MOST_TRAILERS
 from d4orm_env.dynamics.robot_model import ACCELERATION, OWN_LIMITS, SPEED, TURN_RATE
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION
 from d4orm_planners.manoeuvres.first_order_car_moves import first_order_car_moves
-from d4orm_planners.manoeuvres.kinds import MAX_STEPS, OPS, SECTOR, Kind, Mode, Move, held
+from d4orm_planners.manoeuvres.kinds import LENGTHS, MAX_STEPS, OPS, Kind, Mode, Move, held
 
 POSE_SIZE = 3 + MOST_TRAILERS
 """Numbers of a pose: position, heading and hitch angles, zero for those that there are not."""
 TURNS = (1, 2)
 """Sectors by which an arc turns, to either side."""
 TURNS_ON_THE_SPOT = (1, 4)
-LENGTHS = (1.5, 6.0)
-"""Lengths of straight primitives, in cells."""
 DIRECTIONS = 8
 """Directions of a robot without a heading."""
 
@@ -55,7 +53,8 @@ class Primitives(NamedTuple):
 def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]:
     """The primitives of a robot, the same backwards in time, and their modes; the first one is that of rest."""
     # Longer ones, of a robot that is next to unable to reverse or to turn, have no room in a search.
-    moves = [move for move in MOVES[kind.name](kind) if len(move[2]) <= MAX_STEPS]
+    kinds = (kind.usual, kind.careful) if kind.finest else (kind,)
+    moves = [move for own in kinds for move in MOVES[kind.name](own) if len(move[2]) <= MAX_STEPS]
     speeds = len(kind.model.speed_indices)
     if kind.stops:
         moves = [move for move in moves if not any((*move[0][:speeds], *move[1][:speeds]))]
@@ -129,8 +128,8 @@ def _most(kind: Kind, side: int) -> float:
 def _turns(kind: Kind) -> Iterator[tuple[int, float]]:
     """Steps of turns on the spot, and their turn rates."""
     for sectors, side in product(TURNS_ON_THE_SPOT, (1, -1)):
-        count = kind.steps(sectors * SECTOR, _most(kind, side))
-        yield count, side * sectors * SECTOR / (count * kind.dt)
+        count = kind.steps(sectors * kind.sector, _most(kind, side))
+        yield count, side * sectors * kind.sector / (count * kind.dt)
 
 
 def _drives(kind: Kind, speed: float) -> Iterator[tuple[int, float]]:
@@ -138,8 +137,8 @@ def _drives(kind: Kind, speed: float) -> Iterator[tuple[int, float]]:
     for length in LENGTHS:
         yield kind.steps(length * kind.cell, speed), 0.0
     for sectors, side in product(TURNS, (1, -1)):
-        count = max(kind.steps(sectors * SECTOR, _most(kind, side)), kind.steps(LENGTHS[0] * kind.cell, speed))
-        yield count, side * sectors * SECTOR / (count * kind.dt)
+        count = max(kind.steps(sectors * kind.sector, _most(kind, side)), kind.steps(LENGTHS[0] * kind.cell, speed))
+        yield count, side * sectors * kind.sector / (count * kind.dt)
 
 
 def _unicycle(kind: Kind) -> Iterator[Move]:
@@ -155,7 +154,7 @@ def _differential_drive(kind: Kind) -> Iterator[Move]:
     most = kind.limits[TURN_RATE]
     for count, rate in _turns(kind):
         yield (0.0,), (0.0,), held(count, rate, 0.0)
-    turns = [0.0, *(side * sectors * SECTOR for sectors, side in product(TURNS, (1, -1)))]
+    turns = [0.0, *(side * sectors * kind.sector for sectors, side in product(TURNS, (1, -1)))]
     for way, turn in product((1, -1), turns):
         speed = kind.pace(way)
         count = max(kind.speeding_up(speed), kind.steps(abs(turn), most))
@@ -196,7 +195,7 @@ def _paced(kind: Kind, way: int, speed: float, turn: float) -> Iterator[Move]:
 def _unicycle2(kind: Kind) -> Iterator[Move]:
     rest = (0.0, 0.0)
     for sectors, side in product(TURNS_ON_THE_SPOT, (1, -1)):
-        count, swing = _swing(kind, side, sectors * SECTOR, 1)
+        count, swing = _swing(kind, side, sectors * kind.sector, 1)
         yield rest, rest, np.concatenate([held(count, 0.0, swing), held(count, 0.0, -swing)])
     for way in (1, -1):
         speed = kind.pace(way)
@@ -204,7 +203,7 @@ def _unicycle2(kind: Kind) -> Iterator[Move]:
         going = (way * speed, 0.0)
         for sectors, side in product(TURNS, (1, -1)):
             least = kind.steps(LENGTHS[0] * kind.cell / 2, speed)
-            count, swing = _swing(kind, side, sectors * SECTOR, least)
+            count, swing = _swing(kind, side, sectors * kind.sector, least)
             yield going, going, np.concatenate([held(count, 0.0, swing), held(count, 0.0, -swing)])
 
 

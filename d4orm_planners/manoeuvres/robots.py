@@ -16,7 +16,7 @@ from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, TURN_RATE, Model
 from d4orm_env.dynamics.unicycle2 import MAX_TURN_ACCELERATION, UNICYCLE2
 from d4orm_planners.manoeuvres.costs import Area, Costs, costs_of
 from d4orm_planners.manoeuvres.curves import NO_CURVES, curves_of
-from d4orm_planners.manoeuvres.kinds import SECTORS, Kind
+from d4orm_planners.manoeuvres.kinds import Kind
 from d4orm_planners.manoeuvres.lattice import RobotBody
 from d4orm_planners.manoeuvres.nodes import Task
 from d4orm_planners.manoeuvres.primitives import MOVES, POSE_SIZE, primitives_of
@@ -52,15 +52,17 @@ class ManoeuvreScene(NamedTuple):
     extra: float  #: Distance kept from everything [m]
     bent: BoolArray  #: ``(K,)`` whether trailers have to be in a bend at the robot's goal
     stops: bool = False  #: Whether robots stop after every move
+    finest: float = 0.0  #: Size of cells near to starts and goals, zero for the usual one [m]
 
     @property
     def interaction_range(self) -> float:
         """Distance beyond which two robots do not matter to each other in a step [m]."""
         return 2 * float(self.problem.team.radius.max()) + self.extra + 2 * self.problem.stride
 
-    def with_cells(self, share: float, stops: bool = False) -> ManoeuvreScene:
-        """The same with smaller cells, or with robots that stop after every move."""
-        return self._replace(area=self.area._replace(cell=share * self.area.cell), stops=stops)
+    def with_cells(self, share: float, stops: bool = False, near: float = 0.0) -> ManoeuvreScene:
+        """The same with cells of other sizes, shares of this one's, or with robots that stop after every move."""
+        cell = self.area.cell
+        return self._replace(area=self.area._replace(cell=share * cell), stops=stops, finest=near * cell)
 
     def body(self, robot: int) -> RobotBody:
         """A robot among the obstacles."""
@@ -178,15 +180,16 @@ def make_robot(scene: ManoeuvreScene, number: int) -> Robot | None:
     model = problem.team.robot_models[number]
     state = problem.start[number, : model.state_size].astype(np.float64).tolist()
     limits = problem.team.limits[number, : len(model.limit_names)].astype(np.float64).tolist()
-    kind = Kind(model.name, tuple(limits), problem.dt, area.cell, tuple(state[_extra(model) :]), scene.stops)
+    kind = Kind(
+        model.name, tuple(limits), problem.dt, area.cell, tuple(state[_extra(model) :]), scene.stops, scene.finest
+    )  # fmt: skip
     primitives, _, modes = primitives_of(kind)
     if kind.start not in modes:
         return None
     start, goal, last = np.zeros(POSE_SIZE), _goal(problem, number), _limits(kind)
     start[: _extra(model)] = state[: _extra(model)]
     start[3 : 3 + len(model.trailers)] = state[3 : 3 + len(model.trailers)]
-    sectors = 1 if model.heading_index is None else SECTORS
-    lattice = area.lattice(area.cell, float(start[2]), sectors, len(modes))
+    lattice = area.lattice(kind, float(start[2]), start, goal, len(modes))
     wanted = tuple(np.nan_to_num(problem.goal_hitches[number, : len(model.trailers)].astype(np.float64)).tolist())
     hitches = wanted if any(wanted) else None
     bent = bool(scene.bent[number]) or hitches is not None

@@ -34,17 +34,20 @@ FIRST_NODES = 400_000
 """... and among others at first a robot's share of so many, once more after every four searches of each: in a large
 team it is quicker to change others' motions."""
 CELLS = (
-    (1.0, MAX_NODES, False),
-    (0.8, MAX_NODES, False),
-    (0.6, MAX_NODES, False),
-    (1.0, MAX_NODES, True),
-    (0.8, MAX_NODES, True),
-    (0.6, MAX_NODES, True),
-    (0.25, 10 * MAX_NODES, False),
+    (1.0, MAX_NODES, False, 0.0),
+    (0.8, MAX_NODES, False, 0.0),
+    (0.6, MAX_NODES, False, 0.0),
+    (1.0, MAX_NODES, True, 0.0),
+    (0.8, MAX_NODES, True, 0.0),
+    (0.6, MAX_NODES, True, 0.0),
+    (0.25, 10 * MAX_NODES, False, 0.0),
+    (1.0, MAX_NODES, True, 0.125),
+    (1.0, MAX_NODES, True, 0.1),
+    (1.0, MAX_NODES, True, 0.08),
 )
-"""Sizes of cells that are tried in turn for a robot alone, as shares of the usual one, nodes, and whether it stops
-after every move, which leaves more of them to a car that parks: whether poses that count as one leave a way through a
-tight place is chance."""
+"""Sizes of cells that are tried in turn for a robot alone, as shares of the usual one; nodes; whether it stops after
+every move, which leaves more of them to a car that parks; and the sizes near to its start and its goal, if they are
+others. Whether poses that count as one leave a way through a tight place is chance."""
 ROUNDS = 200
 """Neighbourhoods that are replanned to find a motion for everybody, after a quarter of them with late departures."""
 BETTER_ROUNDS = 16
@@ -85,11 +88,12 @@ class TeamMotions:
             nonlocal room
             nodes, searches = self._room_for_nodes(MAX_NODES), count(1)
             for robot in range(part[0], part[1]):
-                for share, most, stops in CELLS:
-                    if stops and self.robots[robot].model.first_order:
+                for share, most, stops, near in CELLS:
+                    if stops and not near and self.robots[robot].model.first_order:
                         continue
                     if share < 1.0 or stops:
-                        self.robots[robot] = make_robot(scene.with_cells(share, stops), robot) or self.robots[robot]
+                        other = scene.with_cells(share, stops, near)
+                        self.robots[robot] = make_robot(other, robot) or self.robots[robot]
                     if most > len(nodes.mode):
                         nodes, room = self._room_for_nodes(most), most
                     self.alone[robot] = self._search(robot, nobody, nodes, next(searches), most)

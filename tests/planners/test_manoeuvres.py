@@ -252,6 +252,18 @@ def test_a_robot_that_reverses_slowly_backs_out_of_a_dead_end(model: str) -> Non
     assert plan.trajectory.states[..., 3].min() == pytest.approx(-0.2)
 
 
+@pytest.mark.parametrize("model", ["car_first_order", slow("car")])
+@pytest.mark.parametrize("out", [False, True])
+def test_a_car_gets_into_and_out_of_a_gap_where_only_short_moves_have_room(model: str, out: bool) -> None:
+    """Costs spread from the goal in usual cells end in the gap, which is 1.4 times as long as the car."""
+    world = World(boxes=[[1, -0.45, 2.08, 0], [2.92, -0.45, 4, 0]], lower=(1, -0.45), upper=(4, 1))
+    poses = [[1.4, 0.55, 0.0], [2.5, -0.225, 0.0]]
+    start, goal = poses[::-1] if out else poses
+    state = [start + [0.0] * (MODELS[model].state_size - 3)]
+    team = Team((model,), footprint=Box(0.6, 0.3))
+    solved(Problem(team, state, [goal[:2]], world, goal_heading=0.0, margin=0.02, horizon=600, arrival="stay"))
+
+
 def test_discs_without_headings_are_planned_otherwise() -> None:
     """Others have the same plans as ever, and nothing new to compile."""
     team = Team(("unicycle", "unicycle"))
