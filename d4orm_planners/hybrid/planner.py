@@ -18,7 +18,8 @@ from d4orm_planners.d4orm_d.planner import State as DecouplingState
 from d4orm_planners.d4orm_d.repairs import DeformedPlan, Repairs
 from d4orm_planners.hybrid.rerouting import reroute
 from d4orm_planners.manoeuvres.robots import can_plan
-from d4orm_planners.manoeuvres.team import TeamMotions, find_manoeuvres, improve_manoeuvres
+from d4orm_planners.manoeuvres.rounds import find_manoeuvres, improve_manoeuvres
+from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.mapf.beam_search import prepare_beams
 from d4orm_planners.mapf.lns import FIRST_ROUNDS, GUIDED_ROUNDS, improve_by_lns, improve_first_paths
 from d4orm_planners.mapf.planner import (

@@ -71,7 +71,7 @@ def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]
         if _is_shortest(moves, before, after, controls)
     ]
     rests = np.array([not any(mode[:speeds]) for mode in modes])
-    return _table(ahead, rests), _table(back, rests), modes
+    return table(ahead, rests), table(back, rests), modes
 
 
 def _is_shortest(moves: list[Move], before: Mode, after: Mode, controls: FloatArray) -> bool:
@@ -105,7 +105,8 @@ def _backwards(poses: Floats) -> Floats:
     return np.column_stack([x, y, gap[:, 2], poses[-2::-1, 3:]])
 
 
-def _table(rows: list[tuple[int, int, Floats, Floats, FloatArray]], rests: BoolArray) -> Primitives:
+def table(rows: list[tuple[int, int, Floats, Floats, FloatArray]], rests: BoolArray) -> Primitives:
+    """Primitives by their modes before and after, poses, speeds and controls, and the modes in which a robot stands."""
     rows = sorted(rows, key=lambda row: row[0])
     before = np.array([row[0] for row in rows])
     return Primitives(

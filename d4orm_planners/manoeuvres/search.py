@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import FloatArray, Floats, IntArray
 from d4orm_env.engine.caching import cached_kernel
 from d4orm_env.engine.compiling import OPTIONS, compiled
 from d4orm_planners.manoeuvres.costs import pop
@@ -241,6 +241,7 @@ class Motion:
 
     poses: FloatArray  #: ``(T + 1, 6)`` float32
     controls: FloatArray  #: ``(T, m)``
+    stops: IntArray  #: Steps at which the robot may stand for longer, the first and the last one among them
 
     @property
     def steps(self) -> int:
@@ -250,7 +251,13 @@ class Motion:
     def later(self, steps: int) -> Motion:
         """The same motion of a robot that stays at its start, at rest, for so many steps before."""
         poses = np.concatenate([np.repeat(self.poses[:1], steps, axis=0), self.poses])
-        return Motion(poses, np.pad(self.controls, ((steps, 0), (0, 0))))
+        return Motion(poses, np.pad(self.controls, ((steps, 0), (0, 0))), np.union1d([0], self.stops + steps))
+
+    def followed_by(self, other: Motion, wait: int) -> Motion:
+        """This motion, so many steps at its end at rest, and another one from there."""
+        poses = np.concatenate([self.poses, np.repeat(self.poses[-1:], wait, axis=0), other.poses[1:]])
+        controls = np.concatenate([np.pad(self.controls, ((0, wait), (0, 0))), other.controls])
+        return Motion(poses, controls, np.concatenate([self.stops, other.stops + self.steps + wait]))
 
 
 def motion_to(robot: Robot, task: Task, nodes: Nodes, node: int) -> Motion:
@@ -266,7 +273,9 @@ def motion_to(robot: Robot, task: Task, nodes: Nodes, node: int) -> Motion:
         controls[since:until] = _controls(robot, int(nodes.move[last]), pose)[: until - since]
     poses = np.empty((steps + 1, POSE_SIZE), np.float32)
     trace(task, nodes, node, poses)
-    return Motion(poses, controls)
+    ends = np.array(chain[::-1])
+    stands = (nodes.mode[ends] < 0) | task.primitives.rests[nodes.mode[ends]]
+    return Motion(poses, controls, nodes.time[ends[stands]])
 
 
 def _controls(robot: Robot, move: int, pose: list[float]) -> FloatArray:

@@ -11,21 +11,16 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
-from d4orm_env.core.seeds import Stream
-from d4orm_env.core.team import Team
-from d4orm_env.core.world import World
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_env.footprints import Box
-from d4orm_planners.base.planner import Iteration
-from d4orm_planners.base.solve import SolveRun
-from d4orm_planners.manoeuvres.curves import NO_CURVES
+from d4orm_planners.manoeuvres.detours import anywhere, starting_from, wandering
 from d4orm_planners.manoeuvres.lattice import buffer_size
-from d4orm_planners.manoeuvres.nodes import AHEAD, Nodes
+from d4orm_planners.manoeuvres.nodes import Nodes
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
+from d4orm_planners.manoeuvres.rails import on_rails
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
-from d4orm_planners.manoeuvres.search import PAUSED, Motion, curve_from, find_motion, motion_to
+from d4orm_planners.manoeuvres.search import PAUSED, Motion, find_motion, motion_to
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
-from d4orm_planners.mapf.lns import Odds, search_neighbourhoods
+from d4orm_planners.mapf.lns import Odds
 from d4orm_planners.tracking.steering import advanced
 
 MAX_NODES = 100_000
@@ -33,6 +28,8 @@ MAX_NODES = 100_000
 FIRST_NODES = 400_000
 """... and among others at first a robot's share of so many, once more after every four searches of each: in a large
 team it is quicker to change others' motions."""
+WANDERING_NODES = MAX_NODES // 5
+"""Nodes of which one is drawn for a robot to go to first."""
 CELLS = (
     (1.0, MAX_NODES, False, 0.0),
     (0.8, MAX_NODES, False, 0.0),
@@ -48,10 +45,6 @@ CELLS = (
 """Sizes of cells that are tried in turn for a robot alone, as shares of the usual one; nodes; whether it stops after
 every move, which leaves more of them to a car that parks; and the sizes near to its start and its goal, if they are
 others. Whether poses that count as one leave a way through a tight place is chance."""
-ROUNDS = 200
-"""Neighbourhoods that are replanned to find a motion for everybody, after a quarter of them with late departures."""
-BETTER_ROUNDS = 16
-"""Neighbourhoods that are replanned in an iteration once everybody has one."""
 
 
 class TeamMotions:
@@ -67,6 +60,7 @@ class TeamMotions:
         motions: Of each robot, ``None`` for those that have none yet.
         alone: Their motions if there were nobody else.
         late: Whether the first robot of a neighbourhood may set out late, so that others get out of its way.
+        detours: Whether it goes somewhere else first, and lets them by.
     """
 
     groups = 1
@@ -79,7 +73,7 @@ class TeamMotions:
         self._poses[:] = np.array([robot.start for robot in self.robots])[:, None]
         self.motions: list[Motion | None] = [None] * size
         self.alone: list[Motion | None] = [None] * size
-        self.late = False
+        self.late = self.detours = False
         still = np.zeros((size, problem.control_size), np.float32)
         self._rests = (advanced(problem, problem.start, still) == problem.start).all(axis=1)
         nobody, room = self._traffic((), {}), MAX_NODES
@@ -176,6 +170,8 @@ class TeamMotions:
             delay = int(longest * random.random()) if self.late and self._rests[order[0]] else 0
             for robot in order:
                 self._take(robot, None)
+            if self.detours and (detour := self._detour(order[0], random)) is not None:
+                self._take(order.pop(0), detour)
             self._plan_in_turn(order, held, delay)
             if self.cost > cost:
                 for robot, motion in enumerate(before):
@@ -189,6 +185,24 @@ class TeamMotions:
             later = {other: held.get(other, 0) for other in order[position + 1 :]}
             self._take(robot, self._find(robot, self._traffic(others, later), 0 if position else delay))
 
+    def _detour(self, number: int, random: np.random.Generator) -> Motion | None:
+        """A robot's motion by way of somewhere else, drawn at random, where it stands for a while; if one is found."""
+        robot, nodes, others = self.robots[number], self._nodes, [*range(number), *range(number + 1, len(self.robots))]
+        self._searches += 2
+        first, second = self._searches - 1, self._searches
+        self._search(number, self._traffic(others, {}), nodes, first, WANDERING_NODES, wandering(robot))
+        found, alone = anywhere(robot, nodes, random), self.alone[number]
+        if found is None or alone is None:
+            return None
+        node, there = found
+        wait = int(2 * (there.steps + alone.steps) * random.random())
+        since = there.steps + wait
+        if since >= self.problem.horizon:
+            return None
+        robot = starting_from(robot, nodes, node, since)
+        on = self._search(number, self._traffic(others, {}, since), nodes, second, MAX_NODES, robot)
+        return None if on is None else there.followed_by(on, wait)
+
     def _take(self, robot: int, motion: Motion | None) -> None:
         self.motions[robot] = motion
         self._poses[robot] = self.robots[robot].start
@@ -196,15 +210,17 @@ class TeamMotions:
             self._poses[robot, : motion.steps + 1] = motion.poses
             self._poses[robot, motion.steps :] = motion.poses[-1]
 
-    def _traffic(self, others: Iterable[int], held: dict[int, int]) -> Traffic:
+    def _traffic(self, others: Iterable[int], held: dict[int, int], since: int = 0) -> Traffic:
+        """The motions of others from a step on, and their starts if they are held there for some steps."""
         last, gone = np.full(len(self.robots), -1), np.full(len(self.robots), NEVER)
         for other in others:
             if (motion := self.motions[other]) is not None:
-                last[other] = motion.steps
+                last[other] = max(motion.steps - since, 0)
         for other, steps in held.items():
             if steps > 0:
                 last[other], gone[other] = 0, steps
-        return traffic_of(self._poses, last, gone, self._area.low, self._area.high, self._interaction_range)
+        poses = np.ascontiguousarray(self._poses[:, since:])
+        return traffic_of(poses, last, gone, self._area.low, self._area.high, self._interaction_range)
 
     def _room_for_nodes(self, most: int) -> Nodes:
         return Nodes.of(most, buffer_size(self.problem.team.all_footprint_arrays))
@@ -220,11 +236,19 @@ class TeamMotions:
             return alone
         self._searches += 1
         most = FIRST_NODES // team * (1 + self._searches // (4 * team))
-        return self._search(number, traffic, self._nodes, self._searches, most)
+        motion = self._search(number, traffic, self._nodes, self._searches, most)
+        # Nodes may run out long before a robot that need only wait for others has seen all places to do so.
+        if motion is None and alone is not None and self._nodes.heap.filled[0] > 0:
+            rails = on_rails(self.robots[number], alone)
+            self._searches += 1
+            motion = self._search(number, traffic, self._nodes, self._searches, most, rails)
+        return motion
 
-    def _search(self, number: int, traffic: Traffic, nodes: Nodes, search: int, most: int) -> Motion | None:
-        """Look for a robot's motion in about so many nodes."""
-        robot = self.robots[number]
+    def _search(
+        self, number: int, traffic: Traffic, nodes: Nodes, search: int, most: int, instead: Robot | None = None
+    ) -> Motion | None:
+        """Look for a robot's motion in about so many nodes, or for that of another one instead."""
+        robot = instead or self.robots[number]
         task = robot.task._replace(number=search)
         nodes.filled[0] = 0
         goes_on, node = False, PAUSED
@@ -241,50 +265,3 @@ class TeamMotions:
             if motion is not None:
                 controls[: motion.steps, robot, : motion.controls.shape[1]] = motion.controls
         return controls
-
-
-def compile_manoeuvres() -> None:
-    """Compile the search, if it is not yet: it is the same for all models."""
-    if find_motion.signatures:
-        return
-    world = World(boxes=[[0.5, 0.8, 0.6, 1.2]])
-    team = Team(("unicycle",) * 2, footprint=Box(0.4, 0.2))
-    problem = Problem(team, [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]], [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
-    motions = TeamMotions.prepared(problem, lambda: False)
-    assert motions is not None
-    motions.plan_all()
-    curve_from(NO_CURVES, motions.robots[0].task.goal, 0.0, 0.0, 0.0, AHEAD)
-
-
-def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
-    """Motions of the whole team, or of some robots if time is up; ``None`` if not all have one after :data:`ROUNDS`."""
-    with search.watch.paused():
-        compile_manoeuvres()
-    motions = TeamMotions.prepared(search.problem, search.should_stop)
-    if motions is None:
-        return None
-    motions.plan_all()
-    return motions if _complete(search, motions) or search.should_stop() else None
-
-
-def _complete(search: SolveRun, motions: TeamMotions) -> bool:
-    """Replan neighbourhoods of robots without a motion until there are none; return whether that is so."""
-    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
-    for number in range(ROUNDS):
-        if not motions.missing or search.should_stop():
-            break
-        motions.late = number >= ROUNDS // 4
-        search_neighbourhoods(motions, random, 1, search.should_stop)
-    motions.late = False
-    return not motions.missing
-
-
-def improve_manoeuvres(search: SolveRun, motions: TeamMotions) -> Iteration:
-    """The team's controls, after robots whose motions fail have new ones, or else some have looked for faster ones."""
-    motions.leave_out(np.flatnonzero(search.current.unsolved).tolist())
-    if motions.missing:
-        _complete(search, motions)
-        return Iteration(motions.controls())
-    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
-    search_neighbourhoods(motions, random, BETTER_ROUNDS, search.should_stop)
-    return Iteration(motions.controls())

@@ -23,7 +23,8 @@ from d4orm_planners.manoeuvres.kinds import MAX_STEPS, Kind
 from d4orm_planners.manoeuvres.lattice import buffer_size
 from d4orm_planners.manoeuvres.primitives import MOVES, POSE_SIZE, primitives_of
 from d4orm_planners.manoeuvres.robots import can_plan, scene_of
-from d4orm_planners.manoeuvres.team import TeamMotions, improve_manoeuvres
+from d4orm_planners.manoeuvres.rounds import improve_manoeuvres
+from d4orm_planners.manoeuvres.team import TeamMotions
 from d4orm_planners.manoeuvres.traffic import NEVER, safe_since, traffic_of
 
 CORRIDOR = [[0.0, 1.0, 6.0, 1.5], [0.0, -0.5, 2.5, 0.3], [3.8, -0.5, 6.0, 0.3]]

@@ -1,0 +1,71 @@
+"""Rounds in which a team's motions are found and improved, a neighbourhood of robots at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.seeds import Stream
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.footprints import Box
+from d4orm_planners.base.planner import Iteration
+from d4orm_planners.base.solve import SolveRun
+from d4orm_planners.manoeuvres.curves import NO_CURVES
+from d4orm_planners.manoeuvres.nodes import AHEAD
+from d4orm_planners.manoeuvres.search import curve_from, find_motion
+from d4orm_planners.manoeuvres.team import TeamMotions
+from d4orm_planners.mapf.lns import search_neighbourhoods
+
+ROUNDS = 200
+"""Neighbourhoods that are replanned to find a motion for everybody, after a quarter of them with late departures; and
+once more as many with detours, where robots have to let each other by somewhere that is on nobody's way."""
+BETTER_ROUNDS = 16
+"""Neighbourhoods that are replanned in an iteration once everybody has one."""
+
+
+def compile_manoeuvres() -> None:
+    """Compile the search, if it is not yet: it is the same for all models."""
+    if find_motion.signatures:
+        return
+    world = World(boxes=[[0.5, 0.8, 0.6, 1.2]])
+    team = Team(("unicycle",) * 2, footprint=Box(0.4, 0.2))
+    problem = Problem(team, [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]], [[1.0, 0.0], [1.0, 2.0]], world, goal_heading=0.0)
+    motions = TeamMotions.prepared(problem, lambda: False)
+    assert motions is not None
+    motions.plan_all()
+    curve_from(NO_CURVES, motions.robots[0].task.goal, 0.0, 0.0, 0.0, AHEAD)
+
+
+def find_manoeuvres(search: SolveRun) -> TeamMotions | None:
+    """Motions of the whole team, or of some robots if time is up; ``None`` if not all have one in the end."""
+    with search.watch.paused():
+        compile_manoeuvres()
+    motions = TeamMotions.prepared(search.problem, search.should_stop)
+    if motions is None:
+        return None
+    motions.plan_all()
+    return motions if _complete(search, motions) or search.should_stop() else None
+
+
+def _complete(search: SolveRun, motions: TeamMotions) -> bool:
+    """Replan neighbourhoods of robots without a motion until there are none; return whether that is so."""
+    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
+    for number in range(2 * ROUNDS):
+        if not motions.missing or search.should_stop():
+            break
+        motions.late, motions.detours = ROUNDS // 4 <= number < ROUNDS, number >= ROUNDS
+        search_neighbourhoods(motions, random, 1, search.should_stop)
+    motions.late = motions.detours = False
+    return not motions.missing
+
+
+def improve_manoeuvres(search: SolveRun, motions: TeamMotions) -> Iteration:
+    """The team's controls, after robots whose motions fail have new ones, or else some have looked for faster ones."""
+    motions.leave_out(np.flatnonzero(search.current.unsolved).tolist())
+    if motions.missing:
+        _complete(search, motions)
+        return Iteration(motions.controls())
+    random = np.random.default_rng(search.iteration_seed(Stream.NEIGHBOURHOODS))
+    search_neighbourhoods(motions, random, BETTER_ROUNDS, search.should_stop)
+    return Iteration(motions.controls())

@@ -1,0 +1,71 @@
+"""Manoeuvres of teams in tight places: robots that wait on their way for others, or go somewhere to let them by."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from env_support import slow
+
+from d4orm_env.core.problem import Problem
+from d4orm_env.core.team import Team
+from d4orm_env.core.world import World
+from d4orm_env.footprints import Box, Train
+from d4orm_env.verify import verify
+from d4orm_planners import make_planner
+from d4orm_planners.manoeuvres import team as team_motions
+from d4orm_planners.manoeuvres.rails import on_rails
+from d4orm_planners.manoeuvres.team import TeamMotions
+
+
+def test_a_car_waits_for_another_one_to_leave_the_gap_that_it_parks_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes run out before those near to the gap, all with the same cost, have been followed to when it is free."""
+    monkeypatch.setattr(team_motions, "FIRST_NODES", 20_000)
+    world = World(boxes=[[1, -0.45, 2.02, 0], [2.98, -0.45, 4, 0]], lower=(1, -0.45), upper=(4, 1.5))
+    street, gap, ahead = [1.4, 0.6, 0.0], [2.5, -0.225, 0.0], [3.6, 0.6]
+    team, usual = Team(("car_first_order",) * 2, footprint=Box(0.6, 0.3)), {"margin": 0.02, "arrival": "stay"}
+    problem = Problem(team, [street, gap], [gap[:2], ahead], world, goal_heading=0.0, horizon=300, **usual)
+    motions = TeamMotions.prepared(problem, lambda: False)
+    assert motions is not None
+    motions.plan_all()
+    assert motions.missing == 0
+    motion, alone = motions.motions[0], motions.alone[0]
+    assert motion is not None
+    assert alone is not None
+    # It drives as it would alone, and stands in between.
+    assert motion.steps > alone.steps
+    moving = np.abs(motion.controls).sum(axis=1) > 0
+    np.testing.assert_array_equal(motion.controls[moving], alone.controls)
+    assert verify(problem, motions.controls()).ok
+
+
+def test_a_motion_on_rails_ends_where_it_does() -> None:
+    """Its stops are all that is left of it: a car with a trailer swings from one to the next."""
+    team = Team(
+        ("car_with_1_trailer",), footprint=Train(Box(0.5, 0.25), [Box(0.3, 0.25)]), own_limits={"wheelbase": 0.25}
+    )
+    problem = Problem(team, [[1.0, 2.5, 0.0, 0.2]], [[4.0, 3.0]], goal_heading=0.5, horizon=400, arrival="stay")
+    motions = TeamMotions.prepared(problem, lambda: False)
+    assert motions is not None
+    (alone,), (robot,) = motions.alone, motions.robots
+    assert alone is not None
+    rails = on_rails(robot, alone)
+    again = motions._search(0, motions._traffic((), {}), motions._nodes, 1000, 1000, rails)
+    assert again is not None
+    np.testing.assert_allclose(again.poses, alone.poses, atol=1e-5)
+    np.testing.assert_array_equal(again.controls, alone.controls)
+
+
+@pytest.mark.parametrize("model", ["unicycle", slow("differential_drive"), "car_first_order"])
+def test_one_of_two_that_change_places_beside_a_bay_goes_into_it(model: str) -> None:
+    """The bay is on nobody's way: whoever is planned first drives straight to where the other one stands."""
+    boxes = [[0.0, -0.6, 1.95, 0.0], [2.85, -0.6, 3.4, 0.0]]
+    world = World(boxes=boxes, lower=(0.0, -0.6), upper=(3.4, 0.5))
+    ends = np.array([[0.4, 0.25], [1.2, 0.25]])
+    team = Team((model,) * 2, footprint=Box(0.5, 0.25))
+    start = np.zeros((2, team.state_size))
+    start[:, :2] = ends
+    problem = Problem(team, start, ends[::-1], world, margin=0.02, goal_heading=0.0, horizon=600, arrival="stay")
+    plan = make_planner(engine="cpu").solve(problem, seed=0)
+    assert plan.verified
+    assert (plan.iterations, plan.denoising_steps) == (1, 0)
+    assert plan.trajectory.positions[..., 0].max() > 1.95
