@@ -22,8 +22,10 @@ def test_a_car_waits_for_another_one_to_leave_the_gap_that_it_parks_in(monkeypat
     monkeypatch.setattr(team_motions, "FIRST_NODES", 20_000)
     world = World(boxes=[[1, -0.45, 2.02, 0], [2.98, -0.45, 4, 0]], lower=(1, -0.45), upper=(4, 1.5))
     street, gap, ahead = [1.4, 0.6, 0.0], [2.5, -0.225, 0.0], [3.6, 0.6]
-    team, usual = Team(("car_first_order",) * 2, footprint=Box(0.6, 0.3)), {"margin": 0.02, "arrival": "stay"}
-    problem = Problem(team, [street, gap], [gap[:2], ahead], world, goal_heading=0.0, horizon=300, **usual)
+    team = Team(("car_first_order",) * 2, footprint=Box(0.6, 0.3))
+    problem = Problem(
+        team, [street, gap], [gap[:2], ahead], world, goal_heading=0.0, margin=0.02, horizon=300, arrival="stay"
+    )
     motions = TeamMotions.prepared(problem, lambda: False)
     assert motions is not None
     motions.plan_all()
