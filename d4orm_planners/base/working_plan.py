@@ -198,7 +198,7 @@ def drive_further_in(search: SolveRun, candidate: Candidate, evaluate: Callable[
             if step < 0 or search.should_stop():
                 break
             own = _driven(search, part, candidate.controls[:, [robot], : part.control_size], step, share)
-            # A big team takes seconds to evaluate, and most of these robots do not arrive alone either.
+            # A big team takes seconds to evaluate; where rounding decides once more it does so alone too.
             if not evaluate_controls(search.engine, part, own).solved:
                 continue
             controls = candidate.controls.copy()

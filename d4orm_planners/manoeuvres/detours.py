@@ -17,7 +17,7 @@ from d4orm_planners.manoeuvres.snapping import NOWHERE
 from d4orm_planners.manoeuvres.traffic import NEVER
 
 
-def wandering(robot: Robot) -> Robot:
+def without_goal(robot: Robot) -> Robot:
     """The robot without a goal, so that a search spreads in all directions; one that docks stays at its goal."""
     goal, limits = robot.task.goal, robot.task.limits._replace(way=NOWHERE)
     nowhere = goal if goal.docks else goal._replace(speed=-1.0)

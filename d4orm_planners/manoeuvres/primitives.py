@@ -66,7 +66,7 @@ def primitives_of(kind: Kind) -> tuple[Primitives, Primitives, tuple[Mode, ...]]
         for (before, after, controls), (poses, speed) in zip(moves, driven, strict=True)
     ]
     back = [
-        (modes.index(after), modes.index(before), _backwards(poses), speed[-2::-1], controls)
+        (modes.index(after), modes.index(before), seen_from_first(poses[::-1]), speed[-2::-1], controls)
         for (before, after, controls), (poses, speed) in zip(moves, driven, strict=True)
         if _is_shortest(moves, before, after, controls)
     ]
@@ -97,12 +97,12 @@ def drive(kind: Kind, mode: Mode, controls: FloatArray) -> tuple[Floats, Floats]
     return poses, np.array([sqrt(velocity[0] ** 2 + velocity[1] ** 2) for velocity in velocities])
 
 
-def _backwards(poses: Floats) -> Floats:
-    """Poses ``(n, 6)`` after each step but the last, backwards, from that one."""
-    gap = poses[-2::-1, :3] - poses[-1, :3]
-    sine, cosine = portable.sin_cos(-poses[-1:, 2])
+def seen_from_first(poses: Floats) -> Floats:
+    """``(n, 6)`` all but the first of some poses, as seen from that one."""
+    gap = poses[1:, :3] - poses[0, :3]
+    sine, cosine = portable.sin_cos(-poses[:1, 2])
     x, y = cosine * gap[:, 0] - sine * gap[:, 1], sine * gap[:, 0] + cosine * gap[:, 1]
-    return np.column_stack([x, y, gap[:, 2], poses[-2::-1, 3:]])
+    return np.column_stack([x, y, gap[:, 2], poses[1:, 3:]])
 
 
 def table(rows: list[tuple[int, int, Floats, Floats, FloatArray]], rests: BoolArray) -> Primitives:
@@ -142,13 +142,18 @@ def _drives(kind: Kind, speed: float) -> Iterator[tuple[int, float]]:
         yield count, side * sectors * kind.sector / (count * kind.dt)
 
 
+def _drives_both_ways(kind: Kind) -> Iterator[tuple[float, int, float]]:
+    """Speeds, negative in reverse, steps and turn rates of drives at full speed."""
+    for drives in zip(*(_drives(kind, kind.pace(way)) for way in (1, -1)), strict=True):
+        for way, (count, rate) in zip((1, -1), drives, strict=True):
+            yield way * kind.pace(way), count, rate
+
+
 def _unicycle(kind: Kind) -> Iterator[Move]:
     for count, rate in _turns(kind):
         yield (), (), held(count, 0.0, rate)
-    forwards, backwards = (list(_drives(kind, kind.pace(way))) for way in (1, -1))
-    for drives in zip(forwards, backwards, strict=True):
-        for way, (count, rate) in zip((1, -1), drives, strict=True):
-            yield (), (), held(count, way * kind.pace(way), rate)
+    for speed, count, rate in _drives_both_ways(kind):
+        yield (), (), held(count, speed, rate)
 
 
 def _differential_drive(kind: Kind) -> Iterator[Move]:
@@ -167,10 +172,8 @@ def _differential_drive(kind: Kind) -> Iterator[Move]:
             if peak <= speed and 2 * count >= kind.steps(abs(turn), most):
                 rate, push = turn / (2 * count * kind.dt), way * peak / (count * kind.dt)
                 yield (0.0,), (0.0,), np.concatenate([held(count, rate, push), held(count, rate, -push)])
-    forwards, backwards = (list(_drives(kind, kind.pace(way))) for way in (1, -1))
-    for drives in zip(forwards, backwards, strict=True):
-        for way, (count, rate) in zip((1, -1), drives, strict=True):
-            yield (way * kind.pace(way),), (way * kind.pace(way),), held(count, rate, 0.0)
+    for speed, count, rate in _drives_both_ways(kind):
+        yield (speed,), (speed,), held(count, rate, 0.0)
 
 
 def _swing(kind: Kind, side: int, turn: float, least: int) -> tuple[int, float]:

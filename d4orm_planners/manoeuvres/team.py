@@ -12,11 +12,11 @@ import numpy as np
 from d4orm_env.core.arrays import FloatArray, IntArray
 from d4orm_env.core.problem import Problem
 from d4orm_env.engine.threads import Threads, available_cores
-from d4orm_planners.manoeuvres.detours import anywhere, starting_from, wandering
+from d4orm_planners.manoeuvres.detours import anywhere, starting_from, without_goal
+from d4orm_planners.manoeuvres.fixed_path import on_fixed_path
 from d4orm_planners.manoeuvres.lattice import buffer_size
 from d4orm_planners.manoeuvres.nodes import Nodes
 from d4orm_planners.manoeuvres.primitives import POSE_SIZE
-from d4orm_planners.manoeuvres.rails import on_rails
 from d4orm_planners.manoeuvres.robots import ManoeuvreScene, Robot, make_robot, scene_of
 from d4orm_planners.manoeuvres.search import PAUSED, Motion, find_motion, motion_to
 from d4orm_planners.manoeuvres.traffic import NEVER, Traffic, meets_nobody, traffic_of
@@ -28,7 +28,7 @@ MAX_NODES = 100_000
 FIRST_NODES = 400_000
 """... and among others at first a robot's share of so many, once more after every four searches of each: in a large
 team it is quicker to change others' motions."""
-WANDERING_NODES = MAX_NODES // 5
+DETOUR_NODES = MAX_NODES // 5
 """Nodes of which one is drawn for a robot to go to first."""
 CELLS = (
     (1.0, MAX_NODES, False, 0.0),
@@ -190,7 +190,7 @@ class TeamMotions:
         robot, nodes, others = self.robots[number], self._nodes, [*range(number), *range(number + 1, len(self.robots))]
         self._searches += 2
         first, second = self._searches - 1, self._searches
-        self._search(number, self._traffic(others, {}), nodes, first, WANDERING_NODES, wandering(robot))
+        self._search(number, self._traffic(others, {}), nodes, first, DETOUR_NODES, without_goal(robot))
         found, alone = anywhere(robot, nodes, random), self.alone[number]
         if found is None or alone is None:
             return None
@@ -239,9 +239,9 @@ class TeamMotions:
         motion = self._search(number, traffic, self._nodes, self._searches, most)
         # Nodes may run out long before a robot that need only wait for others has seen all places to do so.
         if motion is None and alone is not None and self._nodes.heap.filled[0] > 0:
-            rails = on_rails(self.robots[number], alone)
+            fixed = on_fixed_path(self.robots[number], alone)
             self._searches += 1
-            motion = self._search(number, traffic, self._nodes, self._searches, most, rails)
+            motion = self._search(number, traffic, self._nodes, self._searches, most, fixed)
         return motion
 
     def _search(

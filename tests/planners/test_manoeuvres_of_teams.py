@@ -13,7 +13,7 @@ from d4orm_env.footprints import Box, Train
 from d4orm_env.verify import verify
 from d4orm_planners import make_planner
 from d4orm_planners.manoeuvres import team as team_motions
-from d4orm_planners.manoeuvres.rails import on_rails
+from d4orm_planners.manoeuvres.fixed_path import on_fixed_path
 from d4orm_planners.manoeuvres.team import TeamMotions
 
 
@@ -40,7 +40,7 @@ def test_a_car_waits_for_another_one_to_leave_the_gap_that_it_parks_in(monkeypat
     assert verify(problem, motions.controls()).ok
 
 
-def test_a_motion_on_rails_ends_where_it_does() -> None:
+def test_a_motion_on_its_fixed_path_ends_where_it_does() -> None:
     """Its stops are all that is left of it: a car with a trailer swings from one to the next."""
     team = Team(
         ("car_with_1_trailer",), footprint=Train(Box(0.5, 0.25), [Box(0.3, 0.25)]), own_limits={"wheelbase": 0.25}
@@ -50,8 +50,8 @@ def test_a_motion_on_rails_ends_where_it_does() -> None:
     assert motions is not None
     (alone,), (robot,) = motions.alone, motions.robots
     assert alone is not None
-    rails = on_rails(robot, alone)
-    again = motions._search(0, motions._traffic((), {}), motions._nodes, 1000, 1000, rails)
+    fixed = on_fixed_path(robot, alone)
+    again = motions._search(0, motions._traffic((), {}), motions._nodes, 1000, 1000, fixed)
     assert again is not None
     np.testing.assert_allclose(again.poses, alone.poses, atol=1e-5)
     np.testing.assert_array_equal(again.controls, alone.controls)

@@ -1,4 +1,4 @@
-"""A robot that keeps to a motion as if on rails, and may only choose how long it stands at each stop."""
+"""Coordination on a fixed path: a robot keeps to a motion, and may only choose how long it stands at each stop."""
 
 from __future__ import annotations
 
@@ -7,36 +7,26 @@ from itertools import pairwise
 
 import numpy as np
 
-from d4orm_env.core import portable
-from d4orm_env.core.arrays import Floats
 from d4orm_planners.manoeuvres.costs import Costs
 from d4orm_planners.manoeuvres.lattice import PoseLattice
-from d4orm_planners.manoeuvres.primitives import table
+from d4orm_planners.manoeuvres.primitives import seen_from_first, table
 from d4orm_planners.manoeuvres.robots import Robot
 from d4orm_planners.manoeuvres.search import Motion
 
 
-def on_rails(robot: Robot, motion: Motion) -> Robot:
+def on_fixed_path(robot: Robot, motion: Motion) -> Robot:
     """A robot whose moves are those of a motion of it from stop to stop, one after the other."""
     stops = motion.stops.tolist()
     # Modes count down: in mode 0, and in no other, a car with trailers may be at its goal.
     modes, rows = len(stops), []
     for number, (first, end) in enumerate(pairwise(stops)):
-        poses, controls = _seen_from_first(motion.poses[first : end + 1].astype(float)), motion.controls[first:end]
+        poses, controls = seen_from_first(motion.poses[first : end + 1].astype(float)), motion.controls[first:end]
         # Alone it was not at its goal any sooner than at the end of its motion.
         speed = np.append(np.full(end - first - 1, np.inf), 0.0)
         rows.append((modes - 1 - number, modes - 2 - number, poses, speed, controls))
     primitives, lattice = table(rows, np.ones(modes, bool)), robot.task.lattice._replace(modes=modes)
     task = robot.task._replace(primitives=primitives, lattice=lattice, costs=_unknown(lattice))
     return replace(robot, task=task, mode=modes - 1)
-
-
-def _seen_from_first(poses: Floats) -> Floats:
-    """``(n, 6)`` all but the first of some poses, as seen from that one."""
-    gap = poses[1:, :3] - poses[0, :3]
-    sine, cosine = portable.sin_cos(-poses[:1, 2])
-    x, y = cosine * gap[:, 0] - sine * gap[:, 1], sine * gap[:, 0] + cosine * gap[:, 1]
-    return np.column_stack([x, y, gap[:, 2], poses[1:, 3:]])
 
 
 def _unknown(lattice: PoseLattice) -> Costs:
