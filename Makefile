@@ -74,8 +74,8 @@ bench: $(CORE_STAMP) ## Measure the engines on this machine, write bench/
 bench-compare: $(CORE_STAMP) ## Print what got slower since a commit: make bench-compare BASE=main BENCH_ARGS='--quick'
 	$(BIN)/python tests/release/bench_compare.py $(BASE) $(BENCH_ARGS)
 
-reproduce: $(DEV_STAMP) ## Make the tables of docs/tables from examples/studies/data; make reproduce FIGURE=robustness SEEDS=3 runs one anew
-	$(if $(SEEDS),$(if $(FIGURE),,$(error SEEDS is of one figure; give FIGURE, as FIGURE=robustness)))
+reproduce: $(DEV_STAMP) ## Make the tables of docs/tables from examples/studies/data; make reproduce FIGURE=noise SEEDS=3 runs one anew
+	$(if $(SEEDS),$(if $(FIGURE),,$(error SEEDS is of one figure; give FIGURE, as FIGURE=noise)))
 	$(BIN)/python -m examples.studies $(if $(FIGURE),paper $(FIGURE) $(if $(SEEDS),--seeds $(SEEDS)),all --out docs/tables)
 
 format: $(DEV_STAMP) ## Format the code and mend what ruff can

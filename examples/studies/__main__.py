@@ -29,7 +29,7 @@ BESIDE = {"ablation": "disturbance_study", "cl_mapf": "dynobench"}
 OWN = {path.stem for path in FOLDER.glob("[a-z]*.py")} - {"settings_studies"}
 NAMES = tuple(sorted({*COMPARISONS, "paper", *OWN, *BESIDE}))
 FIGURES = (
-    "amswarm", "big-teams", "coarseness", "ipopt", "nodes", "noise-schedule", "robustness", "selections", "team-size",
+    "amswarm", "big-teams", "coarseness", "ipopt", "nodes", "noise", "noise-schedule", "selections", "team-size",
 )  # fmt: skip
 FURTHER = {
     "algorithm_4": ("coarseness",), "ipopt_preset": ("ipopt",), "big-teams_seconds": ("big-teams",),

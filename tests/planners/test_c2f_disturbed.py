@@ -718,6 +718,7 @@ def test_the_paper_preset_is_algorithm_4() -> None:
     assert executed.metrics["success"], executed.metrics
     config = policy.config
     assert (config.num_samples, config.coarse_samples, config.credit, config.penalty) == (1024, 1024, "team", 1.0)
+    assert (config.max_lag, config.mean_of_all) == (None, True), "the team is where all of its robots are on average"
     planner = policy._tracker._planning.planner.config
     assert (planner.decoupling, planner.start, planner.credit, planner.weight_cutoff) == ("groups", "team", "team", 0.0)
     assert not any(loop.replanned for loop in policy.loops)

@@ -128,6 +128,13 @@ def test_what_a_figure_names_exists(name: str) -> None:
                 assert len(study.configurations()) == len(section.policies)
 
 
+@pytest.mark.parametrize("figure", FIGURES.values(), ids=FIGURES)
+def test_rows_without_ours_are_of_the_papers_methods(figure: Figure) -> None:
+    for section in figure.sections:
+        for label, settings in section.policies.items():
+            assert (settings.get("preset") in ("paper", "authors")) != ("ours" in label), label
+
+
 def test_trials_of_a_file_are_not_run_again(paper, tmp_path: Path) -> None:
     part = ("coarseness", "--quick", "--policy", "f=1, o=1")
     assert paper(*part, "--out", "first")[0] == 0
@@ -140,29 +147,29 @@ def test_trials_of_a_file_are_not_run_again(paper, tmp_path: Path) -> None:
 
 
 def test_a_figure_is_made_of_trials_of_other_times(paper, tmp_path: Path) -> None:
-    part = ("robustness", "--section", "2D Holonomic", "--policy", "hybrid")
+    part = ("noise", "--section", "2D Holonomic", "--policy", "hybrid, ours")
     status, out, err = paper(*part, "--seeds", "2", "--workers", "2")
     assert status == 0, err
-    folder = tmp_path / "examples" / "output" / "robustness"
-    kept = folder / "robustness.parquet"
-    assert str(Path("examples", "output", "robustness", "robustness.parquet")) in out
-    first = {name: (folder / f"robustness.{name}").read_text(encoding="utf-8") for name in ("csv", "md")}
+    folder = tmp_path / "examples" / "output" / "noise"
+    kept = folder / "noise.parquet"
+    assert str(Path("examples", "output", "noise", "noise.parquet")) in out
+    first = {name: (folder / f"noise.{name}").read_text(encoding="utf-8") for name in ("csv", "md")}
     earlier = read_parquet(kept)
     # Settings that the defaults do not have any more.
     write_parquet(kept, [replace(trial, config='{"num_samples": 3}') for trial in earlier])
-    status, out, err = paper("robustness", "--trials", str(kept), "--out", "again")
+    status, out, err = paper("noise", "--trials", str(kept), "--out", "again")
     assert status == 0, err
-    again = tmp_path / "again" / "robustness"
-    assert {path.name for path in again.iterdir()} == {f"robustness.{kind}" for kind in ("csv", "md", "png")}
+    again = tmp_path / "again" / "noise"
+    assert {path.name for path in again.iterdir()} == {f"noise.{kind}" for kind in ("csv", "md", "png")}
     for name, text in first.items():
-        assert (again / f"robustness.{name}").read_text(encoding="utf-8") == text
+        assert (again / f"noise.{name}").read_text(encoding="utf-8") == text
     few = [trial for trial in earlier if trial.control_noise_std == 0 and trial.seed == 1]
-    (group,) = grouped(FIGURES["robustness"], few)
-    assert (group.section, group.label, list(group.trials)) == ("2D Holonomic", "hybrid", few)
+    (group,) = grouped(FIGURES["noise"], few)
+    assert (group.section, group.label, list(group.trials)) == ("2D Holonomic", "hybrid, ours", few)
     for arguments, complaint in (
         (("ipopt", "--trials", str(kept)), "none of the 14 trials is one of the figure 'ipopt'"),
-        (("robustness", "--trials", str(folder / "robustness.md")), "is no Parquet file of trials"),
-        (("robustness", "--trials", "nowhere.parquet"), "nowhere.parquet"),
+        (("noise", "--trials", str(folder / "noise.md")), "is no Parquet file of trials"),
+        (("noise", "--trials", "nowhere.parquet"), "nowhere.parquet"),
     ):
         status, out, err = paper(*arguments)
         assert (status, out) == (2, "")
@@ -459,7 +466,7 @@ def test_without_a_name_the_figures_are_listed(paper, tmp_path: Path) -> None:
     [
         (("fig4",), "invalid choice: 'fig4'"),
         (("big-teams", "--section", "Nowhere"), "no section 'Nowhere'; choose of Differential Drive; 2D Holonomic"),
-        (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; ipopt, ours; d4orm; d4orm, defaults"),
+        (("ipopt", "--policy", "cobyla"), "no policy 'cobyla'; choose of ipopt; ipopt, ours; d4orm; d4orm, ours"),
         (("amswarm", "--quick", "--seeds", "0"), "seeds"),
         (("amswarm", "--quick", "--workers", "0"), "workers"),
     ],
@@ -479,13 +486,13 @@ def test_a_planner_that_is_not_there_is_named_before_anything_runs(tmp_path: Pat
 
 
 def test_a_part_of_a_figure() -> None:
-    part = FIGURES["big-teams"].only(["2D Holo Random"], ["hybrid", "d4orm-c2f"])
+    part = FIGURES["big-teams"].only(["2D Holo Random"], ["hybrid, ours", "d4orm-c2f"])
     assert [(section.num_robots, list(section.policies)) for section in part.sections] == [
-        ((16, 32, 64), ["hybrid", "d4orm-c2f"]),
+        ((16, 32, 64), ["hybrid, ours", "d4orm-c2f"]),
     ]
     assert FIGURES["big-teams"].only() == FIGURES["big-teams"]
     for labels, limit in ((["d4orm-c2f"], None), (["d4orm-c2f", "d4orm-d"], 30.0)):  # which is a planner's
-        assert {section.time_limit for section in FIGURES["robustness"].only((), labels).sections} == {limit}
+        assert {section.time_limit for section in FIGURES["noise"].only((), labels).sections} == {limit}
 
 
 # The store.

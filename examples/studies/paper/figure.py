@@ -14,7 +14,7 @@ from d4orm_planners.evaluation.study import Study
 
 PaperNumbers = Mapping[tuple[str, str, str], Mapping[str, str]]
 """The paper's numbers by section, label and metric, and in these by column."""
-Cost = Literal["runtime", "travel_time", "first_steps"]
+Cost = Literal["runtime", "travel_time", "first_steps", "iterations"]
 Across = Literal["num_robots", "nodes", "scenario", "control_noise_std", "policy"]
 
 _FEW: dict[str, object] = {"num_samples": 64, "num_steps": 10, "max_iterations": 3}

@@ -31,6 +31,7 @@ _COSTS = {
     "runtime": "seconds to the first solution",
     "travel_time": "travel time [s]",
     "first_steps": "denoising steps to the first solution",
+    "iterations": "iterations",
 }
 
 
@@ -44,8 +45,9 @@ def markdown(figure: Figure, groups: Sequence[Group]) -> str:
     sections = tuple(dict.fromkeys(row.section for row in rows))
     blocks.append("## What was measured")
     blocks += [draw_table(figure, title, [row for row in rows if row.section == title]) for title in sections]
-    if pairs := _pairs(figure, groups):
-        blocks += [f"## Compared with {figure.reference}", PAIRS.format(cost=_COSTS[figure.compared_by]), *pairs]
+    reference = _reference(figure, groups)
+    if pairs := _pairs(figure, groups, reference):
+        blocks += [f"## Compared with {reference}", PAIRS.format(cost=_COSTS[figure.compared_by]), *pairs]
     if figure.deadlines:
         blocks += _deadlines(figure, groups)
     blocks += errors((row.label, row.error) for row in rows)
@@ -92,15 +94,21 @@ def _said(figure: Figure, row: Measured, metric: str) -> str:
     return figure.paper.get((row.section, row.label, metric), {}).get(column(figure, row), "")
 
 
-def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
+def _reference(figure: Figure, groups: Sequence[Group]) -> str | None:
+    """Label of the policy that others are compared with: of variants of one method the first, where it is not there."""
+    is_there = figure.across != "policy" or any(group.label == figure.reference for group in groups)
+    return figure.reference if is_there else groups[0].label
+
+
+def _pairs(figure: Figure, groups: Sequence[Group], reference: str | None) -> list[str]:
     """A table per section of the other policies beside the reference; none without it."""
     by_cell = {(group.section, column(figure, row), group.label): group.trials
               for group in groups for row in [measured(group)]}  # fmt: skip
     one_column = figure.across == "policy"
     tests: dict[tuple[str, str, str], Paired] = {}
     for (section, where, label), trials in by_cell.items():
-        others = by_cell.get((section, str(figure.reference) if one_column else where, str(figure.reference)))
-        if others is None or label == figure.reference:
+        others = by_cell.get((section, str(reference) if one_column else where, str(reference)))
+        if others is None or label == reference:
             continue
         cost = _cost(figure, [*trials, *others])
         tests[section, where, label] = paired(trials, others, cost, lambda one: first_solution(one) is not None)
@@ -112,7 +120,7 @@ def _pairs(figure: Figure, groups: Sequence[Group]) -> list[str]:
             (label, *[where] * (not one_column), *counts, f"{next(p_values):.2g}", f"{test.difference:+.2f}",
              f"{next(p_values):.2g}")
         )  # fmt: skip
-    header = ("policy", *[figure.across] * (not one_column), "pairs", "only it", f"only {figure.reference}", "p",
+    header = ("policy", *[figure.across] * (not one_column), "pairs", "only it", f"only {reference}", "p",
               "difference", "p")  # fmt: skip
     return [table(section, header, lines) for section, lines in blocks.items()]
 
@@ -124,6 +132,8 @@ def _cost(figure: Figure, trials: Sequence[Trial]) -> Callable[[Trial], float]:
         if figure.compared_by == "first_steps":
             return steps_to_solution(trial)
         seconds = first_solution(trial)
+        if figure.compared_by == "iterations":
+            return None if seconds is None else trial.iterations
         return seconds if figure.compared_by == "runtime" or seconds is None else trial.travel_time
 
     worst = max((found for trial in trials if (found := known(trial)) is not None), default=1.0)

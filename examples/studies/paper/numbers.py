@@ -36,6 +36,7 @@ class Measured(Compared):
     first_steps_upper: float | None
     first_steps_restricted: float | None  # mean over all trials, of which those that failed count all their steps
     iterations: float | None  # none of policies that execute no plan
+    iterations_restricted: float | None  # mean over all trials, of which those that failed count all that they made
     reward: float | None  # of the last best plan, per step of the horizon and robot, over all trials
     travel_time: float | None  # mean arrival time [s]
     makespan: float | None  # latest arrival time [s]
@@ -90,6 +91,7 @@ def measured(group: Group) -> Measured:
         runtime_restricted=_restricted(times, [trial.wall_time for trial in trials]),
         first_steps=steps, first_steps_lower=fewer, first_steps_upper=more,
         first_steps_restricted=_restricted(all_steps, [steps_spent(trial) for trial in trials]),
+        iterations_restricted=_restricted([trial.iterations for trial in trials], times),
         reward=float(np.mean(rewards)) if rewards else None,
         jerk=mean("mean_squared_jerk"),
         nodes=_nodes(trials[0]),
@@ -172,6 +174,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType({
     "first_steps": Metric("denoising steps", _steps),
     "first_steps_restricted": Metric("denoising steps, restricted mean", _number("first_steps_restricted", 0)),
     "iterations": Metric("iterations", _number("iterations", 1)),
+    "iterations_restricted": Metric("iterations, restricted mean", _number("iterations_restricted", 1)),
     "reward": Metric("reward", _number("reward", 3)),
     "travel_time": Metric("travel time, s", _number("travel_time", 2)),
     "makespan": Metric("makespan, s", _number("makespan", 2)),
