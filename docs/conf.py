@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
@@ -85,6 +86,22 @@ def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: boo
     return True if is_alias else None
 
 
+def _read_report(app: Any, page: str, source: list[str]) -> None:
+    """Show the studies' ``REPORT.md`` as a page, with tables in place of the links to them.
+
+    Its other links, and other pages' links to it, lead from page to page. Where it has several tables with headings,
+    their title is left out.
+    """
+    if page == "report":
+        report = HERE.parent / "examples" / "studies" / "REPORT.md"
+        app.env.note_dependency(report)
+        text = report.read_text(encoding="utf-8").replace("](../../docs/", "](")
+        text = re.sub(r"^\[Table\]\((.+)\)$", r"```{include} \1\n```", text, flags=re.MULTILINE)
+        tables = r"```{include} \1\n:start-line: 2\n:heading-offset: 1\n```"
+        source[0] = re.sub(r"^\[Tables\]\((.+)\)$", tables, text, flags=re.MULTILINE)
+    source[0] = source[0].replace("../examples/studies/REPORT.md", "report.md")
+
+
 def _write_generated(app: Any, config: Any) -> None:
     """Have the replays that the pages show, and the page of settings.
 
@@ -103,4 +120,5 @@ def setup(app: Any) -> None:
 
     app.add_domain(IndexedPythonDomain, override=True)
     app.connect("config-inited", _write_generated)
+    app.connect("source-read", _read_report)
     app.connect("autodoc-skip-member", _skip_described_field)

@@ -24,6 +24,7 @@ PAGES = {
     for folder in (DOCS, DOCS / "planners")
     for page in sorted(folder.glob("*.md"))
 }
+PAGES["report"] = (ROOT / "examples" / "studies" / "REPORT.md").read_text(encoding="utf-8")  # which the page shows
 OTHERS = (
     "README.md",
     "CONTRIBUTING.md",
