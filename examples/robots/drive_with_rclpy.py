@@ -28,7 +28,8 @@ class Team(Node):
     def __init__(self) -> None:
         super().__init__("d4orm")
         self.problem = make_problem("circle", 6, robot="turtlebot3_burger", diameter=3.0, horizon=400)
-        self.controller = Controller("d4orm-c2f", mode="measured", timeout=0.9 * self.problem.dt)
+        # The lag with which these robots follow cmd_vel, as measured.
+        self.controller = Controller("d4orm-c2f", mode="measured", timeout=0.9 * self.problem.dt, lag=0.15)
         self.states, self.heard = np.full(self.problem.start.shape, np.nan), np.full(6, -np.inf)
         self.begun, self.commands = False, [self.create_publisher(Twist, f"/robot_{k}/cmd_vel", 1) for k in range(6)]
         for k in range(6):
@@ -49,7 +50,8 @@ class Team(Node):
             self.begun = True
         else:
             turn_rates, accelerations = self.controller.step(self.states, now).control.T
-            speeds = self.states[:, 3] + self.problem.dt * accelerations
+            fastest = self.problem.team.max_speed
+            speeds = np.clip(self.states[:, 3] + self.problem.dt * accelerations, -fastest, fastest)
         for publisher, speed, turn_rate in zip(self.commands, speeds, turn_rates, strict=True):
             command = Twist()
             command.linear.x, command.angular.z = float(speed), float(turn_rate)
