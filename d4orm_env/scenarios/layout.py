@@ -28,6 +28,10 @@ DENSITY = {2: 0.4, 3: 0.25}
 """Share of the area (volume) that random placement fills without fail; it jams at 0.547 (0.384)."""
 
 
+FLOOR = np.array([-np.inf, -np.inf, 0.0], np.float32)
+"""Lowest coordinates of robots that stand above a floor [m]."""
+
+
 class PlacementArea(NamedTuple):
     """Region that points are drawn from: a box, or the ellipse (ellipsoid) inside it."""
 
@@ -83,7 +87,7 @@ def build(settings: Settings, layout: Layout) -> Problem:
 
 
 def _lifted(layout: Layout, height: float) -> Layout:
-    """The layout with its lowest start or goal at that height [m]; obstacles of scenarios reach through all heights."""
+    """The layout with its lowest start or goal at that height [m] above a floor; obstacles reach through all heights."""
     positions = np.vstack([layout.starts, layout.goals])
     if positions.shape[1] != 3:
         raise ValueError(
@@ -94,7 +98,7 @@ def _lifted(layout: Layout, height: float) -> Layout:
     if area is not None:
         area = area._replace(centre=area.centre + lift)
     if world.lower is not None:
-        world = world.replace(lower=world.lower + lift, upper=world.upper + lift)
+        world = world.replace(lower=np.maximum(world.lower + lift, FLOOR), upper=world.upper + lift)
     return replace(layout, starts=layout.starts + lift, goals=layout.goals + lift, world=world, area=area)
 
 
@@ -148,12 +152,12 @@ def _require_margin(settings: Settings, world: World, starts: Floats, goals: Flo
 
 
 def _with_bounds(settings: Settings, world: World, area: PlacementArea | None) -> World:
-    """The world, with the bounds that were asked for if any were.
+    """The world, with the bounds that were asked for if any were, or a floor and wide bounds above it for a height.
 
     A margin is laid around the scenario's ``area``, the same for every seed, so that worlds that differ in their seed
     alone have the same bounds.
     """
-    if settings.bounds is None:
+    if settings.bounds is None and (settings.height is None or area is None or world.lower is not None):
         return world
     if area is None or world.lower is not None:
         raise ValueError(
@@ -163,14 +167,16 @@ def _with_bounds(settings: Settings, world: World, area: PlacementArea | None) -
     if isinstance(settings.bounds, list | tuple | np.ndarray):
         lower, upper = frozen_array(settings.bounds, "bounds", (2, world.dimension), largest=LARGEST)
     else:
-        out = area.half_extent + bounded(settings.bounds, "bounds")
-        lower, upper = as_float32(area.centre - out), as_float32(area.centre + out)
+        margin = area.half_extent.max() if settings.bounds is None else bounded(settings.bounds, "bounds")
+        lower, upper = (as_float32(area.centre + way * (area.half_extent + margin)) for way in (-1, 1))
+        if settings.height is not None:
+            lower = np.maximum(lower, FLOOR)
     return replace(world, lower=lower, upper=upper)
 
 
 def _require_inside(settings: Settings, world: World, starts: Floats, goals: Floats) -> None:
-    """Check that the bounds that were asked for leave every start and goal its radius and the margin."""
-    if settings.bounds is None:
+    """Check that bounds that were asked for, or a floor, leave every start and goal its radius and the margin."""
+    if settings.bounds is None and settings.height is None:
         return
     lower, upper = world.bounds.astype(np.float64)
     needed = np.asarray(settings.team.radius, np.float64) + settings.margin
@@ -180,10 +186,12 @@ def _require_inside(settings: Settings, world: World, starts: Floats, goals: Flo
         if gaps[robot] <= needed[robot]:
             position = ", ".join(f"{coordinate:g}" for coordinate in positions[robot])
             where = f"{gaps[robot]:.3g} m inside" if gaps[robot] >= 0 else f"{-gaps[robot]:.3g} m outside"
+            asked, remedy = settings.bounds, "wider bounds"
+            if asked is None:
+                asked, remedy = "above the floor", "a larger height"
             raise ValueError(
                 f"scenario {settings.scenario!r}: the {what} of robot_{robot} at ({position}) is {where} the bounds "
-                f"{short_repr(settings.bounds)}, and its radius and the margin take {needed[robot]:.3g} m; use wider "
-                "bounds"
+                f"{short_repr(asked)}, and its radius and the margin take {needed[robot]:.3g} m; use {remedy}"
             )
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from d4orm_env import make_problem, make_team
 from d4orm_env.core.robot_types import ROBOTS
+from d4orm_planners import make_planner
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -75,7 +76,23 @@ def test_spatial_scenarios_stand_above_the_floor(scenario: str) -> None:
     lift = high.goal[0] - low.goal[0]
     np.testing.assert_allclose(lift[:2], 0, atol=1e-6)
     np.testing.assert_allclose(high.start[:, :3] - low.start[:, :3], np.broadcast_to(lift, (4, 3)), atol=1e-6)
-    np.testing.assert_allclose(high.world.bounds, low.world.bounds + lift, atol=1e-6)
+    assert high.world.bounds[0, 2] == max(low.world.bounds[0, 2] + lift[2], 0), "the floor"
+    if np.isfinite(low.world.bounds).all():
+        np.testing.assert_allclose(high.world.bounds[1], low.world.bounds[1] + lift, atol=1e-6)
+
+
+@pytest.mark.parametrize("scenario", ["circle", "swap", "forest"])
+def test_robots_that_stand_above_the_floor_are_planned_to_stay_there(scenario: str) -> None:
+    problem = make_problem(scenario, num_robots=6, robot="crazyflie", height=0.3)
+    plan = make_planner().solve(problem, seed=0)
+    assert plan.verified
+    assert (plan.trajectory.positions[..., 2] > problem.team.radius).all()
+
+
+def test_too_low_a_height_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"robot_0 at \(2.5, 0, 0.1\) is 0.1 m inside .* floor.*use a larger height"):
+        make_problem("circle", num_robots=4, robot="crazyflie", height=0.1)
+    assert make_problem("circle", num_robots=4, robot="crazyflie", height=1.0, bounds=0.5).world.bounds[0, 2] == 0.5
 
 
 def test_robots_of_the_plane_have_no_height() -> None:
