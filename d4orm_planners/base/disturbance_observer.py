@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_planners.tracking.reference_feedback import ActuatorLag
-from d4orm_planners.tracking.steering import limit_controls, rates, short_way_round
+from d4orm_planners.tracking.steering import integrated, limit_controls, rates, short_way_round
 
 GAIN = 0.1
 """Share of a step's residual that goes into the estimate."""
@@ -59,7 +59,7 @@ class DisturbanceObserver:
         names = problem.team.models
         columns = {"holonomic2d": range(d, 2 * d), "holonomic3d": range(d, 2 * d), "velocity2d": range(d)}
         self._observed: BoolArray = np.array([name in columns for name in names])
-        self._second_order = np.isin(names, ("holonomic2d", "holonomic3d"))[:, None]
+        self._summed = _summed_controls(problem)
         self._columns = np.array([columns.get(name, range(d)) for name in names])
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
@@ -106,7 +106,7 @@ class DisturbanceObserver:
         return reference + (self._trust * off).astype(np.float32)
 
     def executed(self, before: FloatArray, after: FloatArray, controls: FloatArray) -> FloatArray:
-        """``(K, m)`` controls that take double integrators from one velocity to the other; of other models unchanged.
+        """``(K, m)`` controls with which robots without limits on their states do as their models did.
 
         A model that is at its speed limit does not obey a control that speeds it up; a robot does.
 
@@ -115,10 +115,8 @@ class DisturbanceObserver:
             after: ``(K, n)`` states of the models after the step.
             controls: ``(K, m)`` of the models.
         """
-        d, executed = self.problem.dimension, controls.copy()
-        change = (after[:, d : 2 * d] - before[:, d : 2 * d]) / self.problem.dt if after.shape[1] >= 2 * d else 0.0
-        executed[:, :d] = np.where(self._second_order, change, controls[:, :d])
-        return executed
+        swallowed = (after - integrated(self.problem, before, controls)) / np.float32(self.problem.dt)
+        return controls + np.einsum("kn,knm->km", swallowed, self._summed)
 
     def compensated(self, controls: FloatArray, resting: BoolArray) -> FloatArray:
         """``(K, m)`` controls with the same effect as these without the disturbance; unchanged for robots at rest."""
@@ -129,3 +127,15 @@ class DisturbanceObserver:
         self._explained[resting] = np.nan
         self.applied = self.lag.after(sent.astype(float), self.applied)
         return sent
+
+
+def _summed_controls(problem: Problem) -> FloatArray:
+    """``(K, n, m)`` one where a state other than a position or heading is the sum of a control over time, else zero."""
+    rest, still = np.zeros_like(problem.start), np.zeros((problem.num_robots, problem.control_size), np.float32)
+    summed = np.zeros((*rest.shape, problem.control_size), np.float32)
+    for number, unit in enumerate(np.eye(problem.control_size, dtype=np.float32)):
+        summed[..., number] = rates(problem, rest, still + unit) == 1
+    summed[:, : problem.dimension] = 0
+    for robot, model in enumerate(problem.team.robot_models):
+        summed[robot, [] if model.heading_index is None else model.heading_index] = 0
+    return summed
