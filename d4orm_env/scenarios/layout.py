@@ -87,7 +87,7 @@ def build(settings: Settings, layout: Layout) -> Problem:
 
 
 def _lifted(layout: Layout, height: float) -> Layout:
-    """The layout with its lowest start or goal at that height [m] above a floor; obstacles reach through all heights."""
+    """The layout with its lowest start or goal at that height [m] above a floor; obstacles reach through any height."""
     positions = np.vstack([layout.starts, layout.goals])
     if positions.shape[1] != 3:
         raise ValueError(
@@ -186,12 +186,11 @@ def _require_inside(settings: Settings, world: World, starts: Floats, goals: Flo
         if gaps[robot] <= needed[robot]:
             position = ", ".join(f"{coordinate:g}" for coordinate in positions[robot])
             where = f"{gaps[robot]:.3g} m inside" if gaps[robot] >= 0 else f"{-gaps[robot]:.3g} m outside"
-            asked, remedy = settings.bounds, "wider bounds"
-            if asked is None:
-                asked, remedy = "above the floor", "a larger height"
+            floor, asked = settings.bounds is None, short_repr(settings.bounds)
+            asked, remedy = ("above the floor", "a larger height") if floor else (asked, "wider bounds")
             raise ValueError(
                 f"scenario {settings.scenario!r}: the {what} of robot_{robot} at ({position}) is {where} the bounds "
-                f"{short_repr(asked)}, and its radius and the margin take {needed[robot]:.3g} m; use {remedy}"
+                f"{asked}, and its radius and the margin take {needed[robot]:.3g} m; use {remedy}"
             )
 
 

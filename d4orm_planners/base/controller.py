@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, positive_number, read_only, short_repr
+from d4orm_env.core.arrays import BoolArray, FloatArray, positive_number, read_only, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
+from d4orm_env.disturbances.disturbance import truth
 from d4orm_env.envs.joint_state import JointState, split_state
 from d4orm_planners.base.disturbance_observer import DisturbanceObserver, check_lag
 from d4orm_planners.base.episode import open_env
 from d4orm_planners.base.measured_states import completed, seconds
 from d4orm_planners.base.planner_registry import PolicyLike, make_policy, setting_names
-from d4orm_planners.base.policy import Actions, OpenLoop, Policy
+from d4orm_planners.base.policy import Actions, Observations, OpenLoop, Policy, robot_indices
 from d4orm_planners.base.policy_threads import Background, check_episode
-from d4orm_planners.tracking.reference_feedback import ActuatorLag, LaggedReference, Reference, regulated
+from d4orm_planners.tracking.reference_feedback import (
+    ActuatorLag,
+    ControlSetpoint,
+    LaggedReference,
+    Reference,
+    regulated,
+)
 from d4orm_planners.tracking.steering import (
     advanced,
     limited_states,
@@ -28,33 +34,13 @@ from d4orm_planners.tracking.steering import (
     weaker,
 )
 
+if TYPE_CHECKING:
+    from pettingzoo import ParallelEnv
+
 Mode = Literal["nominal", "measured"]
 
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
-
-
-@dataclass(frozen=True, eq=False)
-class ControlSetpoint:
-    """Setpoint of a team until the next step; its arrays are read-only.
-
-    Attributes:
-        position: ``(K, d)`` where robots are to be at the end of the period [m].
-        velocity: ``(K, d)`` their velocity then [m/s].
-        acceleration: ``(K, d)`` on the way there [m/s^2].
-        heading: ``(K,)`` heading at the end of the period [rad]; zero for robots whose model has none.
-        control: ``(K, m)`` controls of the robots' models, within each robot's limits.
-        arrived: ``(K,)`` bool: it stays at its goal from now on.
-        held: True if the policy did not answer in time: robots brake.
-    """
-
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    heading: Floats
-    control: FloatArray
-    arrived: BoolArray
-    held: bool
 
 
 IN_TIME = 0.9
@@ -113,8 +99,6 @@ class Controller:
         tracker: bool = False,
         **settings: Any,
     ) -> None:
-        if not isinstance(tracker, bool):
-            raise ValueError(f"tracker is {short_repr(tracker)}; it must be True or False")
         if mode not in get_args(Mode):
             raise ValueError(f"mode is {short_repr(mode)}; choose one of {', '.join(get_args(Mode))}")
         self.mode = mode
@@ -124,9 +108,9 @@ class Controller:
         if self.timeout is not None and isinstance(policy, str) and "deadline" in setting_names(policy, settings):
             settings = {"deadline": IN_TIME * self.timeout} | settings
         self.policy: Policy = make_policy(policy, **settings)
-        self.tracker = tracker
+        self.tracker = truth(tracker, "tracker")
         self._looks = mode == "measured" and not isinstance(self.policy, OpenLoop)
-        self.lag, self._leads = check_lag(lag), tracker or not self._looks
+        self.lag, self._leads = check_lag(lag), self.tracker or not self._looks
         self._background: Background[Actions] = Background()
         self._env: Any = None
         self._observer: DisturbanceObserver
@@ -208,6 +192,17 @@ class Controller:
             # Periods follow each other, so that frequent calls do not make the reference faster than the clock.
             self._time = max(self._time + dt, float(time) - SAME_PERIOD * dt)
         return self._setpoint
+
+    def reset(self, env: ParallelEnv, seed: int = 0) -> None:
+        """Take over the team of an environment: controllers are policies, for :func:`~d4orm_planners.run_episode`."""
+        problem: Problem = env.unwrapped.problem
+        self.begin(problem, split_state(problem, env.state()).states, seed=seed)
+
+    def act(self, observations: Observations, state: FloatArray) -> Actions:
+        """Return the controls of all robots that are observed, from the environment's joint state."""
+        joint = split_state(self._robots, state)
+        control = self.step(joint.states, joint.steps * self._robots.dt).control
+        return {agent: control[robot] for agent, robot in zip(observations, robot_indices(observations))}
 
     @property
     def arrived(self) -> BoolArray:

@@ -17,7 +17,7 @@ import typer
 from d4orm_env.core.arrays import duration, whole_number
 from d4orm_env.core.files import read_yaml
 from d4orm_env.core.problem import Problem
-from d4orm_env.scenarios import load_problem
+from d4orm_env.scenarios import load_problem, make_problem
 from d4orm_env.scenarios.schema import VERSION, parse
 from d4orm_planners.base.controller import Controller
 from d4orm_planners.base.disturbance_observer import DisturbanceObserver
@@ -112,8 +112,12 @@ def problem_in(content: object, folder: Path) -> Problem:
     if not isinstance(content, dict):
         raise ValueError(f"problem must be a scenario file or a scenario with its arguments, not {content!r}")
     try:
+        if content.get("scenario") == "map" and isinstance(content.get("map"), str):
+            # No scenario file reads another file; one that says what a machine has to do names several.
+            settings = {name: value for name, value in content.items() if name not in ("scenario", "map")}
+            return make_problem("map", map=folder / content["map"], **settings)
         return parse({"version": VERSION, **content})
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"problem: {error}") from error
 
 

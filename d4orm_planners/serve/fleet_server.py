@@ -11,11 +11,12 @@ import numpy as np
 
 from d4orm_env.core.arrays import FloatArray, Floats, positive_number
 from d4orm_env.core.problem import Problem
-from d4orm_planners.base.controller import Controller, ControlSetpoint
+from d4orm_planners.base.controller import Controller
 from d4orm_planners.serve import wire
 from d4orm_planners.serve.fleet_robot import FleetRobot
 from d4orm_planners.serve.wire import RosSession, Subscriber, position_of, turned
 from d4orm_planners.tracking import ros_messages as ros
+from d4orm_planners.tracking.reference_feedback import ControlSetpoint
 from d4orm_planners.tracking.steering import braking_share
 
 NODE = "d4orm"

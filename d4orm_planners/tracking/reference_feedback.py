@@ -6,11 +6,12 @@ Control: Linear Quadratic Methods, 1990): what cannot be corrected, as the way a
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from d4orm_env.core.arrays import FloatArray, Floats
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.team import Team
 from d4orm_planners.tracking.steering import (
@@ -39,6 +40,29 @@ class Reference(NamedTuple):
     after: FloatArray  #: ``(K, n)`` at the end of the step
     controls: FloatArray  #: ``(K, m)`` what its actuators are told
     applied: FloatArray  #: ``(K, m)`` what they apply now
+
+
+@dataclass(frozen=True, eq=False)
+class ControlSetpoint:
+    """Setpoint of a team until the next step; its arrays are read-only.
+
+    Attributes:
+        position: ``(K, d)`` where robots are to be at the end of the period [m].
+        velocity: ``(K, d)`` their velocity then [m/s].
+        acceleration: ``(K, d)`` on the way there [m/s^2].
+        heading: ``(K,)`` heading at the end of the period [rad]; zero for robots whose model has none.
+        control: ``(K, m)`` controls of the robots' models, within each robot's limits.
+        arrived: ``(K,)`` bool: it stays at its goal from now on.
+        held: True if the policy did not answer in time: robots brake.
+    """
+
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    heading: Floats
+    control: FloatArray
+    arrived: BoolArray
+    held: bool
 
 
 class ActuatorLag:

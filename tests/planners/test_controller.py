@@ -17,9 +17,9 @@ from d4orm_env import Problem, Team, make_problem, navigation_v0, rollout
 from d4orm_env.disturbances import Bias, ControlNoise, Gain, Lag, StateNoise
 from d4orm_env.envs.joint_state import split_state
 from d4orm_planners import Controller, make_planner, make_policy, run_episode
-from d4orm_planners.base.controller import ControlSetpoint
 from d4orm_planners.base.disturbance_observer import MOST, DisturbanceObserver
 from d4orm_planners.base.policy import GoToGoal, OpenLoop
+from d4orm_planners.tracking.reference_feedback import ControlSetpoint
 from d4orm_planners.tracking.steering import advanced, integrated, present_velocities
 
 MODELS = ("holonomic2d", "velocity2d", "differential_drive", "unicycle", "holonomic3d")
@@ -68,6 +68,16 @@ def test_a_perfect_robot_drives_as_in_the_environment(mode: Any, model: str) -> 
     np.testing.assert_array_equal(said[-1].arrived, True)
     assert not any(s.held for s in said)
     assert speeds.max() <= problem.team.max_speed.max() * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("mode", ["nominal", "measured"])
+def test_a_controller_is_a_policy_of_the_environments(mode: Any) -> None:
+    problem = team("holonomic2d")
+    env = navigation_v0.parallel_env(problem=problem, disturbances=[Bias(0.05)])
+    episode = run_episode(env, Controller("d4orm-c2f", mode=mode, refine="sync"), seed=0)
+    assert episode.metrics["success"] == 1
+    plant, _ = driven(Controller("d4orm-c2f", mode=mode, refine="sync"), problem, [Bias(0.05)])
+    assert plant.metrics()["travel_time"] == episode.metrics["travel_time"], "as in a loop of one's own"
 
 
 @pytest.mark.parametrize("model", ["holonomic2d", "differential_drive", slow("car"), slow("unicycle2")])

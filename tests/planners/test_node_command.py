@@ -188,6 +188,17 @@ def test_a_file_means_a_node(tmp_path: Path) -> None:
     np.testing.assert_array_equal(task.problem.start, make_problem("circle", num_robots=4).start)
 
 
+def test_a_file_names_the_map_of_its_problem(tmp_path: Path) -> None:
+    rows = ("type octile", "height 3", "width 6", "map", "......", "..@@..", "......")
+    Path(tmp_path, "room.map").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    task = load_node(write(tmp_path, problem={"scenario": "map", "map": "room.map", "cell": 0.6, "num_robots": 2}))
+    same = make_problem("map", map=tmp_path / "room.map", cell=0.6, num_robots=2)
+    assert task.problem.digest == same.digest
+    for wrong, text in (({"map": "nowhere.map"}, "nowhere"), ({"map": "room.map", "colour": 3}, "colour")):
+        with pytest.raises(ValueError, match=f"problem: .*{text}"):
+            load_node(write(tmp_path, problem={"scenario": "map", **wrong}))
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
