@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, positive_number, read_only, short_repr
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, positive_number, read_only, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_env.core.problem_checks import check_is_problem
 from d4orm_env.disturbances.disturbance import truth
@@ -56,8 +56,7 @@ class Controller:
     In mode ``"nominal"`` the policy sees the reference, and robots follow it: by their own trackers, which are given
     position, velocity and acceleration, or by the controls, which have a feedback on what was measured. In mode
     ``"measured"`` the policy sees what was measured; a plan, which looks at nothing, is followed in either mode. In
-    both, controls make up for what pushes a robot all the time, as a thrust that is too weak does
-    (:mod:`d4orm_planners.base.disturbance_observer`).
+    both, controls make up for what pushes a robot all the time, as a thrust that is too weak does.
 
     Numbers of measured states that are not finite are missing: where a robot's position or heading is, the reference
     takes its place, and what else is follows from its last state and control. Speeds and coordinates beyond what a
@@ -69,12 +68,12 @@ class Controller:
         reserve: Share of the robots' limits on speed, acceleration and turn rate that the reference leaves to the
             feedback, in mode ``"nominal"`` or with a tracker. By default 0.5 with a tracker, which has its robot tilt
             or turn before it can push, 0.2 in mode ``"nominal"`` without, else none.
-        timeout: Longest time that a step waits for the policy [s]. The policy goes on in a thread, robots brake
-            meanwhile, and its late answer is not used. ``None`` waits. A policy that is named and has a ``deadline``,
-            as D4orm-C2F, gets nine tenths of it, and replans in a thread of its own.
+        timeout: Longest time that a step waits for the policy [s], ``None`` for any; robots brake meanwhile, and a late
+            answer is not used. A named policy with a ``deadline``, as D4orm-C2F, gets nine tenths of it.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             setpoints come later by the largest: with it robots can drive as the reference does. In mode ``"measured"``
-            the policy sees robots as they would be without it.
+            the policy sees robots as they would be without it. ``None`` is none but for robots driven by accelerations
+            in mode ``"measured"`` without a tracker, of which it is found as they drive.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
             are shifted against a lasting distance from the reference, as a thrust that is too weak causes, up to the
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
@@ -95,7 +94,7 @@ class Controller:
         mode: Mode = "nominal",
         reserve: float | None = None,
         timeout: float | None = None,
-        lag: ArrayLike = 0.0,
+        lag: ArrayLike | None = None,
         tracker: bool = False,
         **settings: Any,
     ) -> None:
@@ -110,7 +109,9 @@ class Controller:
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = truth(tracker, "tracker")
         self._looks = mode == "measured" and not isinstance(self.policy, OpenLoop)
-        self.lag, self._leads = check_lag(lag), self.tracker or not self._looks
+        found = lag is None and self._looks and not self.tracker
+        self._given_lag = None if found else check_lag(0.0 if lag is None else lag)
+        self._leads = self.tracker or not self._looks
         self._background: Background[Actions] = Background()
         self._env: Any = None
         self._observer: DisturbanceObserver
@@ -130,7 +131,7 @@ class Controller:
     def begin(self, problem: Problem, states: ArrayLike, time: float = 0.0, seed: int = 0) -> None:
         """Take over a team; policies that plan do so now, however long it takes.
 
-        What was learned of pushes is kept where the same team (``problem.team``) goes on in time.
+        What was learned of pushes and lags is kept where the same team (``problem.team``) goes on in time.
 
         Args:
             problem: The team, its goals and its world.
@@ -150,9 +151,10 @@ class Controller:
             raise
 
     def _begin(self, problem: Problem, states: ArrayLike, time: float, seed: int) -> None:
-        observer, lead = DisturbanceObserver(problem, self.lag), np.zeros_like(problem.goal, np.float64)
+        observer, lead = DisturbanceObserver(problem, self._given_lag), np.zeros_like(problem.goal, np.float64)
         if time >= self._time and self._observer.problem.team is problem.team:
-            observer.bias, lead = self._observer.bias, self._lead
+            observer.go_on_from(self._observer)
+            lead = self._lead
         self._observer, self._lead, self._robots = observer, lead, problem
         self._open(problem, seed)
         space, shape = self._env.state_space, problem.start.shape
@@ -163,7 +165,7 @@ class Controller:
         self._open(problem.with_state(start, problem.goal, team=team), seed)
         self.policy.reset(self._env, seed=seed)
         # A tracker follows by itself, and what a policy looks at is as without a lag.
-        lag = ActuatorLag(self._observer.lag.constants * (not (self.tracker or self._looks)), problem.dt)
+        lag = ActuatorLag(self.lag * (not (self.tracker or self._looks)), problem.dt)
         self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, lag)
         idle = self._joint.controls
         self._setpoint = self._described(Reference(start, start, idle, idle), held=False)
@@ -203,6 +205,11 @@ class Controller:
         joint = split_state(self._robots, state)
         control = self.step(joint.states, joint.steps * self._robots.dt).control
         return {agent: control[robot] for agent, robot in zip(observations, robot_indices(observations))}
+
+    @property
+    def lag(self) -> Floats:
+        """``(K,)`` time constants of the actuators, given or found [s]."""
+        return self._observer.lag.constants
 
     @property
     def arrived(self) -> BoolArray:

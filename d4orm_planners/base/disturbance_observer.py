@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, short_repr
+from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_planners.tracking.reference_feedback import ActuatorLag
 from d4orm_planners.tracking.steering import integrated, limit_controls, rates, short_way_round
@@ -14,6 +14,11 @@ GAIN = 0.1
 """Share of a step's residual that goes into the estimate."""
 MOST = 0.5
 """Largest estimate, as a share of the control's limit: the rest is needed to steer."""
+LAGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+"""Time constants that are told apart where none is given, in time steps."""
+KEPT, STEPS, BETTER = 0.97, 15, 0.6
+"""Share of what is known of them that a step keeps, steps after which they are compared, and by how much less residual
+another one than the present must explain what robots did."""
 
 
 def check_lag(lag: ArrayLike) -> ArrayLike:
@@ -39,7 +44,7 @@ class DisturbanceObserver:
 
     Args:
         problem: The team.
-        lag: Time constant of the actuators [s], one or ``K``.
+        lag: Time constant of the actuators [s], one or ``K``; ``None`` finds it out (:class:`LagFinder`).
 
     Attributes:
         lag: That of the actuators, of whatever model.
@@ -50,8 +55,10 @@ class DisturbanceObserver:
         ValueError: If the lag is negative, or neither one number nor one per robot.
     """
 
-    def __init__(self, problem: Problem, lag: ArrayLike = 0.0) -> None:
+    def __init__(self, problem: Problem, lag: ArrayLike | None = 0.0) -> None:
         self.problem, count, d = problem, problem.num_robots, problem.dimension
+        self._finder = LagFinder(problem) if lag is None else None
+        lag = 0.0 if lag is None else lag
         given: Floats = np.asarray(check_lag(lag), np.float64)
         if given.shape not in ((), (1,), (count,)):
             raise ValueError(f"lag has shape {given.shape}; give one number or one per robot ({count})")
@@ -64,11 +71,21 @@ class DisturbanceObserver:
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
         self._fastest = fastest[:, None]
-        self.lag = ActuatorLag(constants, problem.dt)
-        self._trust = problem.dt / (problem.dt + 2 * constants[:, None])
+        self._set_lag(constants)
         self.bias, self.applied = np.zeros((count, d)), np.zeros((count, problem.control_size))
         self._explained: Floats | None = None
         self._before: Floats | None = None
+
+    def go_on_from(self, other: DisturbanceObserver) -> None:
+        """Keep what another has learned of the same robots."""
+        self.bias = other.bias
+        if self._finder is not None:
+            self._finder.constants = other.lag.constants
+            self._set_lag(other.lag.constants)
+
+    def _set_lag(self, constants: Floats) -> None:
+        self.lag = ActuatorLag(constants, self.problem.dt)
+        self._trust = self.problem.dt / (self.problem.dt + 2 * constants[:, None])
 
     def observe(self, states: FloatArray, known: BoolArray) -> None:
         """Learn from measured states ``(K, n)``, where they are known ``(K,)``, now and a step ago."""
@@ -82,6 +99,9 @@ class DisturbanceObserver:
             better = np.clip(self.bias + GAIN * left, -self._most, self._most)
             self.bias = np.where(self._observed[:, None] & np.isfinite(left), better, self.bias)
         self._before = now
+        if self._finder is not None and self._finder.observe(states, known):
+            self._set_lag(self._finder.constants)
+            self.applied = self._finder.applied
 
     def undelayed(self, states: FloatArray, known: BoolArray) -> FloatArray:
         """``(K, n)`` states that obey the models as if there were no lag; those of robots that are not ``known``
@@ -126,7 +146,69 @@ class DisturbanceObserver:
         self._explained = self.lag.mean(sent.astype(float), self.applied)[:, :d]
         self._explained[resting] = np.nan
         self.applied = self.lag.after(sent.astype(float), self.applied)
+        if self._finder is not None:
+            self._finder.send(sent)
         return sent
+
+
+class LagFinder:
+    """Estimator of the lag of each robot's actuators: of a few time constants (:data:`LAGS`) the one from which what
+    robots did follows best by a straight line, so that neither a steady push nor weak actuators make a difference.
+
+    Robots whose controls do not sum up to a state are taken to have none.
+
+    Args:
+        problem: The team.
+
+    Attributes:
+        constants: ``(K,)`` time constants found so far [s].
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self._summed, count = problem, _summed_controls(problem), problem.num_robots
+        self._lags = [ActuatorLag(np.full(count, steps * problem.dt), problem.dt) for steps in LAGS]
+        self._applied = np.zeros((len(LAGS), count, problem.control_size))
+        self._means = self._applied.copy()
+        self._moments = np.zeros((6, *self._applied.shape))
+        self._before: FloatArray | None = None
+        self.constants = np.zeros(count)
+
+    @property
+    def applied(self) -> Floats:
+        """``(K, m)`` what the actuators apply now."""
+        return self._applied[self._present, np.arange(len(self.constants))]
+
+    @property
+    def _present(self) -> IntArray:
+        return np.abs(np.array(LAGS)[:, None] * self._problem.dt - self.constants).argmin(axis=0)
+
+    def send(self, controls: FloatArray) -> None:
+        """Note the controls ``(K, m)`` of the next step."""
+        pairs = list(zip(self._lags, self._applied))
+        self._means = np.stack([lag.mean(controls.astype(float), applied) for lag, applied in pairs])
+        self._applied = np.stack([lag.after(controls.astype(float), applied) for lag, applied in pairs])
+
+    def observe(self, states: FloatArray, known: BoolArray) -> bool:
+        """Learn from measured states ``(K, n)``; return whether another lag than before has been found."""
+        before, self._before = self._before, np.where(known[:, None], states, np.nan)
+        if before is None:
+            return False
+        done = np.einsum("kn,knm->km", (self._before - before) / self._problem.dt, self._summed)
+        seen = np.isfinite(done).all(axis=1, keepdims=True)
+        counted = seen & self._summed.any(axis=1)
+        x, y = np.where(counted, self._means, 0.0), np.broadcast_to(np.where(counted, done, 0.0), self._means.shape)
+        new = np.stack([np.broadcast_to(seen, x.shape), x, y, x * x, x * y, y * y])
+        self._moments = KEPT * self._moments + new
+        weight = self._moments[0]
+        x, y, xx, xy, yy = self._moments[1:] / np.maximum(weight, 1e-9)
+        spread = xx - x * x
+        fitted = np.divide((xy - x * y) ** 2, spread, out=np.zeros_like(spread), where=spread > 0)
+        left = (yy - y * y - fitted).sum(axis=2)
+        best, rows = left.argmin(axis=0), np.arange(len(self.constants))
+        enough = weight[0, :, 0] > (1 - KEPT**STEPS) / (1 - KEPT)
+        better = enough & (left[best, rows] < BETTER * left[self._present, rows])
+        self.constants = np.where(better, np.array(LAGS)[best] * self._problem.dt, self.constants)
+        return bool(better.any())
 
 
 def _summed_controls(problem: Problem) -> FloatArray:
