@@ -48,16 +48,33 @@ def prove_infeasible(problem: Problem) -> dict[int, str]:
     within it counts. For models of users only goals and walls count, because nothing says how far their robots get in a
     step.
     """
-    d, safety_distance = problem.dimension, problem.team.inner_radius + problem.margin
-    starts, goals = problem.start[:, :d].astype(np.float64), problem.goal.astype(np.float64)
-    doubt = problem.rounding + ROUNDING * max(np.abs(starts).max(), np.abs(goals).max(), safety_distance.max())
+    starts, goals, doubt = _ends(problem)
     proofs = dict(_crowded(problem, "starts", starts, _travel(problem, _start_speed(problem)) + doubt, "one step"))
     at_rest = np.full(problem.num_robots, problem.goal_radius + doubt)
     proofs |= dict(_crowded(problem, "has a goal", goals, at_rest, "the goal radius"))
-    if not proofs and problem.world.num_obstacles and safety_distance.min() > 0:
-        robots = _walled_off(problem, starts, goals, float(doubt))
+    if not proofs:
+        robots = _walled_off(problem)
         proofs = dict.fromkeys(robots, "has no free path to its goal: walls are closed all round the one or the other")
     return proofs
+
+
+def check_connected(problem: Problem) -> None:
+    """Raise ``ValueError``, which names them, if walls are proved to lie between robots' starts and goals."""
+    if robots := _walled_off(problem):
+        names = ", ".join(f"robot_{robot}" for robot in robots)
+        inner = " or ".join(sorted({f"{radius:.4g}" for radius in problem.team.inner_radius[robots]}))
+        raise ValueError(
+            f"{names} {'has' if len(robots) == 1 else 'have'} no path from start to goal, not even for the disc of "
+            f"{inner} m within the footprint; move the start or the goal, open the world there, or use a smaller "
+            f"footprint or margin"
+        )
+
+
+def _ends(problem: Problem) -> tuple[Floats, Floats, float]:
+    """Starts and goals ``(K, d)``, and what rounding may add to distances [m]."""
+    starts, goals = problem.start[:, : problem.dimension].astype(np.float64), problem.goal.astype(np.float64)
+    largest = max(np.abs(starts).max(), np.abs(goals).max(), problem.team.inner_radius.max() + problem.margin)
+    return starts, goals, float(problem.rounding + ROUNDING * largest)
 
 
 def _start_speed(problem: Problem) -> Floats:
@@ -98,9 +115,12 @@ def _crowded(problem: Problem, what: str, positions: Floats, freedom: Floats, wi
                 yield robot, f"{gap}, and the two cannot come clear of each other by {needed}"
 
 
-def _walled_off(problem: Problem, starts: Floats, goals: Floats, doubt: float) -> list[int]:
+def _walled_off(problem: Problem) -> list[int]:
     """Robots whose goals are not connected with their starts."""
     d, safety_distance = problem.dimension, problem.team.inner_radius + problem.margin
+    if not problem.world.num_obstacles or safety_distance.min() <= 0:
+        return []
+    starts, goals, doubt = _ends(problem)
     travel = _travel(problem, problem.team.max_speed.astype(np.float64))
     for halving in range(1 + HALVINGS):
         low, cell, clearance = _cells(

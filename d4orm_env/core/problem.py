@@ -24,10 +24,12 @@ from d4orm_env.core.world import World, world_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from d4orm_env.core import infeasibility
     from d4orm_env.paths import shortest_paths as paths
     from d4orm_env.paths.shortest_paths import ShortestPaths
     from d4orm_env.render import pictures
 else:
+    infeasibility = LazyModule("d4orm_env.core.infeasibility")
     paths = LazyModule("d4orm_env.paths.shortest_paths")
     pictures = LazyModule("d4orm_env.render.pictures")
 
@@ -208,12 +210,12 @@ class Problem(Frozen):
     def check_reachable(self) -> None:
         """Check that every robot has a path to its goal that keeps its radius and the margin from obstacles and bounds.
 
-        Other robots do not count. It takes a wavefront for every robot, which is why construction does not ask.
+        Other robots do not count, of footprints the discs within. Construction does not ask, as it takes a while.
 
         Raises:
-            ValueError: If one has none; the message names all of those.
+            ValueError: If one has none, for teams with footprints where that is proved; the message names them.
         """
-        self.shortest_paths.check_reachable()
+        infeasibility.check_connected(self) if self.team.shapes else self.shortest_paths.check_reachable()
 
     @cached_property
     def digest(self) -> str:

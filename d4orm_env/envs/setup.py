@@ -93,7 +93,7 @@ class EnvSetup:
         )
         self.features = Features.of_team(self.layout, problem.team) if options.egocentric else None
         if self.along_paths:
-            problem.check_reachable()
+            problem.shortest_paths.check_reachable()
         self.region = self._region()
         self._prepare_instances(num_instances, batched, differ=not options.stochastic)
 
@@ -173,7 +173,7 @@ class EnvSetup:
                 f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes positions only"
             )
         if self.along_paths:
-            drawn.check_reachable()
+            drawn.shortest_paths.check_reachable()
         names = set(drawn.arrays._fields) - {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid", "footprints"} if self._batched else ()
         differing = self._differing(drawn, names)
         if differing:

@@ -94,10 +94,12 @@ class ShortestPaths:
             distances = sorted(
                 {f"{radius + self.problem.margin:.4g}" for radius in np.asarray(self.problem.team.radius)[robots]}
             )
+            shaped = bool(self.problem.team.shapes)
             raise ValueError(
                 f"{names} {'has' if len(robots) == 1 else 'have'} no path from start to goal that is "
-                f"{' or '.join(distances)} m clear of obstacles; move the start or the goal, open the world there, or "
-                "use a smaller radius or margin"
+                f"{' or '.join(distances)} m clear of obstacles{', for the disc round its footprint' * shaped}; move "
+                f"the start or the goal, open the world there, or use a smaller {'footprint' if shaped else 'radius'} "
+                "or margin"
             )
 
     def _look(self, points: ArrayLike) -> tuple[Floats, Floats]:

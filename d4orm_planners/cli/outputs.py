@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -102,8 +103,13 @@ def episode_rows(episode: Episode) -> list[tuple[str, str]]:
         ("robots in contact", f"{metrics['collided']:.0f}"),
         ("travel time", f"{metrics['travel_time']:.2f} s"),
         ("makespan", f"{metrics['makespan']:.2f} s"),
-        ("stretch", f"{episode.stretch:.2f}" if metrics["arrived"] else "-"),
+        ("stretch", _finite(episode.stretch)),
     ]
+
+
+def _finite(stretch: float) -> str:
+    """A stretch, or a dash where none arrived, or the discs round footprints have no path."""
+    return f"{stretch:.2f}" if math.isfinite(stretch) else "-"
 
 
 def print_plan(plan: Plan) -> None:
@@ -115,7 +121,7 @@ def print_plan(plan: Plan) -> None:
         ("iterations", f"{plan.iterations}"),
         ("travel time", f"{metrics['travel_time']:.2f} s"),
         ("makespan", f"{metrics['makespan']:.2f} s"),
-        ("stretch", f"{plan.stretch:.2f}"),
+        ("stretch", _finite(plan.stretch)),
         ("reward", f"{metrics['reward']:.3f}"),
     ]
     if not plan.solved:

@@ -125,12 +125,12 @@ class NoPaths:
 
     @classmethod
     def unless_reachable(cls, search: SolveRun) -> NoPaths | None:
-        """Return why there are no paths, if :meth:`Problem.check_reachable` knows."""
+        """Return why there are no paths, if the :attr:`Problem.shortest_paths` tell."""
         problem = search.problem
         with search.watch.paused():  # it may compile
-            _small_problem(problem, 0).check_reachable()
+            _small_problem(problem, 0).shortest_paths.check_reachable()
         try:
-            problem.check_reachable()
+            problem.shortest_paths.check_reachable()
         except ValueError as error:
             return cls(str(error), tuple(np.flatnonzero(np.isinf(problem.shortest_paths.length)).tolist()))
         return None

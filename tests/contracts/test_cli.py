@@ -46,6 +46,15 @@ def test_plan_writes_a_replay(d4orm, tmp_path: Path) -> None:
     assert "circle, 2 robots by hybrid" in (tmp_path / "plan.html").read_text(encoding="utf-8")
 
 
+def test_a_stretch_that_is_unknown_is_a_dash(capsys: pytest.CaptureFixture[str]) -> None:
+    plan = make_planner("d4orm", engine="cpu", num_samples=16, num_steps=2).solve(
+        make_problem("circle", num_robots=2, horizon=5), max_iterations=1
+    )
+    outputs.print_plan(plan)
+    row = next(line for line in capsys.readouterr().out.splitlines() if "stretch" in line)
+    assert row.split()[1:-1] == ["stretch", "│", "-"]
+
+
 @pytest.mark.slow
 def test_planning_and_running_take_the_recommended_planner(d4orm) -> None:
     assert d4orm("plan", "--num-robots", "2", "--out", "plan.npz", "--quiet").status == 0

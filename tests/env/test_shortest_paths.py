@@ -12,8 +12,9 @@ from env_support import slow
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from d4orm_env import Problem, Team, World, make_problem, rollout
+from d4orm_env import Problem, Team, World, make_problem, navigation_v0, rollout
 from d4orm_env.core.trajectory import mean_stretch, stretch
+from d4orm_env.footprints import Box
 from d4orm_env.paths.shortest_paths import shortest_paths
 from d4orm_planners import make_planner
 
@@ -199,6 +200,28 @@ def test_robots_without_a_way_are_named() -> None:
     with pytest.raises(ValueError, match=r"^robot_0 has no path .* use a smaller radius or margin$"):
         problem.select([0, 1]).check_reachable()
     problem.select([1, 3]).check_reachable()
+
+
+@pytest.mark.parametrize(("half", "reachable"), [(0.0, False), (0.1, False), (0.2, True), (0.25, True), (0.4, True)])
+def test_footprints_are_refused_where_the_discs_within_them_have_no_path(half: float, reachable: bool) -> None:
+    boxes = [[-1, -3, 1, -half], [-1, half, 1, 3]]
+    world, team = World(boxes=boxes, lower=[-4, -3], upper=[4, 3]), Team(("unicycle",), footprint=Box(0.5, 0.3))
+    problem = Problem(team, [[-2, 0, 0]], [[2, 0]], world, goal_heading=0.0)
+    assert np.isfinite(problem.shortest_paths.length[0]) == (half >= 0.4)
+    if reachable:
+        problem.check_reachable()
+        return
+    with pytest.raises(ValueError, match=r"^robot_0 has no path from start to goal, not even for the disc of 0\.15 m"):
+        problem.check_reachable()
+
+
+def test_rewards_by_the_length_of_paths_need_those_of_the_discs_round_footprints() -> None:
+    world = World(boxes=[[-1, -3, 1, -0.2], [-1, 0.2, 1, 3]], lower=[-4, -3], upper=[4, 3])
+    problem = Problem(Team(("unicycle",), footprint=Box(0.5, 0.3)), [[-2, 0, 0]], [[2, 0]], world)
+    with pytest.raises(
+        ValueError, match=r"0\.3415 m clear of obstacles, for the disc round its footprint; .* footprint or margin"
+    ):
+        navigation_v0.parallel_env(problem=problem, progress="path")
 
 
 @pytest.mark.parametrize(("slack", "passable"), [(0.02, True), (0.005, True), (-0.001, False)])
