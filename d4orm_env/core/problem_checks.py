@@ -18,7 +18,7 @@ from d4orm_env.core.arrays import (
     short_repr,
     whole_number,
 )
-from d4orm_env.core.bodies import least_gap, near_pairs, numbers_by_robot, world_gap
+from d4orm_env.core.bodies import body_poses, least_gap, near_pairs, numbers_by_robot, world_gap
 from d4orm_env.core.goal_poses import states_at_goals
 from d4orm_env.core.team import Team
 from d4orm_env.core.winding import MAX_ANGLE, MOST_TURNS
@@ -44,6 +44,8 @@ STEP_RESOLUTION = 10
 """A robot at its speed limit moves at least so many times that in one step."""
 INTEGRATION_ERROR = 2 / 15
 """Most that one step of RK4 may be off where a robot turns at its limits, as a share of the goal radius."""
+SWINGS = 32
+"""Number of hitch angles to either side that are tried for a trailer that may arrive at any."""
 
 
 def check_arrival(value: object) -> None:
@@ -90,7 +92,36 @@ def check_physics(problem: Problem) -> list[str]:
     for what, positions, states in (("start", starts, problem.start), ("goal", problem.goal, states_at_goals(problem))):
         poses = team.body_poses(states) if team.shapes else None
         found.append(check_positions(team, problem.world, what, positions, problem.margin, poses))
+    _check_hitched(problem)
     return [text for text in found if text]
+
+
+def _check_hitched(problem: Problem) -> None:
+    """Refuse goals with a heading where the first trailer without a hitch angle is in something at any."""
+    team, world, states = problem.team, problem.world, states_at_goals(problem)
+    clear = world.clearance(problem.goal) > team.radius
+    for robot, model in enumerate(team.robot_models):
+        hitches = [hitch for hitch, _ in model.trailers if np.isnan(states[robot, hitch])]
+        if not hitches or clear[robot] or np.isnan(states[robot, model.heading_index]):
+            continue
+        own = [body for body in team.bodies if body.robot == robot]
+        number = next(i for i, body in enumerate(own) if i and body.heading == hitches[0])
+        limit = dict(model.state_limits).get(hitches[0])
+        swing = np.pi if limit is None else float(team.limits[robot, limit])
+        # From one angle to the next no point moves farther.
+        doubt = swing / SWINGS * (own[number].hitch + own[number].footprint.outer_radius)
+        best = -np.inf
+        for angle in sorted(np.linspace(-swing, swing, 2 * SWINGS + 1), key=abs):
+            states[robot, hitches[0]] = angle
+            best = max(best, world_gap(world, own[number].footprint, body_poses(own, states, 2)[number]))
+            if best > -doubt:
+                break
+        else:
+            where = f"goal of robot_{robot} at {_point(problem.goal[robot])} has trailer {number}"
+            raise ValueError(
+                f"{where} {-best - doubt:.3g} m or more inside an obstacle or outside the bounds at every hitch angle "
+                f"(footprint {own[number].footprint}); move it, or change the world or goal_heading"
+            )
 
 
 def check_states(team: Team, states: FloatArray, what: str = "start", max_angle: float = float(MAX_ANGLE)) -> None:

@@ -113,3 +113,30 @@ def test_a_goal_whose_trailers_stand_in_something_is_refused(hitches: Any) -> No
     Problem(team, [[0, 3, 0, 0, 0]], [[0, 0]], goal_hitches=hitches, **poses)
     with pytest.raises(ValueError, match=r"goal of robot_0 at \(0, 0\) is .* m inside an obstacle"):
         Problem(team, [[0, 3, 0, 0, 0]], [[0, 0]], goal_hitches=[[0.0, 0.0]], **poses)
+
+
+@pytest.mark.parametrize(
+    ("box", "heading", "hitches", "refused"),
+    [
+        ([1, -1, 1.2, 1], 0.0, None, True),  # a wall across behind the car
+        ([1, -1, 1.2, 1], np.nan, None, False),
+        ([1, -1, 1.2, 1], 1.5, None, False),
+        ([1, -0.1, 1.2, 0.1], 0.0, None, False),  # bent it goes by
+        ([0.75, -1, 0.85, 1], 0.0, [[np.nan, np.nan]], False),  # in reach of the second trailer only
+        ([0.75, -1, 0.85, 1], 0.0, [[0.0, np.nan]], True),  # given the first, the second
+    ],
+)
+def test_a_goal_whose_trailer_stands_in_something_at_every_hitch_angle_is_refused(
+    box: list[float], heading: float, hitches: Any, refused: bool
+) -> None:
+    count, model = (2, "car_with_2_trailers") if hitches else (1, "car_with_1_trailer")
+    team = Team((model,), footprint=Train(Box(0.5, 0.25), [Box(0.3, 0.25)] * count))
+    world = World(boxes=[box], lower=[-2, -2], upper=[3, 3])
+    poses = {"goal_heading": heading, "goal_hitches": hitches, "horizon": 3, "margin": 0.0}
+    start = [[-0.3, -1.5, 0] + [0] * count]
+    if refused:
+        message = r"goal of robot_0 at \(1.7, 0\) has trailer \d 0.\d+ m or more inside .* at every hitch angle"
+        with pytest.raises(ValueError, match=message):
+            Problem(team, start, [[1.7, 0]], world, **poses)
+    else:
+        Problem(team, start, [[1.7, 0]], world, **poses)
