@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, model_validator
 
 from d4orm_env.core.arrays import short_repr
 from d4orm_env.core.errors import did_you_mean
@@ -60,7 +60,7 @@ class RobotEntry(Entry):
     max_acceleration: Number = 1.0
     max_turn_rate: Number = float(np.float32(np.pi / 2))
     own_limits: dict[str, Number] = Field(default_factory=dict)
-    footprint: dict[str, Any] | None = None
+    footprint: Annotated[Footprint, PlainValidator(parsed)] | None = None
     goal_heading: Number | None = None
     goal_heading_tolerance: Number = DEFAULT_TOLERANCE
     goal_hitches: Annotated[list[Number | None], Field(max_length=MOST_TRAILERS)] | None = None
@@ -180,7 +180,7 @@ class ProblemFile(Entry):
         limits = (*(() if shaped else ("radius",)), "max_speed", "max_acceleration", "max_turn_rate")
         columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
         models = tuple(robot.model for robot in self.robots)
-        shapes = [*map(_footprint, self.robots)] if shaped else None
+        shapes = [robot.footprint or Disc(robot.radius) for robot in self.robots] if shaped else None
         team = Team(models, **columns, own_limits=self._own_limits(), footprint=shapes)
         size = team.state_size  # asks every robot
         start = [state + [0.0] * (size - len(state)) for state in (robot.start_state for robot in self.robots)]
@@ -272,10 +272,6 @@ def _padded(hitches: Sequence[float | None]) -> list[float]:
     """Hitch angles, NaN for any, for as many trailers as a robot may pull."""
     given = [np.nan if hitch is None else hitch for hitch in hitches]
     return given + [np.nan] * (MOST_TRAILERS - len(given))
-
-
-def _footprint(entry: RobotEntry) -> Footprint:
-    return Disc(entry.radius) if entry.footprint is None else parsed(entry.footprint)
 
 
 def _explain(error: ValidationError) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -421,6 +422,25 @@ def test_numbers_are_those_of_yaml_1_2() -> None:
     assert parse_yaml(text) == [
         1e-4, -1e5, 0.5, 5.0, 1e21, 12, "0x1F", "0o17", "1:30", "on", "yes", True, None, "1e-4", "1_000",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("footprint", "message"),
+    [
+        ("{shape: polygon, corners: [[0, 0], [1, 0], [0.2, 0.2], [0, 1]]}", "Polygon is not convex at corner 2"),
+        ("{shape: box, length: 0.3}", "footprint box lacks width"),
+        ("{shape: disc, radius: -1}", "radius of Disc is -1; it must be positive"),
+        ("3", "footprint must be a mapping such as"),
+    ],
+)
+def test_a_bad_footprint_names_its_robot(tmp_path: Path, footprint: str, message: str) -> None:
+    robots = "".join(
+        f"  - {{model: unicycle, start: [0, {y}], goal: [2, {y}], footprint: {shape}}}\n"
+        for y, shape in ((0, "{shape: disc, radius: 0.2}"), (3, "null"), (6, footprint))
+    )
+    (tmp_path / "scene.yaml").write_text(f"version: 1\nrobots:\n{robots}")
+    with pytest.raises(ValueError, match=re.escape(f"scene.yaml: robots[2].footprint: {message}")):
+        load_problem(tmp_path / "scene.yaml")
 
 
 def test_an_empty_footprint_is_refused(tmp_path: Path) -> None:
