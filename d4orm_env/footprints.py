@@ -76,7 +76,7 @@ class Footprint(ABC):
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():  # type: ignore[call-overload] # all are dataclasses
             title = f"{name} of {type(self).__name__}"
-            if name != "offset":
+            if name != "offset" and not isinstance(value, str | bytes):
                 number = positive_number(value, title, least=SMALLEST, most=LARGEST)
             elif (
                 isinstance(value, int | float | np.number)
@@ -200,7 +200,8 @@ class Polygon(Planar):
 
     def __init__(self, corners: ArrayLike) -> None:
         try:
-            table = np.array(corners, np.float64)
+            text = any(isinstance(value, str | bytes | bool) for value in np.array(corners, object).flat)
+            table = np.array("none" if text else corners, np.float64)  # which raises
         except (TypeError, ValueError):
             raise ValueError(f"corners of Polygon must be rows of two numbers, not {short_repr(corners)}") from None
         if table.ndim != 2 or table.shape[1] != 2 or not 3 <= len(table) <= MAX_CORNERS:

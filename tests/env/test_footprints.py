@@ -211,6 +211,20 @@ def test_files_keep_footprints(tmp_path: object) -> None:
         (lambda: Box(0, 1), "length of Box is 0; it must be positive"),
         (lambda: Disc(float("nan")), "radius of Disc is nan"),
         (lambda: Capsule(1, 1, offset="x"), "offset of Capsule must be a number of metres, not 'x'"),
+        (lambda: Box("1", 0.2), "length of Box must be a number of metres, not '1'"),
+        (lambda: Box(1, b"2"), "width of Box must be a number of metres, not b'2'"),
+        (lambda: Disc("1"), "radius of Disc must be a number of metres, not '1'"),
+        (lambda: Capsule(1, "1e-1"), "radius of Capsule must be a number of metres, not '1e-1'"),
+        (lambda: Ellipsoid(1, 1, np.str_("1")), "z of Ellipsoid must be a number of metres, not "),
+        (
+            lambda: Polygon([[0, 0], [1, "0"], [0, 1]]),
+            "corners of Polygon must be rows of two numbers, not [[0, 0], [1, '0']",
+        ),
+        (
+            lambda: Polygon(np.array([["0", "0"], ["1", "0"], ["0", "1"]])),
+            "corners of Polygon must be rows of two numbers",
+        ),
+        (lambda: Polygon([[0, 0], [True, 0], [0, 1]]), "corners of Polygon must be rows of two numbers"),
         (lambda: Polygon([[0, 0], [1, 0]]), "corners of Polygon have shape (2, 2); expected (n, 2), n from 3 to 8"),
         (
             lambda: Polygon([[0, 0], [1, 0], [0.2, 0.2], [0, 1]]),
