@@ -45,6 +45,8 @@ GOAL_TOLERANCE = 0.01
 SLOWEST = 10
 """A problem's duration, in times that its robots would need straight to their goals."""
 LEAST_STEPS = 300
+HALF_TURN, FLOAT32_ERROR = 3.14159, 1e-6
+"""Largest heading that is written: not beyond pi when it is read in float32, and how exactly that is then [rad]."""
 
 KEYS, ROBOT_KEYS = ("min", "max", "obstacles"), ("type", "start", "goal")
 """Keys of their environments and robots that are read. One that looks like one of these is an error, all others are
@@ -219,6 +221,17 @@ def _check_mapping(entry: Any, what: str, *names: str) -> Any:
     return entry
 
 
+def _turn_as_theirs(headings: Floats, rates: Floats) -> None:
+    """Put headings ``(T,)`` where their Euler steps pass pi and ours do not, or the other way round, just beside pi."""
+    for step in range(1, len(headings)):
+        theirs = math.remainder(headings[step - 1] + DT * rates[step], math.tau)
+        if np.pi - abs(theirs) < FLOAT32_ERROR:  # either side of pi for them
+            headings[step - 1] -= math.copysign(10 * FLOAT32_ERROR, headings[step - 1])
+            theirs = math.remainder(headings[step - 1] + DT * rates[step], math.tau)
+        if abs(theirs - headings[step]) > np.pi and HALF_TURN - abs(headings[step]) < GOAL_TOLERANCE / 2:
+            headings[step] = math.copysign(HALF_TURN, theirs)
+
+
 def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
     """The lines of a result file: states and actions of every robot, until it rests at its goal for good."""
     known = {ours: theirs for theirs, ours in DYNAMICS.items()}
@@ -241,7 +254,9 @@ def result_lines(problem: Problem, trajectory: Trajectory) -> Iterator[str]:
         if model.heading_index is not None:
             turned = [model.heading_index, *(hitch for hitch, _ in model.trailers)]
             # Not beyond pi as it is written: their checker would turn that round.
-            states[:, turned] = np.minimum(_wrapped(states[:, turned]), 3.141592)
+            states[:, turned] = np.minimum(_wrapped(states[:, turned]), HALF_TURN)
+        if model.name == "unicycle2":
+            _turn_as_theirs(states[:, model.heading_index], states[:, model.state_names.index("turn_rate")])
         yield "-"
         for name, rows in (("states", states), ("actions", trajectory.controls[:last, robot, : model.control_size])):
             yield f"  {name}:" if len(rows) else f"  {name}: []"

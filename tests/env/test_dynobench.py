@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
-from d4orm_env import load_dynobench, load_problem, verify
+from d4orm_env import load_dynobench, load_problem, rollout, verify
 from d4orm_env.footprints import Box, Disc
+from d4orm_env.scenarios.dynobench import result_lines
 from d4orm_env.scenarios.dynobench_types import MODELS, checked_types
 from d4orm_planners import make_planner
 
@@ -251,6 +252,25 @@ def test_a_start_is_written_as_it_was_read(tmp_path: Path) -> None:
     make_planner().solve(load_dynobench(path), seed=0).to_dynobench(tmp_path / "result.yaml")
     (result,) = yaml.safe_load((tmp_path / "result.yaml").read_text())["result"]
     np.testing.assert_allclose(result["states"][0], [4, 2.5, np.pi], atol=1e-5)
+
+
+def test_headings_pass_pi_as_in_the_steps_of_their_checker(tmp_path: Path) -> None:
+    """Which compares headings without turns, in float32. The first step ends at pi."""
+    path, passed = tmp_path / "one.yaml", 0
+    robots = "robots: [{type: unicycle2_v0, start: [1, 2.5, 3.14, 0, 0], goal: [4, 2.5, 0, 0, 0]}]\n"
+    path.write_text("environment: {min: [-9, -9], max: [9, 9]}\n" + robots)
+    problem, random = load_dynobench(path), np.random.default_rng(0)
+    for _ in range(20):
+        turns = np.append(100 * (np.pi - 3.14), np.repeat(random.uniform(-0.25, 0.25, 150), 4)[1:])
+        trajectory = rollout(problem, np.stack([np.zeros(600), turns], axis=1)[:, None].astype(np.float32))
+        (result,) = yaml.safe_load("\n".join(result_lines(problem, trajectory)))["result"]
+        states, actions = (np.array(result[name], np.float32) for name in ("states", "actions"))
+        assert np.abs(states[:, 2]).max() <= np.pi
+        rate = states[:-1, 4] + 0.1 * actions[:, 1]
+        heading = (states[:-1, 2] + 0.1 * rate + np.pi) % (2 * np.pi) - np.pi
+        np.testing.assert_allclose(states[1:, 2], heading, rtol=0.01, atol=0.01)
+        passed += int((np.abs(np.diff(states[:, 2])) > np.pi).sum())
+    assert passed > 20
 
 
 def test_a_unicycle_of_second_order_is_read(tmp_path: Path) -> None:
