@@ -216,8 +216,14 @@ def _front_radius(team: Team) -> Array:
     return np.array([np.linalg.norm(body.footprint.outline(), axis=1).max() for body in fronts])
 
 
+def _rays(begin: Array, angle: Array, length: Array) -> Array:
+    """``(N, 2, 2)`` lines in the plane from points ``(N, .)``, in directions ``(N,)`` [rad]."""
+    begin = begin[:, :2].astype(np.float64)
+    return np.stack([begin, begin + length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)], axis=1)
+
+
 class TeamLayer:
-    """The robots of one panel: goals, trails, bodies, headings and contacts, drawn once and then moved.
+    """The robots of one panel: goals, trails, bodies, headings of both, contacts, drawn once and then moved.
 
     Attributes:
         artists: The matplotlib artists, in drawing order.
@@ -239,11 +245,15 @@ class TeamLayer:
         empty = np.empty((0, 4, len(panel.right)))
         self.shadows = panel.segments(empty, colors=SHADOW, linewidths=trail, zorder=1.5)
         self.goals = panel.polygons(empty, **self.hollow, linewidths=lines, zorder=3)
+        self.headed = np.flatnonzero(~np.isnan(problem.goal_heading))
+        self.goal_headings = panel.segments(empty, colors=self.colors[self.headed], linewidths=1.5 * lines, zorder=3)
         self.trails = panel.segments(empty, colors=self.colors, linewidths=trail, alpha=0.85, zorder=4)
         self.bodies = panel.polygons(empty, facecolors=self.colors, edgecolors=INK, linewidths=0.7, zorder=5)
         self.headings = panel.segments(empty, linewidths=1.6, capstyle="round", zorder=6)
         self.contacts = panel.polygons(empty, facecolors=CONTACT, edgecolors="white", linewidths=0.7, zorder=7)
-        self.artists = [self.shadows, self.goals, self.trails, self.bodies, self.headings, self.contacts]
+        self.artists = [
+            self.shadows, self.goals, self.goal_headings, self.trails, self.bodies, self.headings, self.contacts
+        ]  # fmt: skip
 
     def update(self, states: Array, arrived: Array, goals: Array, trail: Array, contacts: Array) -> None:
         """Move everything; the shapes are those of :meth:`FrameRenderer.draw`, with ``(N, d)`` contacts."""
@@ -254,6 +264,8 @@ class TeamLayer:
             floor = panel.limits[0, 2]
             self.shadows.set_segments(np.concatenate([paths[..., :2], np.full_like(paths[..., :1], floor)], axis=-1))
         self.goals.set_verts(panel.outlines(goals, 1.5 * self.radius, _DIAMOND))
+        angle = self.problem.goal_heading[self.headed].astype(np.float64)
+        self.goal_headings.set_segments(_rays(goals[self.headed], angle, 2 * self.radius[self.headed]))
         self.bodies.set_verts(self.body_outlines(states))
         shade = np.where(arrived[:, None], ARRIVED_SHADE, 1.0)
         self.bodies.set_facecolor((shade * self.colors + 1 - shade)[self.robots])
@@ -281,6 +293,4 @@ class TeamLayer:
         """``(., 2, 2)`` lines from the centre to the front of every robot that has a heading."""
         models = self.problem.team.robot_models
         angle = np.array([states[k, models[k].heading_index] for k in self.drives], np.float64)
-        front = self.radius[self.drives, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        centre = states[self.drives, :2].astype(np.float64)
-        return np.stack([centre, centre + front], axis=1)
+        return _rays(states[self.drives, :2], angle, self.radius[self.drives])

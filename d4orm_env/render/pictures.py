@@ -81,10 +81,10 @@ def plot_trajectory(
 ) -> Figure:
     """Draw a whole trajectory, to scale: the world, every robot's path, and what went wrong.
 
-    A circle in a robot's colour is its start, a diamond its goal, the filled disc where it ends (paler when it has
-    arrived), the line in it the heading of a differential drive. A star marks where a contact begins, a red disc each
-    further step of it, a pale red disc each step at which only the margin is violated. Spatial problems get a view of
-    space and a view from above.
+    A circle in a robot's colour is its start, a diamond its goal, the line out of it the goal heading, the filled disc
+    where it ends (paler when it has arrived), the line in it the heading of a differential drive. A star marks where a
+    contact begins, a red disc each further step of it, a pale red disc each step at which only the margin is violated.
+    Spatial problems get a view of space and a view from above.
 
     Args:
         problem: The problem that the trajectory belongs to.

@@ -23,7 +23,7 @@ from d4orm_env.core.trajectory import Trajectory
 from d4orm_env.core.world import World
 from d4orm_env.render import FrameRenderer, WindowRenderer, plot, plot_trajectory, save_animation, save_picture
 from d4orm_env.render.animation import frame_steps
-from d4orm_env.render.panels import CONTACT, robot_colors, view_limits
+from d4orm_env.render.panels import CONTACT, Axes2D, TeamLayer, robot_colors, view_limits
 from d4orm_env.render.pictures import contact_points
 from d4orm_planners.cli.outputs import PictureOptions
 
@@ -172,6 +172,16 @@ def test_trailers_have_their_cars_colour_and_goals_a_cars_size() -> None:
     np.testing.assert_allclose(starts.get_edgecolors()[:, :3], colors)
     goals = next(part for part in axes.collections if part.get_zorder() == 3)
     assert np.ptp(goals.get_paths()[0].vertices[:, 0]) < 4 * problem.team.bodies[0].footprint.outline().max()
+
+
+def test_goal_headings_are_drawn_where_there_are_some() -> None:
+    team, start = Team(("unicycle",) * 3), [[0, 0, 0], [0, 1, 0], [0, 2, 0]]
+    problem = Problem(team, start, [[2, 0], [2, 1], [2, 2]], goal_heading=[0.0, np.nan, np.pi / 2])
+    layer = TeamLayer(Axes2D(problem.plot(), problem, view_limits(problem)), problem)
+    layer.update(problem.start, np.zeros(3, bool), problem.goal + 1, np.empty((0, 3, 2)), np.empty((0, 2)))
+    lines = np.array(layer.goal_headings.get_segments())
+    np.testing.assert_allclose(lines, [[[3, 1], [3.3, 1]], [[3, 3], [3, 3.3]]], atol=1e-6)
+    np.testing.assert_allclose(layer.goal_headings.get_colors()[:, :3], layer.colors[[0, 2]])
 
 
 def test_view_holds_every_robot_and_a_near_bound_but_not_a_far_one() -> None:
