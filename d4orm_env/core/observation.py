@@ -40,7 +40,7 @@ def observe_robot(
     ``time_left`` is the share of the time left, 1 to 0.
     """
     d = goal.shape[1]
-    neighbors = 2 * d + 8
+    neighbors = 2 * d + 8 + _see_goal_heading(k, arrays.goal_direction, sensed.heading, 2 * d + 8, out)
     obstacles = neighbors + (2 + 2 * d) * sensed.nearest_robots.shape[0]
     _see_itself(k, arrays, goal, sensed, out)
     out[2 * d + 3] = time_left
@@ -65,6 +65,20 @@ def _see_itself(k: int, arrays: ProblemArrays, goal: FloatArray, sensed: Sensed,
     out[2 * d + 5] = arrays.radius[k]
     out[2 * d + 6] = arrays.limits[k, 0]
     out[2 * d + 7] = arrays.limits[k, 1]
+
+
+def _see_goal_heading(k: int, directions: FloatArray | None, heading: FloatArray, i: int, out: FloatArray) -> int:
+    """Fill the goal heading less the robot's own, from component ``i`` on.
+
+    Returns:
+        Number of components: none where no robot has a goal heading.
+    """
+    if directions is None:
+        return 0
+    cosine, sine = directions[k, 0], directions[k, 1]
+    out[i] = cosine * heading[k, 0] + sine * heading[k, 1]
+    out[i + 1] = sine * heading[k, 0] - cosine * heading[k, 1]
+    return 2
 
 
 def _see_robots(k: int, sensed: Sensed, i: int, out: FloatArray) -> None:

@@ -56,6 +56,8 @@ class OwnParts(NamedTuple):
     radius: slice
     max_speed: slice
     max_acceleration: slice
+    #: cosine and sine of the goal heading less its own, both zero for a robot without one; empty where no robot has one
+    goal_heading: slice
 
 
 class NeighborParts(NamedTuple):
@@ -96,6 +98,7 @@ class ObservationSlices:
     #: one: how far each reaches [m]
     num_rays: int = field(default=0, kw_only=True)
     observed_path: bool = field(default=False, kw_only=True)  #: Whether the path is there
+    goal_headings: bool = field(default=False, kw_only=True)  #: Whether goal headings are, as where any robot has one
 
     def __post_init__(self) -> None:
         for name in ("num_neighbors", "num_obstacles", "num_rays"):
@@ -105,7 +108,7 @@ class ObservationSlices:
     def own(self) -> OwnParts:
         """Slices of the observation."""
         d = self.dimension
-        return OwnParts(*_slices(d, 2, 1, d, 1, 1, 1, 1, 1))
+        return OwnParts(*_slices(d, 2, 1, d, 1, 1, 1, 1, 1, 2 * self.goal_headings))
 
     @cached_property
     def neighbor(self) -> NeighborParts:
@@ -161,6 +164,15 @@ class ObservationSlices:
         """``(..., .)`` what observations ``(..., D)`` say of the path; empty where they do not."""
         return observations[..., self.rays.stop :]
 
+    def with_goal_headings(self, observations: FloatArray, wanted: bool) -> FloatArray:
+        """Observations ``(..., D)`` with goal headings, zeros where there were none, or without."""
+        if wanted == self.goal_headings:
+            return observations
+        part = self.own.goal_heading
+        if wanted:
+            return np.insert(observations, [part.start] * 2, 0, axis=-1)
+        return np.delete(observations, part, axis=-1)
+
     @property
     def names(self) -> tuple[str, ...]:
         """One name per component, as ``neighbor_0.velocity_y``."""
@@ -209,17 +221,16 @@ class ObservationLayout(ObservationSlices):
         Raises:
             ValueError: If a number makes no sense, or the robots cannot have rays or a line of sight.
         """
-        sizes = problem.dimension, num_neighbors, num_obstacles
-        slices = ObservationSlices(*sizes, num_rays=num_rays, observed_path=observed_path)
+        sizes, turns = (problem.dimension, num_neighbors, num_obstacles), not np.isnan(problem.goal_heading).all()
+        parts: dict[str, Any] = {"num_rays": num_rays, "observed_path": observed_path, "goal_headings": turns}
         if line_of_sight and problem.dimension != 2:
             raise ValueError("line_of_sight is for the plane, and this problem is in space; leave it out")
         if num_rays and problem.dimension != 2:
             raise ValueError("rays lie in the plane, and this problem is in space; leave observed_rays out")
         number = partial(positive_number, most=LARGEST)
-        low, high = _bounds(problem, slices, slack, number(ray_range, "ray_range"))
+        low, high = _bounds(problem, ObservationSlices(*sizes, **parts), slack, number(ray_range, "ray_range"))
         limit = np.inf if communication_range is None else number(communication_range, "communication_range")
-        own: dict[str, Any] = {"num_rays": num_rays, "observed_path": observed_path, "line_of_sight": line_of_sight}
-        return cls(*sizes, low, high, communication_range=limit, **own)
+        return cls(*sizes, low, high, communication_range=limit, line_of_sight=line_of_sight, **parts)
 
     @property
     def ray_range(self) -> float:
@@ -245,7 +256,7 @@ def _bounds(problem: Problem, slices: ObservationSlices, slack: BoundsSlack, ray
     top = speed + slack.speed
     own = _ends(
         slices.own, velocity=top, heading=1, speed=top, goal=farthest, time_left=1, arrived=1, radius=radius,
-        max_speed=speed, max_acceleration=acceleration,
+        max_speed=speed, max_acceleration=acceleration, goal_heading=1,
     )  # fmt: skip
     neighbor = _ends(
         slices.neighbor, present=1, position=farthest, velocity=2 * top, radius=max(radius, slack.radius)
@@ -274,5 +285,5 @@ def _slices(*widths: int) -> Iterator[slice]:
 def _component_names(parts: Parts) -> Iterator[str]:
     for name, part in zip(parts._fields, parts, strict=True):
         width = part.stop - part.start
-        suffixes = ("_cos", "_sin") if name == "heading" else ("",) if width == 1 else ("_x", "_y", "_z")[:width]
-        yield from (name + suffix for suffix in suffixes)
+        several = ("_cos", "_sin") if name.endswith("heading") else ("_x", "_y", "_z")
+        yield from (name + suffix for suffix in (("",) if width == 1 else several[:width]))

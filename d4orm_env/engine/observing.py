@@ -26,6 +26,7 @@ from d4orm_env.engine.world_tiles import WorldArrays, load
 for _function in (
     observation.observe_robot,
     observation._see_itself,
+    observation._see_goal_heading,
     observation._see_robots,
     observation._see_obstacles,
     observation.insert_nearest,

@@ -172,6 +172,11 @@ class EnvSetup:
                 f"the instance drawn from scenario {drawn.name!r} has another team or lies outside "
                 f"{region.tolist()} m, where the state space ends; use a scenario whose seed changes positions only"
             )
+        if (drawn.arrays.goal_direction is None) == self.layout.goal_headings:
+            raise ValueError(
+                f"instances of scenario {drawn.name!r} differ in whether any robot has a goal heading, by which "
+                "observations differ; give a goal_heading to some robot of every instance, or to none"
+            )
         if self.along_paths:
             drawn.shortest_paths.check_reachable()
         names = set(drawn.arrays._fields) - {*OWN_ARRAYS, *_WORLD_ARRAYS, "grid", "footprints"} if self._batched else ()

@@ -46,6 +46,7 @@ def observe_team(
         arrays.radius,
         arrays.limits[:, 0],
         arrays.limits[:, 1],
+        *(_goal_heading(arrays, heading) if layout.goal_headings else ()),
         *_neighbors(arrays, position, velocity, layout),
         *_obstacles(arrays, position, layout.num_obstacles),
         *cast_rays(arrays, world.state, position, heading, layout),
@@ -72,6 +73,13 @@ def _motion(models: tuple[str, ...], arrays: ProblemArrays, world: Worlds) -> tu
             angle = x[model.heading_index]
             heading = [jnp.where(own, turn(angle), old) for turn, old in zip((jnp.cos, jnp.sin), heading)]
     return velocity, heading
+
+
+def _goal_heading(arrays: ProblemArrays, heading: Columns) -> Columns:
+    """Cosine and sine of the goal headings less robots' own, zeros for robots without one."""
+    directions = jnp.asarray(arrays.goal_direction)
+    (own_cosine, own_sine), (cosine, sine) = heading, (directions[:, 0], directions[:, 1])
+    return [cosine * own_cosine + sine * own_sine, sine * own_cosine - cosine * own_sine]
 
 
 class _Nearest(NamedTuple):
