@@ -204,7 +204,8 @@ class _ImitationRun:
         env = navigation_v0.parallel_env(instances, settings.num_robots, **settings.options)
         expert = make_policy(settings.expert, **settings.all_expert_settings)
         seed = derived_seed(settings.seed, Stream.DEMONSTRATIONS, index, episode)
-        record_samples(env, expert, seed, self._network(index).controls if index else None).save(path)
+        learner, turns = self._network(index).controls if index else None, settings.goal_headings
+        record_samples(env, expert, seed, learner, goal_headings=turns).save(path)
         env.close()
 
     def _samples(self, last: int) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
@@ -229,7 +230,9 @@ class _ImitationRun:
         return episodes
 
 
-def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None) -> Samples:
+def record_samples(
+    env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None, *, goal_headings: bool = False
+) -> Samples:
     """Run an episode and ask the expert at every step what to do.
 
     Args:
@@ -238,6 +241,7 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver 
         seed: Seeds both.
         learner: Policy that drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the
             expert. With a learner the expert is asked where that has led the team.
+        goal_headings: Whether the samples and the learner have goal headings, zeros where there are none.
 
     Returns:
         What the robots saw until they arrived, and what the expert said.
@@ -247,7 +251,7 @@ def record_samples(env: ParallelEnv, expert: Policy, seed: int, learner: Driver 
     limits, parts = env.unwrapped.problem.team.control_limits, []
     while env.agents:
         acting = {agent: observations[agent] for agent in env.agents}
-        seen = np.stack(list(acting.values()))
+        seen = env.unwrapped.layout.with_goal_headings(np.stack(list(acting.values())), goal_headings)
         asked = expert.act(acting, env.state())
         own = limits[robot_indices(acting)]
         controls = as_float32([asked[agent] for agent in acting])

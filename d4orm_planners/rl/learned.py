@@ -128,7 +128,7 @@ class LearnedPolicy(Policy):
             return
         options = env.unwrapped.options
         self._check_sensors(self._actor.header, range_sensors(options.observed_rays, options.ray_range))
-        self._seen_shape = env.observation_space(env.possible_agents[0]).shape
+        self._seen_shape, self._layout = env.observation_space(env.possible_agents[0]).shape, env.unwrapped.layout
         self._check_team(self._actor, self._seen_shape)
         hiding = options.communication_range is not None or options.line_of_sight
         self._detours = Detours(self.problem) if self.config.detours and not hiding else None
@@ -149,7 +149,8 @@ class LearnedPolicy(Policy):
                 f"the policy in {self._path.name} was trained for {header.model} robots, and this team has "
                 f"{', '.join(sorted(models))}; train one for them with 'd4orm train --model'"
             )
-        if len(observation_shape) != 1 or network.features_for(observation_shape[0]) is None:
+        fitted = self._as_trained(network, np.zeros((1, *observation_shape), np.float32)).shape[1:]
+        if len(fitted) != 1 or network.features_for(fitted[0]) is None:
             robots = f"observed_robots={header.num_neighbors}" if header.encoder is None else "any observed_robots"
             raise ValueError(
                 f"the policy in {self._path.name} was trained for observations of {network.features.slices.size} "
@@ -157,13 +158,20 @@ class LearnedPolicy(Policy):
                 f"observed_obstacles={header.num_obstacles}, and do not wrap its observations"
             )
 
+    def _as_trained(self, network: Network, seen: FloatArray) -> FloatArray:
+        """Return observations ``(N, D)`` with goal headings, zeros where there are none, or without, as in training."""
+        if seen.shape[1:] != (self._layout.size,):  # of a wrapper
+            return seen
+        return self._layout.with_goal_headings(seen, bool(network.header.goal_headings))
+
     def act(self, observations: Observations, state: FloatArray) -> Actions:
         robots = acting_robots(self, observations)
         if not observations:
             return {}
         if isinstance(self._actor, SharedPolicy):
             return self._actor.act(observations, state)
-        seen, joint = stacked_observations(observations, self._seen_shape), split_state(self.problem, state)
+        seen = self._as_trained(self._actor, stacked_observations(observations, self._seen_shape))
+        joint = split_state(self.problem, state)
         self._look_along_paths(self._actor, robots, seen, joint)
         controls = self._actor.controls(seen, self.problem.team.control_limits[robots])
         if not self._actor.header.brakes:

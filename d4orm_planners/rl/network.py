@@ -54,6 +54,8 @@ class Header(BaseModel):
     activation: str  #: Between the layers
     squashed: bool  #: Whether the output goes through tanh
     layers: int = Field(ge=1, le=16)  #: Number of layers; those of sets come before them and are not counted
+    #: Whether it reads goal headings; ``None`` is not, and it acts as if there were none
+    goal_headings: Literal[True] | None = None
     #: ``"sets"`` if neighbours and obstacles are pooled first, see :mod:`d4orm_planners.rl.network`. Such a policy
     #: acts for any number of observed robots
     encoder: Literal["sets"] | None = None
@@ -77,7 +79,7 @@ class Header(BaseModel):
 
     def text(self) -> str:
         """Return it as JSON, which earlier versions read where it says nothing that they do not know."""
-        optional = ("num_rays", "ray_range", "encoder", "frame", "shortest_paths", "brakes")
+        optional = ("num_rays", "ray_range", "goal_headings", "encoder", "frame", "shortest_paths", "brakes")
         unsaid = {name for name in optional if getattr(self, name) is None}
         return self.model_dump_json(exclude=unsaid)
 
@@ -105,9 +107,9 @@ class Network:
     def features(self) -> Features:
         """Features that it sees."""
         head = self.header
-        sizes = head.dimension, head.num_neighbors, head.num_obstacles
-        features = Features.of(ObservationSlices(*sizes, num_rays=head.num_rays or 0), head.model)
-        return replace(features, frame=head.frame or "goal")
+        sizes, turns = (head.dimension, head.num_neighbors, head.num_obstacles), bool(head.goal_headings)
+        slices = ObservationSlices(*sizes, num_rays=head.num_rays or 0, goal_headings=turns)
+        return replace(Features.of(slices, head.model), frame=head.frame or "goal")
 
     @property
     def training_time(self) -> float | None:

@@ -105,6 +105,7 @@ class RobotVecEnv(SharedVecEnv):
             that of each world.
         shortest_paths: Whether robots see their goals along their shortest paths, see :meth:`Features.along`, and
             are paid for progress along these.
+        goal_headings: Whether robots see goal headings, zeros where the problem has none; ``None`` is where it has.
         **kwargs: Further arguments of :class:`d4orm_env.envs.vector_env.NavigationVectorEnv`.
 
     Attributes:
@@ -128,6 +129,7 @@ class RobotVecEnv(SharedVecEnv):
         reward: str | RewardFunction = "training",
         max_observed: int | Sequence[int | None] | None = None,
         shortest_paths: bool = False,
+        goal_headings: bool | None = None,
         **kwargs: Any,
     ) -> None:
         kwargs |= {"reward": reward, "observed_path": shortest_paths, "autoreset_mode": "SameStep"}
@@ -138,7 +140,8 @@ class RobotVecEnv(SharedVecEnv):
         _check_learnable(problem)
         self.problem = problem
         sizes = layout.dimension, layout.num_neighbors, layout.num_obstacles
-        slices = ObservationSlices(*sizes, num_rays=layout.num_rays)
+        turns = layout.goal_headings if goal_headings is None else goal_headings
+        slices = ObservationSlices(*sizes, num_rays=layout.num_rays, goal_headings=turns)
         self.features = Features.of(slices, problem.team.models[0])
         self.shortest_paths = shortest_paths
         self.num_worlds = num_worlds
@@ -200,8 +203,8 @@ class RobotVecEnv(SharedVecEnv):
     def encoded(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Features ``(N, F)`` and frames ``(N, 2)`` of what robots of any such worlds see ``(N, .)``."""
         if self.shortest_paths:
-            seen, path = seen[:, : self.features.slices.size].copy(), self._env.layout.paths(seen)
-            parts = self._env.layout.path
+            slices = self.features.slices
+            seen, path, parts = seen[:, : slices.size].copy(), slices.paths(seen), slices.path
             self.features.along(seen, path[:, parts.direction], path[:, parts.length][:, 0])
         return self.features.encode(seen)
 
@@ -226,6 +229,7 @@ class RobotVecEnv(SharedVecEnv):
         """Return what the robots are to see now, and what those whose episodes have ended saw last."""
         seen = observations.reshape(self.num_envs, -1)
         seen = np.concatenate([seen, last]) if last else seen
+        seen = self._env.layout.with_goal_headings(seen, self.features.slices.goal_headings)
         if self._hidden.any():
             seen, ended = seen if last else seen.copy(), self._finishing @ [self._shape[1], 1]
             self.features.slices.neighbors(seen)[np.concatenate([self._hidden, self._hidden[ended]])] = 0

@@ -82,6 +82,11 @@ class TrainConfig(CheckedSettings):
         """Arguments of environments: here, which range sensors the robots have."""
         return {"observed_rays": self.observed_rays, "ray_range": self.ray_range}
 
+    @cached_property
+    def goal_headings(self) -> bool:
+        """Whether any robot has a goal heading: then all observe theirs, in worlds without any too."""
+        return not np.isnan(self._example().goal_heading).all()
+
     def task(self, scenario: str, num_robots: int) -> TrainTask:
         """The same scenario with a team of that size."""
         return TrainTask(scenario, num_robots, self.scenario_settings if scenario == self.scenario else {})
@@ -97,7 +102,8 @@ class TrainConfig(CheckedSettings):
             ValueError: If one policy cannot be learned for the team.
         """
         task = self.task(self.scenario, self.num_robots)
-        return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **self.options)
+        options = {**self.options, "goal_headings": self.goal_headings}
+        return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **options)
 
     def header(self, algorithm: str, worlds: RobotVecEnv | MixedVecEnv, **training: object) -> dict[str, object]:
         """Return the header of a policy file: what a model does not tell."""
@@ -110,6 +116,7 @@ class TrainConfig(CheckedSettings):
             "num_obstacles": slices.num_obstacles,
             "num_rays": slices.num_rays or None,
             "ray_range": self.ray_range if slices.num_rays else None,
+            "goal_headings": slices.goal_headings or None,
             "frame": None if frame == "goal" else frame,
             "shortest_paths": worlds.shortest_paths or None,
             "brakes": bool(np.isfinite(worlds.problem.goal_speed).any()) or None,
@@ -220,6 +227,12 @@ class TrainingSettings(TrainConfig):
         """The parts of the mixture."""
         return parse_mixture(self.mixture)
 
+    @cached_property
+    def goal_headings(self) -> bool:
+        if not self.mixture:
+            return super().goal_headings
+        return any(not np.isnan(task.problem(0, self.model).goal_heading).all() for task in self.tasks)
+
     @property
     def reward(self) -> TrainingReward:
         """Reward to learn from."""
@@ -259,6 +272,7 @@ class TrainingSettings(TrainConfig):
                 and new ones added when they are drawn.
         """
         seed, drawn, parts = derived_seed(self.seed, Stream.TRAINING_WORLDS, number), {} if drawn is None else drawn, []
+        options = {**self.options, "goal_headings": self.goal_headings}
         for part, (task, max_observed, model) in enumerate(self.parts(stage)):
             count = len(max_observed)
             size = min(_INSTANCES, 2 * count)
@@ -269,13 +283,14 @@ class TrainingSettings(TrainConfig):
             drawn[key] = {own: problem for own, problem in drawn.get(key, {}).items() if own in seeds}
             instances = Instances(partial(task.problem, model=model), seeds, drawn[key])
             own_seed = derived_seed(seed, Stream.TRAINING_WORLDS, part)
-            parts.append(task.worlds(max_observed, own_seed, instances, model, **self.options))
+            parts.append(task.worlds(max_observed, own_seed, instances, model, **options))
         return MixedVecEnv(parts) if self.mixture else parts[0]
 
     def validation(self) -> RobotVecEnv | MixedVecEnv:
         if not self.mixture:
             return super().validation()
-        count, options = -(-self.validation_worlds // len(self.tasks)), self.options
+        count = -(-self.validation_worlds // len(self.tasks))
+        options = {**self.options, "goal_headings": self.goal_headings}
         return MixedVecEnv([part.validation(count, VALIDATION_SEED, self.model, **options) for part in self.tasks])
 
     @property
