@@ -47,6 +47,10 @@ def mixture(models: tuple[str, ...]) -> Problem:
 
 CASES: dict[str, tuple[str, Callable[[], Problem]]] = {
     **{" ".join(models): ("paper", partial(mixture, models)) for models in MIXTURES},
+    "goal headings": (
+        "training",
+        lambda: mixture(MIXTURES[0]).replace(goal_heading=[np.nan, 2.0, np.nan, np.nan]),
+    ),
     "space": ("paper", lambda: apart(make_problem("sphere", num_robots=2))),
     "boxes": ("training", lambda: apart(make_problem("four_obstacles", num_robots=3))),
     "triangles": ("training", lambda: apart(make_problem("circle", num_robots=2)).replace(world=TRIANGLES)),

@@ -293,8 +293,10 @@ def test_the_nearest_obstacles_are_found_from_any_distance(name: str) -> None:
         np.testing.assert_array_equal(*seen)
 
 
-def test_the_plain_function_and_the_compiled_one_agree() -> None:
-    problem = mixed_problem().replace(world=World(2, circles=[[5, 5, 1]], boxes=[[-4, -4, -3, -3]]))
+@pytest.mark.parametrize("goal_heading", [None, [math.nan, 2.0, math.nan]])
+def test_the_plain_function_and_the_compiled_one_agree(goal_heading: Any) -> None:
+    world = World(2, circles=[[5, 5, 1]], boxes=[[-4, -4, -3, -3]])
+    problem = mixed_problem().replace(goal_heading=goal_heading, world=world)
     layout = ObservationLayout.for_problem(problem, 3, 3)
     controls = random_controls(problem, 0)[0]
     compiled = observe_team(problem.arrays, layout, problem.start, controls, np.zeros(3, bool), 0.5)
