@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from d4orm_env.core.arrays import BoolArray, FloatArray, Floats, IntArray, short_repr
 from d4orm_env.core.problem import Problem
 from d4orm_planners.tracking.reference_feedback import ActuatorLag
-from d4orm_planners.tracking.steering import integrated, limit_controls, rates, short_way_round
+from d4orm_planners.tracking.steering import limit_controls, rates, short_way_round
 
 GAIN = 0.1
 """Share of a step's residual that goes into the estimate."""
@@ -135,7 +135,7 @@ class DisturbanceObserver:
             after: ``(K, n)`` states of the models after the step.
             controls: ``(K, m)`` of the models.
         """
-        swallowed = (after - integrated(self.problem, before, controls)) / np.float32(self.problem.dt)
+        swallowed = (after - before) / np.float32(self.problem.dt) - rates(self.problem, before, controls)
         return controls + np.einsum("kn,knm->km", swallowed, self._summed)
 
     def compensated(self, controls: FloatArray, resting: BoolArray) -> FloatArray:
