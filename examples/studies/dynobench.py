@@ -6,11 +6,13 @@
 
 A row for each file, or for all that one generator drew of one size: how many runs solved them within a minute of
 planning, compilation not counted, how long that took, and how long robots are under way; medians of those that solved
-it. Files that `load_dynobench` refuses have the reason in their row of the trials.
+it. Files that `load_dynobench` refuses have the reason in their row of the trials. Beside them is what db-CBS itself
+did, measured apart (`data/db_cbs.csv`).
 """
 
 from __future__ import annotations
 
+import csv
 import re
 import warnings
 from collections.abc import Callable
@@ -36,6 +38,8 @@ A row for each map's kind and number of cars, of the first files of each folder;
 """Description of the study of cars."""
 LIMIT = 60.0
 """Time to plan [s]."""
+RIVAL = Path(__file__).parent / "data" / "db_cbs.csv"
+"""Runs of db-CBS by its own code and settings, one of an instance; see the data's README."""
 
 
 def loaded(path: Path, load: Callable[[Path], Problem]) -> Problem | str:
@@ -80,7 +84,26 @@ def main() -> None:
     # Without the number of one that was drawn.
     accepted = [row | {"kind": re.sub(r"(_n\d+)_\d+", r"\1", row["instance"])} for row in rows if not row["refused"]]
     kinds = grouped(accepted, "benchmark", "kind")
-    save_table([described(*kind, own) for kind, own in kinds.items()], arguments.out / "dynobench.csv")
+    table = [described(*kind, own) | beside_rival(own) for kind, own in kinds.items()]
+    save_table(table, arguments.out / "dynobench.csv")
+
+
+def beside_rival(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Columns of what db-CBS did: solved, seconds of the processor, and our costs by its where both solved."""
+    instances = {row["instance"] for row in rows if row["benchmark"] == "db-CBS"}
+    with RIVAL.open(encoding="utf-8", newline="") as file:
+        runs = [run for run in csv.DictReader(file) if run["instance"] in instances]
+    solved = [run for run in runs if run["solved"] == "True"]
+    seconds = [float(run["seconds"]) for run in solved]
+    costs = {run["instance"]: float(run["sum_of_costs"]) for run in solved}
+    ratios = [
+        row["sum_of_costs"] / costs[row["instance"]] for row in rows if row["solved"] and row["instance"] in costs
+    ]
+    return {
+        "db-CBS": f"{len(solved)} of {len(runs)}" if runs else "-",
+        "its planning [s]": f"{np.median(seconds):.1f}" if seconds else "-",
+        "costs by its": f"{np.median(ratios):.2f}" if ratios else "-",
+    }
 
 
 def described(benchmark: str, kind: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
