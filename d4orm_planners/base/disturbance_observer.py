@@ -16,9 +16,10 @@ MOST = 0.5
 """Largest estimate, as a share of the control's limit: the rest is needed to steer."""
 LAGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 """Time constants that are told apart where none is given, in time steps."""
-KEPT, STEPS, BETTER = 0.97, 15, 0.6
-"""Share of what is known of them that a step keeps, steps after which they are compared, and by how much less residual
-another one than the present must explain what robots did."""
+KEPT, STEPS, BETTER, DRIVEN = 0.95, 15, 0.6, 0.2
+"""Share of what is known of them that a step keeps, steps after which they are compared, the share of its residual with
+which another one than the present must explain what robots did, and the deviation that their controls must have had, as
+a share of their limits: those of robots at rest answer to noise."""
 
 
 def check_lag(lag: ArrayLike) -> ArrayLike:
@@ -205,7 +206,8 @@ class LagFinder:
         fitted = np.divide((xy - x * y) ** 2, spread, out=np.zeros_like(spread), where=spread > 0)
         left = (yy - y * y - fitted).sum(axis=2)
         best, rows = left.argmin(axis=0), np.arange(len(self.constants))
-        enough = weight[0, :, 0] > (1 - KEPT**STEPS) / (1 - KEPT)
+        driven = spread[0] > (DRIVEN * self._problem.team.control_limits.astype(np.float64)) ** 2
+        enough = (weight[0, :, 0] > (1 - KEPT**STEPS) / (1 - KEPT)) & driven.any(axis=1)
         better = enough & (left[best, rows] < BETTER * left[self._present, rows])
         self.constants = np.where(better, np.array(LAGS)[best] * self._problem.dt, self.constants)
         return bool(better.any())

@@ -84,7 +84,7 @@ def test_a_lag_that_nobody_told_is_found(model: str) -> None:
 
 
 def test_no_lag_is_found_where_there_is_none() -> None:
-    for disturbances in ([StateNoise(0.01, 0.1)], [Gain(0.85)], [Bias(0.1)]):
+    for disturbances in ([StateNoise(0.01, 0.1)], [ControlNoise(0.2)], [Bias(0.1)]):
         controller = Controller("d4orm-c2f", mode="measured", refine="sync")
         driven(controller, team("holonomic2d"), disturbances)
         np.testing.assert_array_equal(controller.lag, 0)
