@@ -208,7 +208,7 @@ class Controller:
 
     @property
     def lag(self) -> Floats:
-        """``(K,)`` time constants of the actuators, given or found [s]."""
+        """``(K,)`` time constants of the actuators [s], given or, since :meth:`begin`, found."""
         return self._observer.lag.constants
 
     @property
