@@ -58,7 +58,8 @@ class DisturbanceObserver:
 
     def __init__(self, problem: Problem, lag: ArrayLike | None = 0.0) -> None:
         self.problem, count, d = problem, problem.num_robots, problem.dimension
-        self._finder = LagFinder(problem) if lag is None else None
+        self._summed = _summed_controls(problem)
+        self._finder = LagFinder(problem, self._summed) if lag is None else None
         lag = 0.0 if lag is None else lag
         given: Floats = np.asarray(check_lag(lag), np.float64)
         if given.shape not in ((), (1,), (count,)):
@@ -67,7 +68,6 @@ class DisturbanceObserver:
         names = problem.team.models
         columns = {"holonomic2d": range(d, 2 * d), "holonomic3d": range(d, 2 * d), "velocity2d": range(d)}
         self._observed: BoolArray = np.array([name in columns for name in names])
-        self._summed = _summed_controls(problem)
         self._columns = np.array([columns.get(name, range(d)) for name in names])
         self._most = MOST * problem.team.control_limits[:, :d].astype(np.float64)
         fastest = np.where([name == "velocity2d" for name in names], np.inf, problem.team.max_speed.astype(np.float64))
@@ -160,13 +160,14 @@ class LagFinder:
 
     Args:
         problem: The team.
+        summed: ``(K, n, m)`` which states are sums of which controls, see :func:`_summed_controls`.
 
     Attributes:
         constants: ``(K,)`` time constants found so far [s].
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self._problem, self._summed, count = problem, _summed_controls(problem), problem.num_robots
+    def __init__(self, problem: Problem, summed: FloatArray) -> None:
+        self._problem, self._summed, count = problem, summed, problem.num_robots
         self._lags = [ActuatorLag(np.full(count, steps * problem.dt), problem.dt) for steps in LAGS]
         self._applied = np.zeros((len(LAGS), count, problem.control_size))
         self._means = self._applied.copy()

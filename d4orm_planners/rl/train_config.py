@@ -84,7 +84,7 @@ class TrainConfig(CheckedSettings):
 
     @cached_property
     def goal_headings(self) -> bool:
-        """Whether any robot has a goal heading: then all observe theirs, in worlds without any too."""
+        """True if any robot has a goal heading: then all observe theirs, in worlds without any too."""
         return not np.isnan(self._example().goal_heading).all()
 
     def task(self, scenario: str, num_robots: int) -> TrainTask:

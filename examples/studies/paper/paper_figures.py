@@ -118,6 +118,11 @@ def _ipopt() -> Figure:
     )
 
 
+BIG_TEAMS_METRICS = (
+    "success", "runtime", "runtime_restricted", "first_steps", "first_steps_restricted", "travel_time", "step_time"
+)  # fmt: skip
+
+
 def _big_teams() -> Figure:
     policies = {**DENOISERS, **BOTH_C2F}
     random: Environment = ("2D Holo Random", "paper_random", None)
@@ -133,15 +138,7 @@ def _big_teams() -> Figure:
             *_sections(policies, hundred, num_robots=(100,), scenario_settings=AS_IN_THE_PAPER, **few),
         ),
         across="num_robots",
-        metrics=(
-            "success",
-            "runtime",
-            "runtime_restricted",
-            "first_steps",
-            "first_steps_restricted",
-            "travel_time",
-            "step_time",
-        ),
+        metrics=BIG_TEAMS_METRICS,
         plots=("runtime", "travel_time", "success", "survival"),
         deadlines=(1, 2, 10, 30),
         reference="d4orm",
@@ -162,7 +159,7 @@ def _big_teams() -> Figure:
     )
 
 
-def _robustness() -> Figure:
+def _noise() -> Figure:
     policies = {**BOTH_C2F, "d4orm-d": PAPER, "hybrid, ours": {"policy": "hybrid"}}
     levels = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
     return Figure(
@@ -299,15 +296,7 @@ def _distributed() -> tuple[Figure, Figure]:
         source="section VIII-D, figure of D-D4orm, upper row",
         sections=_sections({**alone, **nodes}, *environments, num_robots=SIZES, quick_robots=(2, 3)),
         across="num_robots",
-        metrics=(
-            "success",
-            "iterations",
-            "iterations_restricted",
-            "runtime",
-            "waiting_share",
-            "messages",
-            "message_bytes",
-        ),
+        metrics=DISTRIBUTED_METRICS,
         plots=("iterations", "runtime", "success", "waiting_share"),
         reference="top-k",
         compared_by="iterations",
@@ -330,6 +319,9 @@ def _distributed() -> tuple[Figure, Figure]:
     return selections, numbers
 
 
+DISTRIBUTED_METRICS = (
+    "success", "iterations", "iterations_restricted", "runtime", "waiting_share", "messages", "message_bytes"
+)  # fmt: skip
 DISTRIBUTED_REMARKS = (
     "The paper shows iterations to the first solution, in a plot without numbers in its text. The policies without "
     "`ours` have its parameters, and 20 iterations.",
@@ -342,7 +334,7 @@ DISTRIBUTED_REMARKS = (
 FIGURES: Mapping[str, Figure] = MappingProxyType({
     figure.name: figure
     for figure in (
-        _team_size(), _ipopt(), _big_teams(), _robustness(), _coarseness(), _noise_schedule(), _amswarm(),
+        _team_size(), _ipopt(), _big_teams(), _noise(), _coarseness(), _noise_schedule(), _amswarm(),
         *_distributed(),
     )
 })  # fmt: skip
