@@ -136,14 +136,11 @@ def place_team(f: FootprintArrays | None, num_robots: int, w: FloatArray) -> Non
 
 
 class TeamBoxes(NamedTuple):
-    """Boxes round the positions of a team's robots in a tile, by which pairs that are far apart are left out.
+    """Boxes round the positions of a team's robots in a tile, by which pairs that are far apart are left out."""
 
-    Attributes:
-        corners: ``(K, 2, d)`` float32 lowest and highest positions [m]; ``(0, 2, d)`` for a team that is not big.
-        order: ``(K,)`` int64 numbers of the robots, of a big team by where its boxes begin along the first axis.
-    """
-
+    #: ``(K, 2, d)`` float32 lowest and highest positions [m]; ``(0, 2, d)`` for a team that is not big
     corners: FloatArray
+    #: ``(K,)`` int64 numbers of the robots, of a big team by where its boxes begin along the first axis
     order: IntArray
 
 

@@ -192,12 +192,9 @@ class BaseEnv:
     """A simulation, read and drawn; how it is reset and stepped is up to the environment.
 
     Before the first reset all that asks about an episode is a ``RuntimeError``.
-
-    Attributes:
-        options: Options that it was made of.
     """
 
-    options: EnvOptions
+    options: EnvOptions  #: Options that it was made of
     metadata: dict[str, object]
     render_mode: str | None
 

@@ -42,34 +42,25 @@ def moving_robots(team: Team, states: FloatArray) -> MovingObstacles:
 
 @dataclass(frozen=True, eq=False)
 class SamplingTask:
-    """Distribution to sample from, and rules to score by.
+    """Distribution to sample from, and rules to score by."""
 
-    Attributes:
-        problem: The robots that are sampled, their world and horizon.
-        base: ``(H, K, m)`` controls that the sampled deformation is added to; zeros to sample controls themselves.
-        collisions: Whether robots are penalised for coming near each other and near ``moving``.
-        credit: ``"team"`` weights samples by the mean reward of the team (the paper), ``"robot"`` weights each robot's
-            part of a sample by that robot's own reward.
-        moving: Bodies to avoid that are not sampled, or ``None``.
-        arrived: ``(K,)`` robots arrived from the beginning, or ``None`` for none.
-        penalty: Factor of the problem's collision penalty: of all robots, or ``(K,)`` of each.
-        penalty_per_pair: Whether a robot pays for every robot and moving body that it is near, not once for all.
-        noise_factor: Factors on the noise of the first step that go with ``(H, K, m)``: zero for robots that are not
-            sampled, so that their base stays.
-        reference_distance: Distances count relative to the initial one (paper, section III-D), or to this if that is
-            less: a robot that starts next to its goal then loses no more by waiting than others do. ``None`` for the
-            paper's.
-    """
-
-    problem: Problem
+    problem: Problem  #: The robots that are sampled, their world and horizon
+    #: ``(H, K, m)`` controls that the sampled deformation is added to; zeros to sample controls themselves
     base: FloatArray
-    collisions: bool = True
+    collisions: bool = True  #: Whether robots are penalised for coming near each other and near ``moving``
+    #: ``"team"`` weights samples by the mean reward of the team (the paper), ``"robot"`` weights each robot's part of a
+    #: sample by that robot's own reward
     credit: str = "team"
-    moving: MovingObstacles | None = None
-    arrived: BoolArray | None = None
-    penalty: float | FloatArray = 1.0
+    moving: MovingObstacles | None = None  #: Bodies to avoid that are not sampled, or ``None``
+    arrived: BoolArray | None = None  #: ``(K,)`` robots arrived from the beginning, or ``None`` for none
+    penalty: float | FloatArray = 1.0  #: Factor of the problem's collision penalty: of all robots, or ``(K,)`` of each
+    #: Whether a robot pays for every robot and moving body that it is near, not once for all
     penalty_per_pair: bool = False
+    #: Factors on the noise of the first step that go with ``(H, K, m)``: zero for robots that are not sampled, so that
+    #: their base stays
     noise_factor: float | FloatArray = 1.0
+    #: Distances count relative to the initial one (paper, section III-D), or to this if that is less: a robot that
+    #: starts next to its goal then loses no more by waiting than others do. ``None`` for the paper's.
     reference_distance: float | None = None
 
     @property
@@ -99,56 +90,42 @@ Rule: TypeAlias = Callable[..., Any]
 
 
 class SamplingRules(NamedTuple):
-    """The rules that tell one sampling method from another: pure functions of arrays, in NumPy or JAX alike.
+    """The rules that tell one sampling method from another: pure functions of arrays, in NumPy or JAX alike."""
 
-    Attributes:
-        weights: ``(rewards, array library) -> weights``: from ``(1, M)`` or ``(K, M)`` rewards to weights that sum to
-            one over the last axis. Rewards that are not finite arrive as minus infinity and must get weight zero.
-        adapt: ``(mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)`` factors on
-            the schedule, the deviation being in units; ``None`` leaves the schedule alone and saves the second moment.
-        importance: Share of the importance-sampling term of MPPI (paper, Eq. 11) in the weights: ``weights`` then gets
-            it as ``log_ratio``, like the rewards in shape. It is the logarithm of how much likelier a sample ``U``
-            would be around zero than around ``U_hat``, the mean that it was drawn around, but for a constant:
-            ``-U_hat / sigma^2 * (U - U_hat)``, summed over time and components, and over robots for team credit.
-    """
-
+    #: ``(rewards, array library) -> weights``: from ``(1, M)`` or ``(K, M)`` rewards to weights that sum to one over
+    #: the last axis. Rewards that are not finite arrive as minus infinity and must get weight zero.
     weights: Rule
+    #: ``(mean square deviation, array library) -> noise``: the noise of the next step, ``(H, K, m)`` factors on the
+    #: schedule, the deviation being in units; ``None`` leaves the schedule alone and saves the second moment
     adapt: Rule | None = None
+    #: Share of the importance-sampling term of MPPI (paper, Eq. 11) in the weights: ``weights`` then gets it as
+    #: ``log_ratio``, like the rewards in shape. It is the logarithm of how much likelier a sample ``U`` would be around
+    #: zero than around ``U_hat``, the mean that it was drawn around, but for a constant:
+    #: ``-U_hat / sigma^2 * (U - U_hat)``, summed over time and components, and over robots for team credit.
     importance: float = 0.0
 
 
 class SamplingResult(NamedTuple):
-    """One denoising run.
+    """One denoising run."""
 
-    Attributes:
-        mean: ``(H, K, m)`` the last weighted mean of the deformations.
-        rewards: ``(N,)`` mean reward of the samples at each step done: fewer than asked for where the run was stopped.
-        excluded: Samples left out because their reward was not finite.
-        noise_factor: Factors on the noise that a next step would have, that go with ``(H, K, m)``.
-    """
-
-    mean: FloatArray
+    mean: FloatArray  #: ``(H, K, m)`` the last weighted mean of the deformations
+    #: ``(N,)`` mean reward of the samples at each step done: fewer than asked for where the run was stopped
     rewards: FloatArray
-    excluded: int
+    excluded: int  #: Samples left out because their reward was not finite
+    #: Factors on the noise that a next step would have, that go with ``(H, K, m)``
     noise_factor: float | FloatArray = 1.0
 
 
 class DenoisingStep(NamedTuple):
-    """One step of a denoising run, for observers.
+    """One step of a denoising run, for observers."""
 
-    Attributes:
-        task: Distribution of the samples, and their scoring.
-        noise_scale: Standard deviation of the samples.
-        mean: ``(H, K, m)`` the weighted mean of the deformations, which the next step samples around.
-        samples: ``(S, H, K, m)`` the first deformations that it is the mean of, at most :data:`WATCHED_SAMPLES`.
-        weights: ``(S,)`` what they count for with team credit, ``(K, S)`` with robot credit; those of all ``M`` samples
-            add up to one.
-    """
-
-    task: SamplingTask
-    noise_scale: float
-    mean: FloatArray
+    task: SamplingTask  #: Distribution of the samples, and their scoring
+    noise_scale: float  #: Standard deviation of the samples
+    mean: FloatArray  #: ``(H, K, m)`` the weighted mean of the deformations, which the next step samples around
+    #: ``(S, H, K, m)`` the first deformations that it is the mean of, at most :data:`WATCHED_SAMPLES`
     samples: FloatArray
+    #: ``(S,)`` what they count for with team credit, ``(K, S)`` with robot credit; those of all ``M`` samples add up to
+    #: one
     weights: FloatArray
 
 

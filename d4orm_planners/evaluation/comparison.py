@@ -20,24 +20,15 @@ stats: Any = LazyModule("scipy.stats")
 
 @dataclass(frozen=True, kw_only=True)
 class Paired:
-    """Paired comparison of two policies on the same problems, seeds and levels of noise.
+    """Paired comparison of two policies on the same problems, seeds and levels of noise."""
 
-    Attributes:
-        pairs: Number of trials that they have in common.
-        only_first: Those in which only the first succeeded.
-        only_second: Those in which only the second did.
-        success_p: Probability that two equally good policies differ so much in successes: McNemar's exact test,
-            two-sided.
-        difference: Median of the first's cost less the second's.
-        cost_p: The same for the costs: Wilcoxon's signed-rank test, two-sided.
-    """
-
-    pairs: int
-    only_first: int
-    only_second: int
+    pairs: int  #: Number of trials that they have in common
+    only_first: int  #: Those in which only the first succeeded
+    only_second: int  #: Those in which only the second did
+    #: Probability that two equally good policies differ so much in successes: McNemar's exact test, two-sided
     success_p: float
-    difference: float
-    cost_p: float
+    difference: float  #: Median of the first's cost less the second's
+    cost_p: float  #: The same for the costs: Wilcoxon's signed-rank test, two-sided
 
 
 def paired(
@@ -101,20 +92,6 @@ class PairedPolicies:
     """Paired comparison of two policies under one condition, by trials with the same problem and seed.
 
     The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
-
-    Attributes:
-        first: A policy's label.
-        second: Another's.
-        trials: Pairs of trials.
-        only_first: Pairs in which only the first succeeded.
-        only_second: Those in which only the second did.
-        p_value: That rates of success are equal, two-sided: :func:`mcnemar`.
-        difference: Success rate of the first less that of the second.
-        lower: Lower end of its 95% confidence interval: :func:`newcombe_interval`.
-        upper: Upper end.
-        slower: Mean of how much longer the first travelled where both succeeded [s]; ``None`` without any.
-        slower_lower: Lower end of its 95% confidence interval (Student's t); ``None`` with fewer than two.
-        slower_upper: Upper end.
     """
 
     scenario: str
@@ -123,18 +100,18 @@ class PairedPolicies:
     control_noise_std: float
     disturbance: str
     level: float | None
-    first: str
-    second: str
-    trials: int
-    only_first: int
-    only_second: int
-    p_value: float
-    difference: float
-    lower: float
-    upper: float
-    slower: float | None
-    slower_lower: float | None
-    slower_upper: float | None
+    first: str  #: A policy's label
+    second: str  #: Another's
+    trials: int  #: Pairs of trials
+    only_first: int  #: Pairs in which only the first succeeded
+    only_second: int  #: Those in which only the second did
+    p_value: float  #: That rates of success are equal, two-sided: :func:`mcnemar`
+    difference: float  #: Success rate of the first less that of the second
+    lower: float  #: Lower end of its 95% confidence interval: :func:`newcombe_interval`
+    upper: float  #: Upper end
+    slower: float | None  #: Mean of how much longer the first travelled where both succeeded [s]; ``None`` without any
+    slower_lower: float | None  #: Lower end of its 95% confidence interval (Student's t); ``None`` with fewer than two
+    slower_upper: float | None  #: Upper end
 
 
 def compare_pairs(groups: Iterable[TrialGroup]) -> list[PairedPolicies]:
@@ -202,19 +179,12 @@ def newcombe_interval(both: int, only_first: int, only_second: int, neither: int
 
 @dataclass(frozen=True, eq=False)
 class Survival:
-    """The share of trials without a solution, by what was spent on them.
+    """The share of trials without a solution, by what was spent on them."""
 
-    Attributes:
-        costs: ``(n,)`` rising costs at which some trial was solved.
-        unsolved: ``(n,)`` share that is left from then on.
-        lower: ``(n,)`` lower end of its 95% interval (Wilson).
-        upper: ``(n,)`` upper end.
-    """
-
-    costs: Floats
-    unsolved: Floats
-    lower: Floats
-    upper: Floats
+    costs: Floats  #: ``(n,)`` rising costs at which some trial was solved
+    unsolved: Floats  #: ``(n,)`` share that is left from then on
+    lower: Floats  #: ``(n,)`` lower end of its 95% interval (Wilson)
+    upper: Floats  #: ``(n,)`` upper end
 
 
 def survival(costs: Sequence[float | None]) -> Survival:

@@ -28,75 +28,44 @@ Robots = Annotated[Count, Field(le=10_000)]
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkSettings(CheckedSettings):
-    """Settings of a benchmark.
+    """Settings of a benchmark."""
 
-    Attributes:
-        sections: Parts to measure, of :data:`SECTIONS`.
-        num_robots: Team sizes.
-        models: Robot models.
-        engines: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.reference`, which has the common models.
-        num_samples: ``M``.
-        horizon: ``H``.
-        num_steps: Denoising steps in an iteration.
-        repetitions: Calls per measurement at most.
-        time_limit: Seconds per measurement, after which no further call begins.
-        iteration_limit: Whole iterations expected to take longer than this are left out [s].
-        most_robots_slow: Largest team for engines other than the CPU engine and, on an accelerator, JAX.
-        env_steps: Environment steps per repetition.
-        num_worlds: Worlds in the batched environment.
-        plan_robots: Team sizes for the first feasible plan.
-        seeds: Seeds ``0, 1, ...`` per team size.
-        plan_time_limit: Seconds per plan.
-        thread_robots: Team sizes whose iterations are timed with several threads and with one.
-        memory_robots: Team size of the memory measurement.
-        obstacles: Numbers of boxes among the paths of 8 robots.
-        far_obstacles: The same of boxes far away; also what environments are stepped among.
-        map_cells: Cells along a side of the maps whose index of obstacles is timed.
-        big_random: Team sizes for the first plan of the recommended planner on open ground.
-        big_warehouse: The same in warehouses.
-        big_drives: The same of differential drives.
-        big_boxes: The same of rectangles with goal headings in warehouses.
-        big_free_boxes: The same of rectangles without.
-        big_seeds: Seeds of these, and of the plans that are improved.
-        big_time_limit: Seconds per plan of these.
-        improved_robots: Team sizes whose first plans are improved.
-        improving_limit: Time that this may take [s].
-        loop_robots: Team sizes for control loops of D4orm-C2F.
-        loops: Their number.
-    """
-
-    sections: tuple[str, ...] = SECTIONS
-    num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)
-    models: tuple[str, ...] = MODELS
+    sections: tuple[str, ...] = SECTIONS  #: Parts to measure, of :data:`SECTIONS`
+    num_robots: tuple[Robots, ...] = (4, 8, 16, 32, 64, 100)  #: Team sizes
+    models: tuple[str, ...] = MODELS  #: Robot models
+    #: Of :data:`ENGINES`; ``"plain"`` is :mod:`d4orm_planners.reference`, which has the common models
     engines: tuple[str, ...] = ENGINES
-    num_samples: Samples = 1024
-    horizon: Steps = 100
-    num_steps: Steps = 100
-    repetitions: Count = 20
-    time_limit: Positive = 2.0
-    iteration_limit: Positive = 20.0
+    num_samples: Samples = 1024  #: ``M``
+    horizon: Steps = 100  #: ``H``
+    num_steps: Steps = 100  #: Denoising steps in an iteration
+    repetitions: Count = 20  #: Calls per measurement at most
+    time_limit: Positive = 2.0  #: Seconds per measurement, after which no further call begins
+    iteration_limit: Positive = 20.0  #: Whole iterations expected to take longer than this are left out [s]
+    #: Largest team for engines other than the CPU engine and, on an accelerator, JAX
     most_robots_slow: Annotated[Whole, Field(ge=0)] = 16
-    env_steps: Count = 2000
-    num_worlds: Steps = 1024
-    plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)
-    seeds: Count = 20
-    plan_time_limit: Positive = 20.0
+    env_steps: Count = 2000  #: Environment steps per repetition
+    num_worlds: Steps = 1024  #: Worlds in the batched environment
+    plan_robots: tuple[Robots, ...] = (4, 8, 12, 16)  #: Team sizes for the first feasible plan
+    seeds: Count = 20  #: Seeds ``0, 1, ...`` per team size
+    plan_time_limit: Positive = 20.0  #: Seconds per plan
+    #: Team sizes whose iterations are timed with several threads and with one
     thread_robots: tuple[Robots, ...] = (8, 16, 64)
-    memory_robots: Robots = 64
-    obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)
-    far_obstacles: tuple[Count, ...] = (200,)
-    map_cells: tuple[Count, ...] = (32, 256)
+    memory_robots: Robots = 64  #: Team size of the memory measurement
+    obstacles: tuple[Count, ...] = (4, 200, 1000, 5000)  #: Numbers of boxes among the paths of 8 robots
+    far_obstacles: tuple[Count, ...] = (200,)  #: The same of boxes far away; also what environments are stepped among
+    map_cells: tuple[Count, ...] = (32, 256)  #: Cells along a side of the maps whose index of obstacles is timed
+    #: Team sizes for the first plan of the recommended planner on open ground
     big_random: tuple[Robots, ...] = (1000, 2000)
-    big_warehouse: tuple[Robots, ...] = (100, 200)
-    big_drives: tuple[Robots, ...] = (100,)
-    big_boxes: tuple[Robots, ...] = (16, 50)
-    big_free_boxes: tuple[Robots, ...] = (100,)
-    big_seeds: Count = 3
-    big_time_limit: Positive = 120.0
-    improved_robots: tuple[Robots, ...] = (8, 24)
-    improving_limit: Positive = 0.05
-    loop_robots: tuple[Robots, ...] = (64, 512)
-    loops: Count = 30
+    big_warehouse: tuple[Robots, ...] = (100, 200)  #: The same in warehouses
+    big_drives: tuple[Robots, ...] = (100,)  #: The same of differential drives
+    big_boxes: tuple[Robots, ...] = (16, 50)  #: The same of rectangles with goal headings in warehouses
+    big_free_boxes: tuple[Robots, ...] = (100,)  #: The same of rectangles without
+    big_seeds: Count = 3  #: Seeds of these, and of the plans that are improved
+    big_time_limit: Positive = 120.0  #: Seconds per plan of these
+    improved_robots: tuple[Robots, ...] = (8, 24)  #: Team sizes whose first plans are improved
+    improving_limit: Positive = 0.05  #: Time that this may take [s]
+    loop_robots: tuple[Robots, ...] = (64, 512)  #: Team sizes for control loops of D4orm-C2F
+    loops: Count = 30  #: Their number
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -162,13 +162,6 @@ class Tolerance:
     """Level of a disturbance at which the success of a policy falls below a share of what it is undisturbed.
 
     The first six fields are those of :class:`~d4orm_planners.evaluation.summary.Compared`.
-
-    Attributes:
-        passes: The last level before that, from harmless to bad; ``None`` if it fails at the first.
-        fails: The first level with a success rate below the threshold; ``None`` if it tolerates all. Both are ``None``
-            where no level can be named: without an undisturbed success rate, or with one of 0.
-        undisturbed: Success rate without any disturbance but the noise; ``None`` if no level without effect was run.
-        threshold: That share of it.
     """
 
     label: str
@@ -177,10 +170,13 @@ class Tolerance:
     model: str
     control_noise_std: float
     disturbance: str
-    passes: float | None
+    passes: float | None  #: The last level before that, from harmless to bad; ``None`` if it fails at the first
+    #: The first level with a success rate below the threshold; ``None`` if it tolerates all. Both are ``None`` where no
+    #: level can be named: without an undisturbed success rate, or with one of 0.
     fails: float | None
+    #: Success rate without any disturbance but the noise; ``None`` if no level without effect was run
     undisturbed: float | None
-    threshold: float | None
+    threshold: float | None  #: That share of it
 
     @property
     def text(self) -> str:

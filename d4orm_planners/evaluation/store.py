@@ -19,42 +19,26 @@ STORE = "trials.sqlite"
 
 
 class TrialKey(NamedTuple):
-    """Key of a trial.
+    """Key of a trial."""
 
-    Attributes:
-        policy: Registry name.
-        config: All settings of the policy, as JSON with sorted keys; under ``observation`` the arguments of the
-            environment on what it observes, where there are any.
-        problem: :attr:`d4orm_env.core.problem.Problem.digest`.
-        control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        seed: Seed of the episode: of the policy and of the noise.
-        disturbances: Further disturbances, as JSON: a list of ``[name, attributes]``.
-        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
-    """
-
-    policy: str
+    policy: str  #: Registry name
+    #: All settings of the policy, as JSON with sorted keys; under ``observation`` the arguments of the environment on
+    #: what it observes, where there are any
     config: str
-    problem: str
-    control_noise_std: float
-    seed: int
-    disturbances: str = "[]"
-    physics: str = "model"
+    problem: str  #: :attr:`d4orm_env.core.problem.Problem.digest`
+    control_noise_std: float  #: Standard deviation of the execution noise, in the controls' units
+    seed: int  #: Seed of the episode: of the policy and of the noise
+    disturbances: str = "[]"  #: Further disturbances, as JSON: a list of ``[name, attributes]``
+    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`
 
 
 class BestSoFar(NamedTuple):
-    """The best plan of a solve from some moment on.
+    """The best plan of a solve from some moment on."""
 
-    Attributes:
-        seconds: Since the solve began.
-        solved: Whether it is a solution, 1 or 0.
-        reward: Its mean reward.
-        steps: Denoising steps done; ``None`` where it is not known.
-    """
-
-    seconds: float
-    solved: int
-    reward: float
-    steps: int | None = None
+    seconds: float  #: Since the solve began
+    solved: int  #: Whether it is a solution, 1 or 0
+    reward: float  #: Its mean reward
+    steps: int | None = None  #: Denoising steps done; ``None`` where it is not known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,44 +46,6 @@ class Trial:
     """One episode of one policy and how it ended: a row of the store, with a column per field, in this order.
 
     The first seven fields are its :class:`TrialKey`.
-
-    Attributes:
-        label: Name of the policy with these settings.
-        scenario: Name of the scenario, with the arguments that it was given.
-        num_robots: Team size.
-        model: Model names of the team, each once, joined by ``+``.
-        dt: Time step [s].
-        versions: Versions of the libraries, as JSON; ``{}`` where the process was lost.
-        machine: Processor, cores and system, as JSON, likewise.
-        date: Time at which the trial ended, UTC, ISO 8601.
-        success: Everyone arrived in time, and none was ever in contact.
-        verified: Whether :func:`d4orm_env.verify` found no fault with the executed controls; ``None`` if not judged.
-        violation: The first fault that it found.
-        collided: Robots that were ever in contact.
-        arrived: Robots that arrived.
-        travel_time: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive.
-        makespan: Latest arrival time [s], likewise.
-        stretch: Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; ``None`` if
-            no robot arrived, and in rows that older versions wrote.
-        reward: Mean over steps and robots.
-        mean_squared_jerk: See :func:`d4orm_env.core.trajectory.mean_squared_jerk` [m^2/s^6].
-        steps: Steps of the episode.
-        iterations: Iterations of the planner; ``None`` for a policy that executes no plan.
-        denoising_share: Share of them that denoised; 0 where the plan is search's and path finding's alone.
-        status: End of its solve, see :class:`d4orm_planners.base.plan.Plan`.
-        wall_time: Seconds spent planning, or choosing actions.
-        preparation: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a
-            controller; ``None`` in rows that older versions wrote.
-        training_time: Seconds of training behind a learned policy, all before it included, where its file tells; else
-            ``None``.
-        elapsed: Seconds that the trial took, with the environment and the judge.
-        history: Times in the solve at which the best plan so far changed, as JSON: a list of
-            ``[seconds, solved (0 or 1), mean reward, denoising steps]``, the last not in rows that older versions
-            wrote; empty for a policy that executes no plan. See :attr:`progress`.
-        messages: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others.
-        message_bytes: Their length together.
-        waiting_share: Share of the nodes' time that they waited for each other.
-        error: Why there is no outcome; empty for a trial that ran to its end.
     """
 
     policy: str
@@ -109,37 +55,49 @@ class Trial:
     seed: int
     disturbances: str = "[]"
     physics: str = "model"
-    label: str
-    scenario: str
-    num_robots: int
-    model: str
-    dt: float
-    versions: str = "{}"
-    machine: str = "{}"
-    date: str = ""
-    success: bool = False
+    label: str  #: Name of the policy with these settings
+    scenario: str  #: Name of the scenario, with the arguments that it was given
+    num_robots: int  #: Team size
+    model: str  #: Model names of the team, each once, joined by ``+``
+    dt: float  #: Time step [s]
+    versions: str = "{}"  #: Versions of the libraries, as JSON; ``{}`` where the process was lost
+    machine: str = "{}"  #: Processor, cores and system, as JSON, likewise
+    date: str = ""  #: Time at which the trial ended, UTC, ISO 8601
+    success: bool = False  #: Everyone arrived in time, and none was ever in contact
+    #: Whether :func:`d4orm_env.verify` found no fault with the executed controls; ``None`` if not judged
     verified: bool | None = None
-    violation: str = ""
-    collided: int = 0
-    arrived: int = 0
+    violation: str = ""  #: The first fault that it found
+    collided: int = 0  #: Robots that were ever in contact
+    arrived: int = 0  #: Robots that arrived
+    #: Mean arrival time [s], with the time of the whole episode for a robot that did not arrive
     travel_time: float | None = None
-    makespan: float | None = None
+    makespan: float | None = None  #: Latest arrival time [s], likewise
+    #: Path travelled over the shortest path, see :func:`d4orm_env.core.trajectory.mean_stretch`; ``None`` if no robot
+    #: arrived, and in rows that older versions wrote
     stretch: float | None = None
-    reward: float | None = None
-    mean_squared_jerk: float | None = None
-    steps: int = 0
-    iterations: int | None = None
+    reward: float | None = None  #: Mean over steps and robots
+    mean_squared_jerk: float | None = None  #: See :func:`d4orm_env.core.trajectory.mean_squared_jerk` [m^2/s^6]
+    steps: int = 0  #: Steps of the episode
+    iterations: int | None = None  #: Iterations of the planner; ``None`` for a policy that executes no plan
+    #: Share of them that denoised; 0 where the plan is search's and path finding's alone
     denoising_share: float | None = None
-    status: str = ""
-    wall_time: float | None = None
+    status: str = ""  #: End of its solve, see :class:`d4orm_planners.base.plan.Plan`
+    wall_time: float | None = None  #: Seconds spent planning, or choosing actions
+    #: Those of ``wall_time`` before the first action: the whole solve of a plan, the coarse plan of a controller;
+    #: ``None`` in rows that older versions wrote
     preparation: float | None = None
+    #: Seconds of training behind a learned policy, all before it included, where its file tells; else ``None``
     training_time: float | None = None
-    elapsed: float | None = None
+    elapsed: float | None = None  #: Seconds that the trial took, with the environment and the judge
+    #: Times in the solve at which the best plan so far changed, as JSON: a list of ``[seconds, solved (0 or 1), mean
+    #: reward, denoising steps]``, the last not in rows that older versions wrote; empty for a policy that executes no
+    #: plan. See :attr:`progress`.
     history: str = "[]"
+    #: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others
     messages: int | None = None
-    message_bytes: int | None = None
-    waiting_share: float | None = None
-    error: str = ""
+    message_bytes: int | None = None  #: Their length together
+    waiting_share: float | None = None  #: Share of the nodes' time that they waited for each other
+    error: str = ""  #: Why there is no outcome; empty for a trial that ran to its end
 
     @property
     def key(self) -> TrialKey:

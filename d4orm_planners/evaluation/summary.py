@@ -16,60 +16,34 @@ stats: Any = LazyModule("scipy.stats")
 
 
 class TrialGroup(NamedTuple):
-    """Trials of one policy, one per seed, that have all but their seeds in common.
+    """Trials of one policy, one per seed, that have all but their seeds in common."""
 
-    Attributes:
-        label: Name of the policy with its settings.
-        trials: At least one.
-        disturbance: Further disturbance, such as ``"push.speed"``; empty for nothing.
-        level: Its level.
-    """
-
-    label: str
-    trials: Sequence[Trial]
-    disturbance: str = ""
-    level: float | None = None
+    label: str  #: Name of the policy with its settings
+    trials: Sequence[Trial]  #: At least one
+    disturbance: str = ""  #: Further disturbance, such as ``"push.speed"``; empty for nothing
+    level: float | None = None  #: Its level
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
-    """Successes of a policy on one scenario, model and team size, at one level of noise.
+    """Successes of a policy on one scenario, model and team size, at one level of noise."""
 
-    Attributes:
-        label: Name of the policy with its settings.
-        policy: Registry name.
-        scenario: Scenario name.
-        num_robots: Team size.
-        model: Models of the team.
-        control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbance: Further disturbance, such as ``"push.speed"``; empty for nothing.
-        level: Its level.
-        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
-        undisturbed: True if no disturbance changed anything, as at level zero.
-        trials: Trials, those with an error included.
-        successes: Those that succeeded.
-        lower: Lower end of the 95% confidence interval of the success rate (Wilson).
-        upper: Upper end.
-        errors: Trials that raised an error; they count as failures.
-        error: The first error.
-    """
-
-    label: str
-    policy: str
-    scenario: str
-    num_robots: int
-    model: str
-    control_noise_std: float
-    disturbance: str = ""
-    level: float | None = None
-    physics: str = "model"
-    undisturbed: bool = False
-    trials: int
-    successes: int
-    lower: float
-    upper: float
-    errors: int
-    error: str
+    label: str  #: Name of the policy with its settings
+    policy: str  #: Registry name
+    scenario: str  #: Scenario name
+    num_robots: int  #: Team size
+    model: str  #: Models of the team
+    control_noise_std: float  #: Standard deviation of the execution noise, in the controls' units
+    disturbance: str = ""  #: Further disturbance, such as ``"push.speed"``; empty for nothing
+    level: float | None = None  #: Its level
+    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`
+    undisturbed: bool = False  #: True if no disturbance changed anything, as at level zero
+    trials: int  #: Trials, those with an error included
+    successes: int  #: Those that succeeded
+    lower: float  #: Lower end of the 95% confidence interval of the success rate (Wilson)
+    upper: float  #: Upper end
+    errors: int  #: Trials that raised an error; they count as failures
+    error: str  #: The first error
 
     @property
     def rate(self) -> float:
@@ -99,61 +73,39 @@ class SuccessRate(Compared):
     """Rate at which all arrived in time and none was ever in contact, and the time taken.
 
     Intervals are of 95% confidence.
-
-    Attributes:
-        verified: Trials with whose executed controls :func:`d4orm_env.verify` found no fault; ``None`` where none
-            could be judged.
-        contacts: Those in which robots touched something.
-        late: Those in which a robot did not arrive in time.
-        travel_time: Mean over the successes of the mean arrival time [s]; ``None`` without any.
-        travel_time_lower: Lower end of its interval (Student's t); ``None`` with fewer than two successes.
-        travel_time_upper: Upper end.
-        stretch: Mean over the successes of the path travelled over the shortest path; ``None`` without any.
-        denoising_steps: Median denoising steps until the last better plan; ``None`` where no plan is executed.
-        denoising_share: Mean share of the iterations that denoised, where it is known.
-        wall_time: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors.
-        decision: Median seconds of choosing the actions of one step, without what came before the first one; ``None``
-            if all raised errors.
-        training_time: Seconds of training behind a learned policy, where its file tells; else ``None``.
-        compute: Mean seconds of planning, or of choosing actions, per second of motion, likewise.
-        compute_lower: Lower end of its interval (Student's t); ``None`` with fewer than two trials.
-        compute_upper: Upper end.
     """
 
+    #: Trials with whose executed controls :func:`d4orm_env.verify` found no fault; ``None`` where none could be judged
     verified: int | None
-    contacts: int
-    late: int
-    travel_time: float | None
-    travel_time_lower: float | None
-    travel_time_upper: float | None
-    stretch: float | None
+    contacts: int  #: Those in which robots touched something
+    late: int  #: Those in which a robot did not arrive in time
+    travel_time: float | None  #: Mean over the successes of the mean arrival time [s]; ``None`` without any
+    travel_time_lower: float | None  #: Lower end of its interval (Student's t); ``None`` with fewer than two successes
+    travel_time_upper: float | None  #: Upper end
+    stretch: float | None  #: Mean over the successes of the path travelled over the shortest path; ``None`` without any
+    #: Median denoising steps until the last better plan; ``None`` where no plan is executed
     denoising_steps: float | None
-    denoising_share: float | None
+    denoising_share: float | None  #: Mean share of the iterations that denoised, where it is known
+    #: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors
     wall_time: float | None
+    #: Median seconds of choosing the actions of one step, without what came before the first one; ``None`` if all
+    #: raised errors
     decision: float | None
-    training_time: float | None
-    compute: float | None
-    compute_lower: float | None
-    compute_upper: float | None
+    training_time: float | None  #: Seconds of training behind a learned policy, where its file tells; else ``None``
+    compute: float | None  #: Mean seconds of planning, or of choosing actions, per second of motion, likewise
+    compute_lower: float | None  #: Lower end of its interval (Student's t); ``None`` with fewer than two trials
+    compute_upper: float | None  #: Upper end
 
 
 @dataclass(frozen=True)
 class SuccessWithin:
-    """Successes of trials with so much time for planning.
+    """Successes of trials with so much time for planning."""
 
-    Attributes:
-        deadline: The time [s].
-        trials: Trials, those with an error included.
-        successes: Those that succeeded within it.
-        lower: Lower end of the 95% confidence interval of the success rate (Wilson).
-        upper: Upper end.
-    """
-
-    deadline: float
-    trials: int
-    successes: int
-    lower: float
-    upper: float
+    deadline: float  #: The time [s]
+    trials: int  #: Trials, those with an error included
+    successes: int  #: Those that succeeded within it
+    lower: float  #: Lower end of the 95% confidence interval of the success rate (Wilson)
+    upper: float  #: Upper end
 
     @property
     def rate(self) -> float:

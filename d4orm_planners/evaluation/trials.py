@@ -43,21 +43,14 @@ LIBRARIES = ("d4orm-env", "numpy", "numba", "jax", "pyrvo", "casadi", "mujoco", 
 
 @dataclass(frozen=True)
 class Condition:
-    """Condition of a trial.
+    """Condition of a trial."""
 
-    Attributes:
-        control_noise_std: Standard deviation of the execution noise, in the controls' units.
-        disturbances: Further disturbances.
-        name: Varied quantity, such as ``"push.speed"``; empty for nothing.
-        level: Its level; of disturbances that differ in more than a number, their index among the levels.
-        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
-    """
-
-    control_noise_std: float = 0.0
-    disturbances: tuple[AnyDisturbance, ...] = ()
-    name: str = ""
+    control_noise_std: float = 0.0  #: Standard deviation of the execution noise, in the controls' units
+    disturbances: tuple[AnyDisturbance, ...] = ()  #: Further disturbances
+    name: str = ""  #: Varied quantity, such as ``"push.speed"``; empty for nothing
+    #: Its level; of disturbances that differ in more than a number, their index among the levels
     level: float | None = None
-    physics: str = "model"
+    physics: str = "model"  #: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`
 
     @property
     def text(self) -> str:
@@ -77,20 +70,13 @@ class Condition:
 
 @dataclass(frozen=True)
 class Configuration:
-    """A policy with its settings.
+    """A policy with its settings."""
 
-    Attributes:
-        label: Its name in the results.
-        policy: Its name or import path; the label of one that a program gave itself.
-        settings: Those that differ from the defaults.
-        given: Argument of :func:`~d4orm_planners.make_policy` for it in any process, if not ``policy``.
-        observation: Arguments of the environment on what robots observe, where they are others than its own.
-    """
-
-    label: str
-    policy: str
-    settings: Mapping[str, object]
-    given: object = None
+    label: str  #: Its name in the results
+    policy: str  #: Its name or import path; the label of one that a program gave itself
+    settings: Mapping[str, object]  #: Those that differ from the defaults
+    given: object = None  #: Argument of :func:`~d4orm_planners.make_policy` for it in any process, if not ``policy``
+    #: Arguments of the environment on what robots observe, where they are others than its own
     observation: Mapping[str, object] = field(default_factory=dict)
 
     @property

@@ -91,16 +91,12 @@ def range_sensors(number: int, ray_range: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A policy that needs nothing but NumPy.
+    """A policy that needs nothing but NumPy."""
 
-    Attributes:
-        header: Its header.
-        arrays: ``weight_i`` ``(out, in)`` and ``bias_i`` ``(out,)`` of each layer, and the normalisation:
-            ``observation_mean`` and ``observation_variance`` ``(F,)``, and ``reward_variance`` ``()``, which only
-            further training needs. With sets, the arrays of those, and no normalisation of observations.
-    """
-
-    header: Header
+    header: Header  #: Its header
+    #: ``weight_i`` ``(out, in)`` and ``bias_i`` ``(out,)`` of each layer, and the normalisation: ``observation_mean``
+    #: and ``observation_variance`` ``(F,)``, and ``reward_variance`` ``()``, which only further training needs. With
+    #: sets, the arrays of those, and no normalisation of observations.
     arrays: Mapping[str, FloatArray]
 
     @property
