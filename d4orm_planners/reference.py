@@ -45,11 +45,7 @@ class PlainTeam(NamedTuple):
 
 
 def plain_team(problem: Problem) -> tuple[str, PlainTeam]:
-    """The model's name and the arrays of a problem.
-
-    Raises:
-        ValueError: If the team mixes models, or has one that this formulation does not cover.
-    """
+    """The model's name and the arrays of a problem; ValueError for mixed teams, and models that this does not cover."""
     models = sorted(set(problem.team.models))
     if len(models) > 1:
         raise ValueError(f"the plain formulation moves one model at a time, not {' and '.join(models)}; use an engine")
@@ -211,11 +207,7 @@ def denoise(
 def denoise_around_rest(
     problem: Problem, noise_scale: ArrayLike, num_samples: int, temperature: float, seed: int, collisions: bool = True
 ) -> FloatArray:
-    """``(H, K, m)`` controls of :func:`denoise` from zero, for a problem whose robots have one model.
-
-    Raises:
-        ValueError: If the team mixes models.
-    """
+    """``(H, K, m)`` controls of :func:`denoise` from zero, for a problem whose robots have one model."""
     model, team = plain_team(problem)
     zero = jnp.zeros((problem.horizon, problem.num_robots, problem.control_size), jnp.float32)
     scale, key = jnp.asarray(noise_scale, jnp.float32), jax.random.key(seed)

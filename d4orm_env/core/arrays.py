@@ -38,8 +38,7 @@ def read_only(arrays: A) -> A:
 def as_float32(value: ArrayLike) -> FloatArray:
     """A new float32 array of ``value``, PyTorch's tensors included; what is too large for float32 becomes infinite.
 
-    Raises:
-        ValueError: If it cannot be read as numbers, or holds a whole number that no float holds.
+    What cannot be read as numbers, or is a whole number that no float holds, is a ValueError.
     """
     try:
         with np.errstate(over="ignore"):
@@ -115,11 +114,10 @@ def frozen_array(
 
 
 def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray:
-    """``value`` as ``(num_robots,)`` positive numbers; a single number is given to every robot.
+    """``value`` as ``(num_robots,)`` numbers from :data:`SMALLEST` to :data:`LARGEST`; a single one is given to every
+    robot.
 
-    Raises:
-        ValueError: As :func:`frozen_array`, or if a value is not positive, or not from :data:`SMALLEST` to
-            :data:`LARGEST`; the message names the robot.
+    Others are a ValueError that names the robot.
     """
     numbers = numbers_of(value, f"{name} must be an array of numbers")
     if numbers.ndim == 0:
@@ -256,11 +254,7 @@ def whole_number(value: object, name: str, minimum: int, maximum: int | None = N
 
 
 def plain_number(value: object) -> object:
-    """A number or truth value of NumPy's as Python's: ``default=`` of ``json.dumps``.
-
-    Raises:
-        TypeError: If it is neither.
-    """
+    """A number or truth value of NumPy's as Python's, else a TypeError: ``default=`` of ``json.dumps``."""
     for theirs, ours in ((np.bool_, bool), (np.integer, int), (np.floating, float)):
         if isinstance(value, theirs):
             return ours(value)

@@ -25,11 +25,7 @@ from d4orm_env.core.errors import MissingFileError
 
 
 def checked_path(path: object, what: str) -> Path:
-    """Return the path of ``what``.
-
-    Raises:
-        ValueError: If it is neither text nor a path, or empty.
-    """
+    """Return the path of ``what``. Raises ValueError if it is neither text nor a path, or empty."""
     if not isinstance(path, (str, os.PathLike)) or path == "":
         raise ValueError(f"the path of {what} must be text or a path, not {path!r}")
     return Path(path)
@@ -76,11 +72,7 @@ def _unreadable(error: OSError, where: str = "") -> ValueError:
 
 
 def target_of(path: Path) -> Path:
-    """Path at which a file is written: its own, or the target of a symbolic link.
-
-    Raises:
-        OSError: If no file can be there, because of what is there or of a folder that is missing.
-    """
+    """Path at which a file is written: its own, or a symbolic link's target. Raises OSError if no file can be there."""
     target = Path(os.path.realpath(path))
     if target.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
@@ -97,14 +89,8 @@ def target_of(path: Path) -> Path:
 def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[Path]:
     """Give a temporary path in the same folder; rename it to ``path`` at the end, or remove it after an error.
 
-    Args:
-        path: The file to write; where it is a symbolic link, that which it leads to.
-        suffixes: Endings that are allowed; none given allows all.
-
-    Raises:
-        ValueError: If ``path`` does not end in one of the suffixes.
-        OSError: If the folder does not exist or cannot be written to, or ``path`` is a folder. An error while writing
-            names ``path``.
+    A symbolic link stays one. A path that ends in none of the ``suffixes``, if there are any, is a ValueError, and one
+    that cannot be written to an OSError that names it.
     """
     if suffixes and path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} ends in {path.suffix!r}; choose one of {', '.join(suffixes)}")
@@ -131,17 +117,9 @@ def replaced_when_done(path: Path, suffixes: tuple[str, ...] = ()) -> Iterator[P
 
 
 def claim_folder(path: Path, identity: Mapping[str, object], kind: str, remedy: str = "choose another folder") -> None:
-    """Write the purpose of a folder to a JSON file in it, or check that it is the same.
+    """Write the purpose of a folder, which holds ``kind``, to a JSON file at ``path``, or check that it is the same.
 
-    Args:
-        path: The file.
-        identity: All that must be the same.
-        kind: Content of the folder for messages, as ``"a training"``.
-        remedy: What else to do than to go on with the same.
-
-    Raises:
-        ValueError: If it is for something else, or does not say.
-        OSError: If it cannot be written to.
+    A folder for something else is a ValueError, which ends with the ``remedy``.
     """
     wanted = json.loads(json.dumps(identity))
     if not path.exists():
@@ -213,11 +191,7 @@ def is_yaml_path(path: str | os.PathLike[str]) -> bool:
 
 
 def read_yaml(path: str | os.PathLike[str]) -> object:
-    """The content of a YAML file: text, numbers, lists and mappings.
-
-    Raises:
-        ValueError: If it cannot be read, is larger than 10 MB, or is refused by :func:`parse_yaml`.
-    """
+    """The content of a YAML file: text, numbers, lists and mappings. Raises ValueError as :func:`parse_yaml`."""
     try:
         content = read_limited(Path(path), "a YAML file", MAX_BYTES)
     except OSError as error:
@@ -229,11 +203,7 @@ def read_yaml(path: str | os.PathLike[str]) -> object:
 
 
 def parse_yaml(text: str) -> object:
-    """The one document of a YAML text.
-
-    Raises:
-        ValueError: If it is no such YAML, or too large or too deep; one line that says where.
-    """
+    """The one document of a YAML text; a ValueError of one line says where it is none, or too large or too deep."""
     try:
         events = _not_too_many(yaml.parse(text, Loader=_LOADER))
         documents = [_node(events, event, 0) for event in events if isinstance(event, yaml.NodeEvent)]

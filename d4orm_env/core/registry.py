@@ -146,8 +146,7 @@ def installed() -> Any:
 def load_reference(text: str) -> object:
     """Load ``"package.module:Name"`` or ``"folder/file.py:Name"``; modules of the present folder are found too.
 
-    Raises:
-        ValueError: If the text has another form, or the module cannot be imported or has no such name.
+    Text of another form, or of which nothing can be imported, is a ValueError.
     """
     module, _, name = text.rpartition(":")
     if not module or not all(part.isidentifier() for part in name.split(".")):
@@ -205,10 +204,8 @@ def _qualified_name(thing: object) -> object:
 
 
 def source_digest(thing: object) -> str:
-    """SHA-256 of the file in which a class, a function or an instance's class is written.
-
-    Raises:
-        ValueError: If there is no source to be read.
+    """SHA-256 of the file in which a class, a function or an instance's class is written; ValueError where there is
+    none.
     """
     code = source_object(thing)
     try:
@@ -249,11 +246,7 @@ def required_parameters(function: Callable[..., object]) -> int | None:
 
 
 def check_call(function: Callable[..., object], owner: str, *arguments: str, **keywords: object) -> None:
-    """Refuse a function of a user that cannot be called with these arguments.
-
-    Raises:
-        ValueError: If it cannot; ``owner`` begins the message.
-    """
+    """Refuse a function of a user that cannot be called so, by a ValueError that begins with its ``owner``."""
     try:
         signature = inspect.signature(function)
     except ValueError:  # of built-in functions nobody knows

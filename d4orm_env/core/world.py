@@ -248,11 +248,7 @@ def _polygons(given: Sequence[ArrayLike]) -> tuple[FloatArray, ...]:
 
 
 def world_of(value: object, dimension: int) -> World:
-    """``value`` as the world of a team that moves in so many dimensions; an open one for ``None``.
-
-    Raises:
-        ValueError: If it is no world, or one of another dimension.
-    """
+    """``value`` as the world of a team that moves in so many dimensions, open for ``None``; else a ValueError."""
     world = World(dimension=dimension) if value is None else value
     if not isinstance(world, World):
         raise ValueError(f"world is {short_repr(world)}; give a World, such as World(boxes=[...]), or leave it out")

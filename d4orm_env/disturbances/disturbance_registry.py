@@ -65,10 +65,8 @@ class Level(NamedTuple):
 def find_level(text: str) -> Level:
     """The kind and the attribute that a name such as ``push.speed`` stands for; without one, the kind's first.
 
-    Other attributes may be given in brackets behind the kind, as YAML reads values: ``push(rate=0.5).speed``.
-
-    Raises:
-        ValueError: If there is no such kind, it has no such attribute, or one is given twice.
+    Other attributes may be given in brackets behind the kind, as YAML reads values: ``push(rate=0.5).speed``. What does
+    not exist, or is given twice, is a ValueError.
     """
     path, opened, behind = text.partition("(")
     given, closed, rest = behind.partition(")")

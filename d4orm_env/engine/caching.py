@@ -193,11 +193,7 @@ def _compile_once(compile_kernel: Callable[P, R_co], cache: object) -> Callable[
 
 
 def check_can_be_kept() -> None:
-    """Find out whether kernels can be kept on disk.
-
-    Raises:
-        OSError: If no folder can be written to, or the disk is full.
-    """
+    """Raise OSError if kernels cannot be kept on disk: no folder can be written to, or the disk is full."""
     try:
         folder = _CacheFolder(check_can_be_kept).locator.get_cache_path()
     except RuntimeError:

@@ -118,13 +118,10 @@ def _fits(rest: FloatArray, team_size: int, body: int) -> bool:
 def state_bounds(
     problem: Problem, positions: FloatArray, max_cycles: int, slack: BoundsSlack, num_bodies: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Finite bounds that every joint state of an episode keeps.
+    """Finite bounds that every joint state of an episode keeps: the lowest and the highest vector.
 
     A robot gets no farther from its start, in the box ``positions`` ``(2, d)`` [m], than its limits and the slack allow
     in ``max_cycles`` steps, and angles do not wind up.
-
-    Returns:
-        Lowest and highest joint state vector.
     """
     low, high = _robot_bounds(problem, positions, max_cycles * problem.dt, slack)
     limits = problem.team.control_limits

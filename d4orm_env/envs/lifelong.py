@@ -54,11 +54,7 @@ def reached_goals(team: Team, arrays: ProblemArrays, states: FloatArray, control
 def assign_goals(
     problem: Problem, robots: NDArray[np.intp], world: WorldBatch, random: np.random.Generator, draw: GoalFunction
 ) -> None:
-    """Give some robots of a batch of one world, which is changed, goals that ``draw`` says, and distances from there.
-
-    Raises:
-        ValueError: See :func:`given_goal`.
-    """
+    """Give some robots of a batch of one world, which is changed, goals that ``draw`` says, and distances."""
     positions, goals = world.state[0, :, : problem.dimension], world.goal[0]
     for robot in robots.tolist():
         goals[robot] = draw(problem, robot, positions, goals, random)
@@ -75,10 +71,8 @@ def given_goal(
     goals: FloatArray,
     random: np.random.Generator,
 ) -> FloatArray:
-    """A goal ``(d,)`` that a function of a user's gives.
-
-    Raises:
-        ValueError: If it is no position in :func:`goal_region`, or the robot would be in contact with an obstacle.
+    """A goal ``(d,)`` that a function of a user's gives; ValueError unless it is a position of :func:`goal_region` with
+    room.
     """
     name, given = f"the next goal of robot_{robot}", function(problem, robot, positions.copy(), goals.copy(), random)
     goal, (low, high) = frozen_array(given, name, (problem.dimension,)), goal_region(problem)

@@ -54,21 +54,14 @@ def agent_infos(names: Iterable[str], robots: Iterable[int], step: TeamStep) -> 
 def episode_metrics(
     worlds: WorldBatch, dt: float, goals: NDArray[np.int64] | None, lost: BoolArray | None
 ) -> dict[str, Floats]:
-    """Episodes in numbers.
+    """Episodes in numbers, each ``(B,)`` float64, of time step ``dt`` [s].
 
-    Args:
-        worlds: The worlds.
-        dt: Time step [s].
-        goals: ``(B, K)`` goals reached by each robot in lifelong mode, or ``None`` outside it.
-        lost: ``(B, K)`` bool: robots that a disturbance keeps from ever arriving, if there can be any.
-
-    Returns:
-        ``steps``; ``reward``: mean over steps and robots; ``goals_reached``; ``goals_per_robot_minute``;
-        ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin; ``collided`` and
-        ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots arrived; ``success``:
-        1.0 when all have docked, but for those that are lost, and none was ever in contact; ``travel_time`` and
-        ``makespan``: mean and latest arrival [s], with the time so far for a robot that has not arrived. Each ``(B,)``
-        float64.
+    ``steps``; ``reward``: mean over steps and robots; ``goals_reached``, in lifelong mode ``goals`` ``(B, K)``;
+    ``goals_per_robot_minute``; ``collisions`` and ``margin_violations``: robot-steps in contact, or within the margin;
+    ``collided`` and ``margin_violated``: robots that ever were. Unless lifelong also ``arrived``: robots arrived;
+    ``success``: 1.0 when all have docked, but for those that a disturbance keeps from ever arriving, ``lost`` ``(B,
+    K)``, and none was ever in contact; ``travel_time`` and ``makespan``: mean and latest arrival [s], with the time so
+    far for a robot that has not arrived.
     """
     steps = worlds.steps.astype(np.float64)
     robot_steps = worlds.contacts.shape[1] * np.maximum(steps, 1)

@@ -259,19 +259,10 @@ def _file(name: str) -> str:
 
 @own_style()
 def save_denoising(problem: Problem, denoising: Denoising, path: str | Path, panels: int = 6) -> Path:
-    """Write a picture of a plan's denoising: the paths of its candidate, from the first step to the last.
+    """Write a picture of a plan's denoising, as PNG, SVG or PDF: its candidate's paths, in ``panels`` steps, three to a
+    row.
 
-    Faint lines are samples. Spatial problems are seen from above.
-
-    Args:
-        problem: The problem that was planned for.
-        denoising: Denoising as seen.
-        path: A PNG, SVG or PDF file.
-        panels: Number of steps to show, in rows of three.
-
-    Raises:
-        ValueError: For another suffix.
-        OSError: If it cannot be written; nothing is left behind then.
+    Faint lines are samples. Spatial problems are seen from above. Nothing is left behind after an error.
     """
     shown = np.unique(np.linspace(0, len(denoising.labels) - 1, panels).round().astype(int))
     rows = -(-len(shown) // 3)

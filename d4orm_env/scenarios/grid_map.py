@@ -88,12 +88,10 @@ def float32_resolves(coordinate: float, cell: float) -> bool:
 
 
 def merge_cells(blocked: BoolArray) -> np.ndarray:
-    """Disjoint rectangles that cover the blocked cells and nothing else.
+    """``(B, 4)`` disjoint rectangles, top, left, bottom and right, the last two exclusive, that cover the blocked
+    cells.
 
     Cells side by side make a run, and equal runs one below the other a rectangle; columns are tried in place of rows.
-
-    Returns:
-        ``(B, 4)`` top, left, bottom and right, the last two exclusive.
     """
     upright = _merge_rows(blocked.T)[:, [1, 0, 3, 2]]
     flat = _merge_rows(blocked)

@@ -23,11 +23,7 @@ a share of their limits: those of robots at rest answer to noise."""
 
 
 def check_lag(lag: ArrayLike) -> ArrayLike:
-    """Return time constants of actuators [s], one or one per robot, as they are.
-
-    Raises:
-        ValueError: If they are no numbers, or one is negative or not finite.
-    """
+    """Return time constants of actuators [s], one or one per robot, as they are; ValueError unless zero or more."""
     try:
         constants: Floats = np.asarray(lag, np.float64)
     except (TypeError, ValueError):
@@ -127,14 +123,11 @@ class DisturbanceObserver:
         return reference + (self._trust * off).astype(np.float32)
 
     def executed(self, before: FloatArray, after: FloatArray, controls: FloatArray) -> FloatArray:
-        """``(K, m)`` controls with which robots without limits on their states do as their models did.
+        """``(K, m)`` controls with which robots without limits on their states do as their models did, by their
+        ``controls``.
 
-        A model that is at its speed limit does not obey a control that speeds it up; a robot does.
-
-        Args:
-            before: ``(K, n)`` states of the robots now, at whatever speed.
-            after: ``(K, n)`` states of the models after the step.
-            controls: ``(K, m)`` of the models.
+        A model that is at its speed limit does not obey a control that speeds it up; a robot does. It is in state
+        ``before``, the model ``after`` the step in another ``(K, n)``.
         """
         swallowed = (after - before) / np.float32(self.problem.dt) - rates(self.problem, before, controls)
         return controls + np.einsum("kn,knm->km", swallowed, self._summed)

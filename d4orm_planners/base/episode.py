@@ -78,17 +78,9 @@ class Episode(DisplayMixin):
 
 
 def open_env(problem: Problem, physics: str = "model", policy: Policy | None = None, **options: Any) -> ParallelEnv:
-    """An environment of a problem.
+    """An environment of a problem, by :func:`find_physics`; ``options`` are those of the PettingZoo environment.
 
-    Args:
-        problem: The problem.
-        physics: Physics of the robots, see :func:`~d4orm_planners.base.physics.find_physics`.
-        policy: Policy that is to act in it: where ``options`` say nothing, robots observe what it wants them to.
-        **options: Further arguments of :class:`d4orm_env.navigation_v0.parallel_env`.
-
-    Raises:
-        ValueError: As :func:`~d4orm_planners.base.physics.find_physics`, or for a bad argument.
-        ImportError: If the physics needs a library that is not installed.
+    Where these say nothing, robots observe what the policy that is to act in it wants them to.
     """
     module, bodies = find_physics(physics, problem)
     if isinstance(policy, Policy):  # a user's own may have no more than reset and act

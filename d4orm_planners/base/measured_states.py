@@ -25,11 +25,7 @@ Bounds = tuple[FloatArray, ...]
 
 
 def seconds(time: object) -> float:
-    """Return a time of a clock [s].
-
-    Raises:
-        ValueError: If it is none.
-    """
+    """Return a time of a clock [s]. Raises ValueError if it is none."""
     if isinstance(time, Real) and not isinstance(time, bool):
         with suppress(OverflowError):
             if abs(value := float(time)) <= LATEST:
@@ -44,11 +40,8 @@ def robots_by_agent(num_robots: int) -> dict[str, int]:
 
 
 def acting_robots(policy: object, observations: Mapping[str, object]) -> list[int]:
-    """Numbers of the robots that a policy is asked for.
-
-    Raises:
-        RuntimeError: Before the policy's first reset, or after one that failed.
-        ValueError: If the observations are not by agent of its team.
+    """Numbers of the robots that a policy is asked for; ValueError if observations are not by agent, RuntimeError
+    before reset.
     """
     problem: Problem | None = getattr(policy, "problem", None)
     if problem is None:
@@ -64,11 +57,7 @@ def acting_robots(policy: object, observations: Mapping[str, object]) -> list[in
 
 
 def stacked_observations(observations: Mapping[str, FloatArray], shape: tuple[int, ...]) -> FloatArray:
-    """``(N, *shape)`` observations of ``N`` robots.
-
-    Raises:
-        ValueError: If one has another shape or is not finite.
-    """
+    """``(N, *shape)`` observations of ``N`` robots. Raises ValueError if one has another shape or is not finite."""
     with suppress(ValueError):
         seen = as_float32([*observations.values()])
         if seen.shape == (len(observations), *shape) and np.isfinite(seen).all():
@@ -79,13 +68,10 @@ def stacked_observations(observations: Mapping[str, FloatArray], shape: tuple[in
 def completed(
     problem: Problem, bounds: Bounds, states: ArrayLike, reference: FloatArray, expected: Callable[[], FloatArray]
 ) -> tuple[FloatArray, BoolArray]:
-    """``(K, n)`` measured states, and ``(K,)`` whose position and heading are finite.
+    """``(K, n)`` measured states, and ``(K,)`` whose position and heading are finite; ValueError for another shape.
 
     Others are where the ``reference`` is. What else of a robot is not finite, as it has no sensor for it, is as
     ``expected``. Whole turns of angles say nothing, and numbers far beyond the state space are cut off.
-
-    Raises:
-        ValueError: If the states have another shape.
     """
     measured = numbers_of(states, "states must be an array of numbers")
     if measured.shape != reference.shape:

@@ -102,10 +102,8 @@ def make_policy(name: PolicyLike, **config: Any) -> Policy:
 
 
 def find_policy(policy: object) -> object:
-    """Return the thing that a policy's name or import path stands for; anything but text is returned as it is.
-
-    Raises:
-        ValueError: If there is no such policy.
+    """Return the thing that a policy's name or import path stands for, else a ValueError; all but text is returned as
+    it is.
     """
     if is_brought(policy):
         return policy
@@ -162,11 +160,7 @@ def setting_names(policy: object, given: Mapping[str, object] = NOTHING) -> tupl
 
 
 def default_settings(policy: str) -> dict[str, object]:
-    """Settings of a planner or policy with their defaults; ``"required"`` where there is none.
-
-    Raises:
-        ValueError: If there is no such planner or policy.
-    """
+    """Settings of a planner or policy with their defaults; ``"required"`` where there is none."""
     kind = find_policy(policy)
     if (config_class := getattr(kind, "config_class", None)) is not None:
         return dict(config_class().keywords())
@@ -175,13 +169,10 @@ def default_settings(policy: str) -> dict[str, object]:
 
 
 def policy_settings(name: object, **config: Any) -> dict[str, object]:
-    """All that distinguishes ``make_policy(name, **config)`` from other policies of that name.
+    """All that distinguishes ``make_policy(name, **config)`` from other policies of that name; refused where that is.
 
     These are its settings, with the defaults of a configuration class, and with those of a preset in its place. A
     policy from outside this package has the digest of its source as well.
-
-    Raises:
-        ValueError, TypeError: As :func:`make_policy`; also if there is no source to be read.
     """
     kind, owner = find_policy(name), f"policy {called(name)!r}"
     settings: dict[str, object]
@@ -223,11 +214,8 @@ def _policy_config(kind: object, config_class: type[Config], given: Mapping[str,
 def _configured(
     config_class: type[Config], presets: Presets, preset: object, config: Mapping[str, object], owner: str
 ) -> Config:
-    """Settings as given, on top of those of a preset.
-
-    Raises:
-        ValueError: For an unknown preset, or a setting that makes no sense.
-        TypeError: For an unknown setting.
+    """Settings as given, on top of those of a preset; ValueError or, for an unknown setting, TypeError for what makes
+    no sense.
     """
     if preset is not None and not (isinstance(preset, str) and preset in presets):
         remedy = f"choose one of {', '.join(presets)}" if presets else "it has none, so leave it out"

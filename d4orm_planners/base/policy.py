@@ -271,11 +271,7 @@ def acts(thing: object) -> TypeGuard[Policy]:
 
 
 def as_policy(thing: Any, owner: str) -> Policy:
-    """Wrap what acts itself as a policy.
-
-    Raises:
-        ValueError: If it does not.
-    """
+    """Wrap what acts itself as a policy. Raises ValueError if it does not."""
     if isinstance(thing, Planner):
         return OpenLoop(thing)
     if acts(thing) and not isinstance(thing, type):

@@ -11,21 +11,13 @@ from d4orm_planners.base.policy import Policy
 
 
 def fresh_policy(name: PolicyLike, **config: Any) -> Policy:
-    """:func:`make_policy`, where that returns an instance that was given, a copy of it: its episodes do not change it.
-
-    Raises:
-        ValueError, TypeError: As :func:`make_policy`; also if an instance cannot be copied.
-    """
+    """:func:`make_policy`, where that returns a given instance, a copy of it: its episodes do not change it."""
     policy = make_policy(name, **config)
     return copy_policy(policy) if policy is find_policy(name) else policy
 
 
 def copy_policy(policy: Policy) -> Policy:
-    """A policy like this one, whose episodes do not change it.
-
-    Raises:
-        ValueError: If it cannot be copied.
-    """
+    """A policy like this one, whose episodes do not change it. Raises ValueError if it cannot be copied."""
     # Those of this package begin anew at every reset.
     if type(policy).__module__.startswith("d4orm_planners."):
         return copy.copy(policy)

@@ -44,8 +44,7 @@ class Driving:
     def turn(self, env: Any = None) -> Iterator[None]:
         """Context in which a thread resets the policy for an environment or, without one, asks it for controls.
 
-        Raises:
-            RuntimeError: If another thread does so at this moment, or has reset the policy for its own environment.
+        A RuntimeError if another thread does so at this moment, or has reset the policy for its own environment.
         """
         if not self._lock.acquire(blocking=False):
             raise RuntimeError(f"another thread is using this policy at this moment; {_REMEDY}")
@@ -65,11 +64,7 @@ class Driving:
 
 
 def check_episode(policy: Any, env: Any) -> None:
-    """Refuse a policy whose last reset was for another environment.
-
-    Raises:
-        RuntimeError: If so.
-    """
+    """Refuse a policy whose last reset was for another environment, by a RuntimeError."""
     driving = vars(policy).get(ATTRIBUTE)
     if driving is not None and not driving.is_for(env):
         raise RuntimeError("this policy has begun another episode since; give each controller one of its own")

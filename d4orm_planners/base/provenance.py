@@ -111,10 +111,7 @@ def attributes(thing: object) -> dict[str, object]:
     """All that distinguishes an instance or a function from others of the same source, by name, as JSON has it.
 
     These are the attributes of an instance, and the default arguments and closure of a function. Numbers, truth values
-    and text stay as they are; of all else there is a digest.
-
-    Raises:
-        ValueError: If one of them cannot be told from others of its type, as an open file.
+    and text stay as they are; of all else there is a digest, or a ValueError for what has none, as an open file.
     """
     if isinstance(thing, partial):
         given = {str(number): value for number, value in enumerate(thing.args)} | thing.keywords

@@ -170,21 +170,15 @@ class SharedPolicy(Policy):
 
 
 def loaded(model: Model, method: str = "state_dict") -> Model:
-    """A model, which must have a method.
-
-    Raises:
-        ValueError: If it has not, as the path of one.
-    """
+    """A model, which must have a method: a ValueError for others, as the path of one."""
     if isinstance(model, type) or not hasattr(model, method):
         raise ValueError(f"the model is {short_repr(model)}; load it first, and give what acts and has {method}")
     return model
 
 
 def _checked_actions(answer: Any, count: int) -> FloatArray:
-    """Actions ``(count, m)`` that a model answers with.
-
-    Raises:
-        ValueError: If it is anything else, as actions with the state of a recurrent network.
+    """Actions ``(count, m)`` that a model answers with; ValueError for all else, as actions with a recurrent network's
+    state.
     """
     with contextlib.suppress(ValueError):
         if not isinstance(answer, tuple) and (actions := as_float32(answer)).shape[:-1] == (count,):

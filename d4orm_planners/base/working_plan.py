@@ -99,12 +99,11 @@ class WorkingPlan:
         return np.floor(costs[:, 0]) + (reported <= self.problem.horizon), np.minimum(first[:, 0], reported)
 
     def take_best(self, robots: ArrayLike, paths: Rollouts, *, or_longer: bool = False) -> None:
-        """Let one robot after the other take the best of its paths, if that is better than what it does.
+        """Let robots ``(R,)``, one after the other, take the best of their ``V`` paths, if that is better than what
+        they do.
 
-        Args:
-            robots: ``(R,)``.
-            paths: ``V`` of each. The best has the fewest faults, and of those with as many takes the least time.
-            or_longer: Take it even if it takes longer, as long as it has no more faults.
+        It has the fewest faults and, of those with as many, takes the least time. With ``or_longer`` it may take longer
+        than what the robot does, as long as it has no more faults.
         """
         for i, robot in enumerate(np.asarray(robots).tolist()):
             costs = self._path_costs(robot, np.moveaxis(paths.positions[:, i], 1, 0), paths.arrived[i])

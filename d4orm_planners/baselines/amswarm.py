@@ -54,10 +54,8 @@ class Swarm:
         self.violation = 0.0
 
     def run(self, engine: Engine, should_stop: Callable[[], bool]) -> FloatArray:
-        """Plan and drive step by step until all have arrived, the horizon ends or it must stop; the rest is zero.
-
-        Returns:
-            ``(H, K, m)`` controls.
+        """``(H, K, m)`` controls, planned and driven step by step until all have arrived or it must stop; the rest is
+        zero.
         """
         problem = self._problem
         controls = np.zeros((problem.horizon, problem.num_robots, problem.control_size), np.float32)

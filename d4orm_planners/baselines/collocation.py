@@ -83,8 +83,7 @@ class TeamProgram:
     def write(self, contacts: Contacts, arrivals: IntArray) -> tuple[dict[str, Expression], dict[str, Floats]]:
         """The program as CasADi takes it, with robots at their goals from steps ``arrivals`` ``(K,)`` on.
 
-        Returns:
-            Variables ``x``, cost ``f`` and constraints ``g``, each one column; and their bounds.
+        Variables ``x``, cost ``f`` and constraints ``g``, each one column; and their bounds.
         """
         ca = self.casadi
         rows = [*self._motion_rows(), *self._goal_rows(arrivals), *self._contact_rows(contacts, arrivals)]

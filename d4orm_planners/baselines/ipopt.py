@@ -193,13 +193,11 @@ def solve_program(
     options: Options,
     should_stop: Callable[[], bool],
 ) -> tuple[CollocatedMotion, str]:
-    """Solve from a guess, with robots at their goals by steps ``arrivals`` ``(K,)``, from which on they stay there.
+    """The motion that IPOPT comes to from a guess, feasible or not, and its word for how it ended.
 
-    ``should_stop`` is asked every hundredth of a second; it ends within a tenth, even where writing the program or one
-    of IPOPT's iterations takes longer.
-
-    Returns:
-        The motion that IPOPT came to, feasible or not, and its word for how it ended.
+    Robots are at their goals by steps ``arrivals`` ``(K,)``, from which on they stay there. ``should_stop`` is asked
+    every hundredth of a second; it ends within a tenth, even where writing the program or one of IPOPT's iterations
+    takes longer.
     """
     start = reached = program.packed(guess)
 

@@ -67,11 +67,7 @@ Workers = Annotated[int | None, typer.Option("--workers", "-j", help="Processes;
 
 
 def takes(options: type[T]) -> Callable[[Callable[[T], None]], Callable[..., None]]:
-    """Make a command of a function of one argument: a dataclass, whose fields are the command's options.
-
-    Args:
-        options: The dataclass; the fields' types are annotated as those of parameters are for Typer.
-    """
+    """Make a command of a function of one argument: a dataclass, whose fields, annotated for Typer, are its options."""
 
     def decorate(function: Callable[[T], None]) -> Callable[..., None]:
         @wraps(function)

@@ -59,8 +59,7 @@ class DeformedPlan(WorkingPlan):
     ) -> tuple[Problem, FloatArray, Trajectory]:
         """Deform these robots' first ``horizon`` controls around all others.
 
-        Returns:
-            The problem of these robots alone, their new controls as planned, and the rollout of those in it.
+        Their problem alone, their new controls as planned, and the rollout of those in it.
         """
         planner, search, problem = self.planner, self.search, self.problem
         part = problem.select(robots)

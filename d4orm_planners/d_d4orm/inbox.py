@@ -51,11 +51,7 @@ class Evaluator:
         self._lock = threading.Lock()
 
     def own(self, controls: FloatArray) -> Candidate:
-        """Evaluate the controls of a node of this process.
-
-        Raises:
-            Stopped: If it is no longer wanted.
-        """
+        """Evaluate the controls of a node of this process. Raises Stopped if it is no longer wanted."""
         # Evaluation holds the interpreter's lock: two at once would both be half as fast.
         with self._lock:
             if self.stop.is_set():
@@ -183,11 +179,7 @@ def shares(total: int, parts: int) -> tuple[int, ...]:
 
 
 def merge(newest: Mapping[int, Item], arrivals: Iterable[Message]) -> tuple[dict[int, Item], tuple[Message, ...]]:
-    """The newest item of every node.
-
-    Returns:
-        What is held now, and the stale arrivals: those that are no newer than what was held before.
-    """
+    """The newest item of every node, and the stale arrivals: those that are no newer than what was held before."""
     merged, stale = dict(newest), list[Message]()
     for item in arrivals:
         if item.node in newest and item.sequence <= newest[item.node].sequence:
@@ -240,18 +232,10 @@ def diverse(rewards: ArrayLike, points: ArrayLike, k: int, generator: np.random.
 
 
 def choose(selection: str, rewards: ArrayLike, points: ArrayLike, k: int, generator: np.random.Generator) -> int:
-    """Index of the candidate to go on from.
+    """Index of the candidate to go on from, by the rewards ``(n,)`` and controls, ``points`` ``(n, ...)``, of all.
 
-    Args:
-        selection: ``"top-k"`` draws one of the ``k`` best (Algorithm 5); ``"max"`` takes the best; ``"k-means"`` draws
-            one of the best of ``k`` clusters (section VIII-D).
-        rewards: ``(n,)``.
-        points: ``(n, ...)`` the candidates' controls.
-        k: Number to draw from.
-        generator: Generator that it is drawn with.
-
-    Raises:
-        ValueError: If there is no such rule.
+    ``"top-k"`` draws one of the ``k`` best (Algorithm 5); ``"max"`` takes the best; ``"k-means"`` draws one of the best
+    of ``k`` clusters (section VIII-D).
     """
     if selection == "max":
         return top_k(rewards, 1)[0]

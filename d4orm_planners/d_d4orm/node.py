@@ -157,12 +157,10 @@ class Node:
             )
 
     def settle(self, seconds: float) -> bool:
-        """Send the best candidate repeatedly, until all others have one as good or the time is over.
+        """Send the best candidate repeatedly, until all others have one as good or the time is over; return whether
+        they have.
 
         Without a solution it only takes what has arrived.
-
-        Returns:
-            Whether all others have sent a solution as good as the best one here.
         """
         self._gather()
         deadline = time.perf_counter() + seconds

@@ -54,11 +54,7 @@ class NodePool(ABC):
         self._seconds = self._waited = 0.0
 
     def iterate(self, search: SolveRun) -> Iteration:
-        """The best new candidate, after a round of all nodes that live.
-
-        Raises:
-            RuntimeError: If every node has failed, from the error of the last one.
-        """
+        """The best new candidate, after a round of all nodes that live; a RuntimeError if every node has failed."""
         self._check_alive()
         compiled_before = {node: node.search.watch.paused_seconds for node in self.alive}
 
@@ -108,11 +104,8 @@ class NodePool(ABC):
 
     @abstractmethod
     def _round(self, time_left: Callable[[], float | None], improve: bool) -> list[Candidate]:
-        """New candidates of the nodes.
-
-        Args:
-            time_left: Returns the seconds left, below zero when overdue.
-            improve: Whether nodes go on once there is a solution.
+        """New candidates of the nodes, which go on once there is a solution to ``improve`` it; time left is below 0
+        when overdue.
         """
 
     def _lose(self, job: ThreadJob, reason: str) -> None:

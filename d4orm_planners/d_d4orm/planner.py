@@ -125,11 +125,7 @@ class DD4ormConfig(PlannerConfig):
         return next(kind for kind in NODE_PLANNERS.values() if kind.config_class is type(self.refinement))
 
     def node_planners(self, nodes: int) -> list[NodePlanner]:
-        """The planner of each of so many nodes.
-
-        Raises:
-            ValueError: If there are not two samples for each.
-        """
+        """The planner of each of so many nodes. Raises ValueError if there are not two samples for each."""
         settings: list[dict[str, Any]] = [{"engine": self.engine, "improve": self.improve} for _ in range(nodes)]
         for name in ("num_samples", "repair_samples"):
             total = getattr(self.refinement, name, None)

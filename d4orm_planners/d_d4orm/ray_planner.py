@@ -101,11 +101,7 @@ def _loopback_only() -> Iterator[None]:
 
 
 def host_and_port(address: str) -> tuple[str, int]:
-    """Return host and port of an address; nothing for one that is no ``host:port``, with ``ray://`` or without.
-
-    Raises:
-        ValueError: If it is no address.
-    """
+    """Host and port of an address, none for ``auto`` and ``local``; ValueError for others that are no ``host:port``."""
     if address in ("auto", "local"):
         return "", 0
     host, _, port = str(address).removeprefix("ray://").rpartition(":")
@@ -179,11 +175,7 @@ class RayPlanner(Planner):
         self._calling, self._closed = threading.Lock(), threading.Event()
 
     def start(self) -> None:
-        """Wait until the actor is there.
-
-        Raises:
-            ConnectionError: If it does not start.
-        """
+        """Wait until the actor is there. Raises ConnectionError if it does not start."""
         try:
             self.process = self._ray.get(self._actor.ready.remote(), timeout=START)
         except self._ray.exceptions.RayTaskError as error:
@@ -231,11 +223,7 @@ class RayPlanner(Planner):
 def ray_planners(
     connection: RayConnection, planners: list[Planner], problem: Problem, seeds: list[int]
 ) -> list[RayPlanner]:
-    """Planners that do what these do, each in an actor, once all actors are there.
-
-    Raises:
-        ConnectionError: If an actor does not start.
-    """
+    """Planners that do what these do, each in an actor, once all are there; ConnectionError if one does not start."""
     ray, number = connection.ray, len(planners)
     machines = sum(bool(machine["Alive"]) for machine in ray.nodes())
     # Without a claim on cores no actor waits for a place, however many there are; they share what a machine has.

@@ -55,11 +55,7 @@ class MessageError(ValueError):
 
 
 def encode(message: Message, problem: Problem) -> bytes:
-    """A message as bytes.
-
-    Raises:
-        MessageError: If it would be longer than :data:`MAX_BYTES`.
-    """
+    """A message as bytes. Raises MessageError if it would be longer than :data:`MAX_BYTES`."""
     digest = bytes.fromhex(problem.digest)
     content = np.ascontiguousarray(message.controls, "<f4")
     header = _HEADER.pack(
@@ -73,16 +69,10 @@ def encode(message: Message, problem: Problem) -> bytes:
 
 
 def decode(data: bytes, problem: Problem, num_nodes: int) -> Message:
-    """Read a message.
+    """Read a message, which may be anything, about this problem, from a node that is numbered below ``num_nodes``.
 
-    Args:
-        data: Anything.
-        problem: The problem that it must be about.
-        num_nodes: Nodes are numbered below it.
-
-    Raises:
-        MessageError: If it is anything but a message of this version with finite controls, none beyond
-            :data:`~d4orm_planners.base.candidate.MOST_OF_LIMIT` times its limit, for this problem, from a node.
+    A MessageError if it is anything but one of this version with finite controls, none beyond
+    :data:`~d4orm_planners.base.candidate.MOST_OF_LIMIT` times its limit.
     """
     if len(data) > MAX_BYTES:
         raise MessageError("too_large", f"{len(data)} bytes; at most {MAX_BYTES} are read")

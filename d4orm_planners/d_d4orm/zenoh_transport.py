@@ -104,11 +104,7 @@ class ZenohSettings(CheckedSettings):
 
     @classmethod
     def of(cls, settings: object) -> ZenohSettings:
-        """Settings from a mapping; those that are such already stay.
-
-        Raises:
-            ValueError: If it is neither, or a setting is unknown or makes no sense.
-        """
+        """Settings from a mapping; those that are such already stay. Raises ValueError for others."""
         if isinstance(settings, cls):
             return settings
         if not isinstance(settings, Mapping):

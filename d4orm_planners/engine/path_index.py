@@ -73,14 +73,10 @@ class PathIndex:
         return np.stack(np.divmod(met, num_robots), axis=1)
 
     def count_meetings(self, robots: ArrayLike, states: FloatArray) -> tuple[Ints, Ints]:
-        """Count the others that robots would meet on each of some paths, if only that one changed.
+        """Count the others that robots ``(R,)`` would meet on each of ``V`` paths, if only that one changed.
 
-        Args:
-            robots: ``(R,)``.
-            states: ``(R, V, H+1, n)`` states, or just positions.
-
-        Returns:
-            ``(R, V)``, and the first step at which each meets one, ``H+1`` if it meets none.
+        ``states`` are ``(R, V, H+1, n)``, or just positions. Numbers are ``(R, V)``, and so are the first steps at
+        which each meets one, ``H+1`` if it meets none.
         """
         index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(states, np.float32)
         counts, when = np.empty((2, *paths.shape[:2]), np.int32)
@@ -208,16 +204,10 @@ farther than :mod:`d4orm_env.verify.docking` has it."""
 
 
 def check_alone(arrays: ProblemArrays, robots: ArrayLike, states: FloatArray) -> Ints:
-    """Check some robots' paths without looking at the others.
+    """Check paths ``(R, V, H+1, n)`` of robots ``(R,)``, states or just positions, without looking at the others.
 
-    Args:
-        arrays: The problem.
-        robots: ``(R,)``.
-        states: ``(R, V, H+1, n)`` states, or just positions.
-
-    Returns:
-        ``(3, R, V)`` steps: the first after the start within the margin of an obstacle or the bounds; the last that
-        moves the robot; and the first at which rounding decides whether it is at its goal. ``H+1`` where there is none.
+    ``(3, R, V)`` steps, ``H+1`` where there is none: the first after the start within the margin of an obstacle or the
+    bounds; the last that moves the robot; and the first at which rounding decides whether it is at its goal.
     """
     index, paths = np.asarray(robots, np.int64), np.ascontiguousarray(states, np.float32)
     steps = np.empty((3, *paths.shape[:2]), np.int32)

@@ -119,16 +119,10 @@ def _softmax(
 def softmax_weights(
     rewards: FloatArray, temperature: float, cutoff: float, log_ratio: FloatArray | None = None
 ) -> FloatArray:
-    """``exp(reward / (temperature * standard deviation) + log_ratio)``, normalised to sum to one.
+    """``(..., M)`` float32 ``exp(reward / (temperature * standard deviation) + log_ratio)``, normalised to sum to one.
 
-    Args:
-        rewards: ``(..., M)``; samples at minus infinity get no weight.
-        temperature: ``lambda``.
-        cutoff: Weights below this share of the largest are zero.
-        log_ratio: ``(..., M)`` added to the logarithm of the weights, or ``None``.
-
-    Returns:
-        ``(..., M)`` float32 weights; all zero where no sample is more than minus infinity.
+    Samples at minus infinity get no weight, so that all may be zero, and weights below a share ``cutoff`` of the
+    largest are zero.
     """
     rows = np.ascontiguousarray(rewards, np.float32)
     num_samples = rows.shape[-1]

@@ -36,14 +36,7 @@ def circumstances(command: str) -> Measurement:
 def write_report(
     folder: Path, settings: BenchmarkSettings, begun: Measurement, results: dict[str, list[Measurement]]
 ) -> tuple[Path, Path]:
-    """Write ``bench.json`` and ``bench.md``.
-
-    Returns:
-        The two paths.
-
-    Raises:
-        OSError: If the folder does not exist or cannot be written to.
-    """
+    """Write ``bench.json`` and ``bench.md``, and return their paths."""
     document = {"format": FORMAT, **begun, "settings": asdict(settings), **results}
     with replaced_when_done(folder / "bench.json") as path:
         path.write_text(json.dumps(document, indent=1, default=asdict, allow_nan=False) + "\n", encoding="utf-8")

@@ -30,14 +30,9 @@ act count with all the time of an episode."""
 
 
 def leaderboard(trials: Sequence[Trial], deadlines: Sequence[float] = ()) -> str:
-    """The page.
+    """The page of stored trials, with tables of success within ``deadlines`` [s] for planning, if there are any.
 
-    Args:
-        trials: Result of :meth:`~d4orm_planners.evaluation.store.TrialStore.trials`.
-        deadlines: Seconds for planning, for tables of success within them; none by default.
-
-    Raises:
-        ValueError: If there are no trials, or a deadline is not positive.
+    No trials, or a deadline that is not positive, are a ValueError.
     """
     if not trials:
         raise ValueError("the store holds no trials yet; run `d4orm evaluate` first")

@@ -61,9 +61,8 @@ class JobWorker(Protocol):
     def receive(self, timeout: float | None) -> Any:
         """Return the job's next message: :data:`BEGUN`, then each result.
 
-        Raises:
-            TimeoutError: If it does not come within so many seconds.
-            WorkerLost: If the process is gone; the next job begins another one.
+        A TimeoutError if it does not come within so many seconds, WorkerLost if the process is gone; the next job
+        begins another.
         """
 
     def stop(self) -> None:
@@ -73,15 +72,11 @@ class JobWorker(Protocol):
 def run_jobs(
     jobs: Iterable[Work[Result]], workers: Sequence[JobWorker], timeout: float | None = None
 ) -> Generator[list[Result]]:
-    """Run jobs and yield results as they come, :meth:`Work.lost` where a process dies or a part takes too long.
+    """Run jobs and yield results as they come, :meth:`Work.lost` where a process dies or a part takes over ``timeout``
+    [s].
 
-    Args:
-        jobs: Jobs to run.
-        workers: Workers that share them; stopped at the end, also when the iteration is broken off.
-        timeout: Seconds that a part may take; ``None`` is no limit.
-
-    Raises:
-        OSError: If no process can be started.
+    The workers share the jobs; they are stopped at the end, also when the iteration is broken off. Raises OSError if no
+    process can be started.
     """
     waiting, found = deque(jobs), SimpleQueue[list[Result] | Exception | None]()
     over = threading.Event()
@@ -233,17 +228,9 @@ def run_on_ray(
 ) -> Generator[list[Result]]:
     """:func:`run_jobs` by tasks on a Ray cluster, one per job and core, never tried again by Ray itself.
 
-    Args:
-        jobs: Jobs to run.
-        address: ``"auto"`` for the cluster that this machine belongs to, an address, or ``"local"`` for a new one on
-            this machine.
-        size: Jobs under way at most; by default twice as many as the cluster has cores.
-        timeout: Seconds that a part may take.
-
-    Raises:
-        ValueError: If the address is none.
-        ImportError: If Ray is not installed.
-        ConnectionError: If there is no cluster.
+    Its address is ``"auto"`` for the one that this machine belongs to, ``"local"`` for a new one here, or an address.
+    At most ``size`` jobs are under way, by default twice as many as it has cores. Raises ValueError if the address is
+    none, ImportError without Ray, ConnectionError if there is no cluster.
     """
     connection = RayConnection(address, RAY_USE)
     try:

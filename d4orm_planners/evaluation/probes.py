@@ -76,11 +76,7 @@ CELL, BLOCKED = 0.6, 0.2
 
 
 def _run(code: str, *arguments: object, cache: str | None = None) -> tuple[float, Measurement]:
-    """Seconds from start to exit of a fresh interpreter, and what it printed.
-
-    Raises:
-        RuntimeError: If it fails; the message is its last line of error output.
-    """
+    """Seconds from start to exit of a fresh interpreter, and what it printed; RuntimeError if it fails."""
     environment = dict(os.environ) if cache is None else {**os.environ, "NUMBA_CACHE_DIR": cache}
     begin = time.perf_counter()
     process = subprocess.run(
@@ -96,9 +92,8 @@ def _run(code: str, *arguments: object, cache: str | None = None) -> tuple[float
 def measure_startup(scenario: str, num_robots: int, repetitions: int) -> Measurement:
     """First plan of a process: once with an empty kernel cache, then with a full one.
 
-    Returns:
-        ``cold`` seconds from start to exit of the first process and ``compiling``, the part that was neither importing
-        nor planning; ``warm`` the :class:`Spread` of the processes after it, start to exit.
+    ``cold`` are seconds from start to exit of the first process and ``compiling`` the part that was neither importing
+    nor planning; ``warm`` is the :class:`Spread` of the processes after it.
     """
     with tempfile.TemporaryDirectory() as cache:
         cold, first = _run(_FIRST_PLAN, scenario, num_robots, cache=cache)

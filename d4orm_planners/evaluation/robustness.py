@@ -193,9 +193,8 @@ _LINE = ("label", "scenario", "num_robots", "model", "control_noise_std", "distu
 def tolerances(rates: Iterable[SuccessRate]) -> list[Tolerance]:
     """One for every policy, scenario, team size, level of noise and disturbance, in order of appearance.
 
-    Args:
-        rates: In any order, if a disturbance has a level without effect, else its levels from harmless to bad. Those
-            without a disturbance only tell the undisturbed success.
+    Rates may be in any order, if a disturbance has a level without effect; else its levels are from harmless to bad.
+    Those without a disturbance only tell the undisturbed success.
     """
     lines: dict[tuple[object, ...], list[SuccessRate]] = {}
     undisturbed: dict[tuple[object, ...], float] = {}

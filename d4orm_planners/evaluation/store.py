@@ -234,8 +234,7 @@ class TrialStore(SqliteFile):
 def checked_trial(values: Mapping[str, Any]) -> Trial:
     """A trial of what a file has for each of its attributes; truth values may be numbers.
 
-    Raises:
-        ValueError: If one is of another type; the message goes on from the name of the trial.
+    Another type is a ValueError, which goes on from the trial's name.
     """
     for name, kinds in _KINDS.items():
         if not isinstance(values[name], kinds) or (name in _JSON and not _is_json(values[name], _JSON[name])):

@@ -61,9 +61,7 @@ class Study:
     def groups(self) -> list[list[Job]]:
         """A list of jobs per scenario, model, team size and policy, in that order, with one for every seed.
 
-        Raises:
-            ValueError: For an unknown name or setting, a number that makes no sense, or nothing to do.
-            ImportError: If a policy, or the physics, needs a library that is not installed.
+        Raises ValueError and ImportError as :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
         """
         under = tuple(
             replace(condition, physics=self.physics)
@@ -90,12 +88,7 @@ class Study:
         ]
 
     def configurations(self) -> list[Configuration]:
-        """The policies with their settings.
-
-        Raises:
-            ValueError: For an unknown name or setting, no policy, or a time limit that concerns none of them.
-            ImportError: If a policy needs a library that is not installed.
-        """
+        """The policies with their settings, checked as those of :meth:`groups`."""
         chosen = [self._configuration(label, *given) for label, given in _labelled(self.policies).items()]
         if not chosen:
             raise ValueError("policies is empty; give at least one")
@@ -238,11 +231,7 @@ def _several(values: T | Iterable[T], name: str = "") -> tuple[T, ...]:
 def conditions(
     control_noise_std: float | Iterable[float], disturbances: DisturbanceLevels | None
 ) -> tuple[Condition, ...]:
-    """Every level of noise with every level of every disturbance, one disturbance at a time.
-
-    Raises:
-        ValueError: For an unknown name, a level that makes no sense, or nothing to do.
-    """
+    """Every level of noise with every level of every disturbance, one at a time; ValueError for what makes no sense."""
     given: tuple[float, ...] = _several(control_noise_std)
     noise = tuple(dict.fromkeys(positive_number(std, "control_noise_std", zero_allowed=True) for std in given))
     if not noise:

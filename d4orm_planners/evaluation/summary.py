@@ -113,10 +113,8 @@ class SuccessWithin:
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Mean of a sample, and its 95% confidence interval by Student's t.
-
-    Returns:
-        Mean, lower and upper end; the ends are ``None`` for fewer than two values, and the mean for none.
+    """Mean of a sample, and its 95% confidence interval by Student's t; ``None`` for what takes more values than there
+    are.
     """
     if not values:
         return None, None, None
@@ -128,12 +126,9 @@ def mean_interval(values: Sequence[float]) -> tuple[float | None, float | None, 
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95% confidence interval of a success rate by Wilson's method.
+    """95% confidence interval of a success rate of at least one trial by Wilson's method.
 
     Unlike the normal approximation it stays inside [0, 1] and says something at 0 and at all successes.
-
-    Raises:
-        ValueError: If there are no trials, more successes than trials, or fewer than none.
     """
     interval = stats.binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)

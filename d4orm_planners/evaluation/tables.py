@@ -37,15 +37,7 @@ HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "
 def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
     """Write ``table.md`` and ``table.csv``, and of the store in the folder ``trials.csv`` and ``trials.parquet``.
 
-    Args:
-        folder: Folder of the store.
-        rates: Result of :func:`~d4orm_planners.evaluation.evaluate.evaluate`.
-
-    Returns:
-        The paths; ``trials.parquet`` is not among them, and not written, where pyarrow is not installed.
-
-    Raises:
-        OSError: If the folder cannot be written to.
+    The paths are returned; the last is not among them, and not written, where pyarrow is not installed.
     """
     trials = TrialStore.existing(Path(folder) / STORE).trials()
     paths = [Path(folder, name) for name in ("table.md", "table.csv", "trials.csv", "trials.parquet")]
@@ -70,10 +62,8 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
 
 
 def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
-    """Write trials as Parquet, one column per attribute.
-
-    Returns:
-        Whether it was written: ``False`` where pyarrow is not installed.
+    """Write trials as Parquet, one column per attribute; return ``False``, without writing, where pyarrow is not
+    installed.
     """
     try:
         load(pyarrow)
@@ -92,13 +82,10 @@ def write_parquet(path: Path, trials: Sequence[Trial]) -> bool:
 
 
 def read_parquet(path: str | os.PathLike[str]) -> list[Trial]:
-    """The trials that :func:`write_parquet` wrote.
+    """The trials that :func:`write_parquet` wrote; ImportError where pyarrow is not installed.
 
-    Raises:
-        ImportError: If pyarrow is not installed.
-        ValueError: If the file is no Parquet, has other columns, or more than a store has room for, or a value of
-            another type.
-        OSError: If it cannot be read.
+    A ValueError if the file is no Parquet, has other columns, or more than a store has room for, or a value of another
+    type.
     """
     try:
         require_file(Path(path), "one that d4orm evaluate wrote")

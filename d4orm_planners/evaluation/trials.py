@@ -54,10 +54,8 @@ class Condition:
 
     @property
     def text(self) -> str:
-        """The disturbances that change anything, as JSON: a list of ``[name, attributes]``.
-
-        Raises:
-            ValueError: If an attribute of a user's has no form in JSON, or its source cannot be read.
+        """The disturbances that change anything, as JSON: a list of ``[name, attributes]``; ValueError for what has no
+        such form.
         """
         listed = [[name_of(one), _attributes(one)] for one in self.disturbances if not one.negligible]
         return _stored(listed, f"disturbance {self.name!r} has an attribute")
@@ -86,10 +84,8 @@ class Configuration:
 
     @cached_property
     def config(self) -> str:
-        """All settings, the digest of a user's source, and what is observed, as JSON with sorted keys.
-
-        Raises:
-            ValueError: If a setting has no form in JSON, or a source cannot be read.
+        """All settings, the digest of a user's source, and what is observed, as JSON with sorted keys; ValueError
+        likewise.
         """
         observed = {"observation": dict(self.observation)} if self.observation else {}
         settings = policy_settings(self.source, **self.settings)
@@ -142,10 +138,7 @@ class Job:
     def run(self) -> Iterator[Trial]:
         """Run the trials one after another; a plan is made once and executed under all conditions.
 
-        Whatever a policy raises is the result of its trial, an exit of the program too.
-
-        Raises:
-            KeyboardInterrupt: If Ctrl-C was pressed meanwhile.
+        Whatever a policy raises is the result of its trial, an exit of the program too, but for Ctrl-C.
         """
         for reference in self.imports:
             load_reference(reference)

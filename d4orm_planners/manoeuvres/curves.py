@@ -70,10 +70,7 @@ NO_CURVES = Curves(
 def curves_of(kind: Kind, bent: bool, hitches: Mode | None = None) -> Curves:
     """Circles of a first-order car, and the swings between them and straight on.
 
-    Args:
-        kind: The car.
-        bent: Whether curves end in a bend, in the circles' own ...
-        hitches: ... or at these hitch angles [rad].
+    Curves end in a bend if they are ``bent``: in the circles' own, or at these hitch angles [rad].
     """
     swings, rows, straight, tightest = [], [], (0.0,) * len(kind.model.trailers), tightest_curvature(kind)
     if tightest is None:

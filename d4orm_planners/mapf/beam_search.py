@@ -227,21 +227,11 @@ def find_paths(
     limits: ArrayLike = np.inf,
     others: OtherAgents | None = None,
 ) -> Rollouts:
-    """The best paths that robots ``(R,)`` find; one that finds none does what it does, and does not arrive.
+    """The single best path that each of robots ``(R,)`` finds, or what it does, without arriving, for one that finds
+    none.
 
-    So do those left over when the search should stop.
-
-    Args:
-        team: Plan of all.
-        robots: Their numbers.
-        blocks: ``(R,)`` the block of steps at whose beginning their new paths begin.
-        primitives: Their motion primitives.
-        rules: Rules by which paths are kept.
-        limits: ``(R,)`` what a path must cost less than [s]: its time, and what it costs to meet others.
-        others: Agents that they mind, or do not mind.
-
-    Returns:
-        A single path of each.
+    So do those left over when the search should stop. Paths are new from the beginning of ``blocks`` ``(R,)`` of steps
+    on, and must cost less than ``limits`` ``(R,)`` [s]: their time, and what it costs to meet ``others``.
     """
     problem, horizon = team.problem, team.problem.horizon
     blocks, limits = np.broadcast_to(blocks, len(robots)), np.broadcast_to(np.asarray(limits, float), len(robots))

@@ -170,17 +170,11 @@ class TeamOnRoadmap:
 def find_moves(
     problem: Problem, roadmap: Roadmap, seed: int, should_stop: Callable[[], bool], max_steps: int = 1_000_000
 ) -> TeamMoves | None:
-    """Moves that bring all to their goals, or as many as possible until the search is stopped.
+    """Moves that bring all to their goals, or as many as possible until the search is stopped or has gone
+    ``max_steps``.
 
-    Args:
-        problem: The team.
-        roadmap: The roadmap of its world.
-        seed: Of ties.
-        should_stop: Asked before every step.
-        max_steps: Steps of the team after which the search ends.
-
-    Returns:
-        The moves; ``None`` where a robot has no path on the roadmap.
+    ``None`` where a robot has no path on the roadmap. ``should_stop`` is asked before every step, and the seed is of
+    ties.
     """
     team, num_robots = TeamOnRoadmap(problem, roadmap), problem.num_robots
     length = team.bodies.costs[np.arange(num_robots), roadmap.starts].astype(np.float64)

@@ -148,19 +148,12 @@ def improve_first_paths(team: WorkingPlan, rounds: int = FIRST_ROUNDS) -> None:
 
 
 def improve_paths(team: WorkingPlan, seed: int, rounds: int, temperature: float = TEMPERATURE) -> FloatArray:
-    """Let groups of robots look for faster paths, so many rounds, as long as there is time.
+    """``(H, K, m)`` controls of the best, after so many rounds of :data:`GROUPS` groups that look for faster paths.
 
     What counts is the sum of all arrival times and of all distances left over time, each as a share of the robot's
-    first: the first is what travel takes, the second what the reward is made of.
-
-    Args:
-        team: A team in which none fails; changed.
-        seed: Of what is tried.
-        rounds: Number of rounds of :data:`GROUPS` groups.
-        temperature: See :data:`TEMPERATURE`; it falls to zero with the rounds.
-
-    Returns:
-        ``(H, K, m)`` controls of the best that there has been; at a temperature of zero that is what the team does.
+    first: the first is what travel takes, the second what the reward is made of. In the team, which is changed, none
+    fails. The ``temperature``, see :data:`TEMPERATURE`, falls to zero with the rounds; at zero the best is what the
+    team does.
     """
     random, should_stop = np.random.default_rng(seed), team.search.should_stop
     return search_neighbourhoods(_Motions(team), random, rounds, should_stop, temperature)

@@ -23,11 +23,8 @@ class Cells(NamedTuple):
 
 
 def sort_into_cells(points: Floats, width: float) -> Cells:
-    """Sort points into cells of this width, or larger ones where there would be many more of them than points.
-
-    Args:
-        points: ``(N, 3)`` float64 [m].
-        width: [m].
+    """Sort points ``(N, 3)`` into cells of this width [m], or larger ones where there would be many more of them than
+    points.
     """
     low, high = points.min(axis=0), points.max(axis=0)
     while np.floor((high - low) / width + 1).prod() > 4 * len(points) + 64:

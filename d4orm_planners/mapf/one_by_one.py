@@ -25,16 +25,11 @@ HOPELESS = 10
 def plan_one_by_one(
     replanning: Replanning, random: np.random.Generator, should_stop: Callable[[], bool], patience: int
 ) -> TeamRollout | None:
-    """The team, its paths planned one by one.
+    """All robots' paths within the horizon, planned one by one; ``None`` if they were not found.
 
-    Args:
-        replanning: The search for a path.
-        random: Of the order, of the robots that may be displaced, and of how long others are left to set out.
-        should_stop: Asked before every path.
-        patience: Paths after which it gives up if no fewer robots wait for theirs than ever before.
-
-    Returns:
-        All robots' paths within the horizon; ``None`` if they were not found.
+    ``random`` draws the order, the robots that may be displaced, and how long others are left to set out.
+    ``should_stop`` is asked before every path, and after ``patience`` paths it gives up, if no fewer robots wait for
+    theirs than ever before.
     """
     problem, steps, num_robots = replanning.problem, replanning.problem.horizon, replanning.problem.num_robots
     positions = np.full((steps + 1, num_robots, 3), FAR)
@@ -110,16 +105,11 @@ class _Settled:
         return displaced
 
     def find_others(self, robot: int, displaced: IntArray, most: int) -> list[int]:
-        """Plan other paths for those that a robot displaces, which it leaves time to set out if it can.
+        """Plan other paths for those that a robot displaces, numbers ``(D,)``, which it leaves time to set out if it
+        can.
 
-        Args:
-            robot: The robot.
-            displaced: ``(D,)`` numbers of the others.
-            most: Those who may find no path, at most.
-
-        Returns:
-            Robots that have no path now: those that find none, or that robot where they are more than ``most``; then
-            all others have the paths that they had.
+        Robots that have no path now are returned: those that find none, or that robot where they are more than
+        ``most``; then all others have the paths that they had.
         """
         driven, lost, roadmap = self.driven, list[int](), self.replanning.roadmap
         controls, arrivals = driven.controls[:, displaced], driven.arrivals[displaced]

@@ -210,18 +210,12 @@ def find_all_at_once(search: SolveRun) -> RoadmapSolution | NoPaths:
 
 
 def relay_paths(problem: Problem, paths: FloatArray, changed: BoolArray, seed: int) -> FloatArray | None:
-    """Plan paths for some robots of a team with ever new goals around all others on their present paths.
+    """``(H + 1, K, d)`` future positions of a team with ever new goals [m], of which the ``changed`` ``(K,)`` are
+    planned.
 
-    Others yield only where there is no other path.
-
-    Args:
-        problem: The team where it is now, and its goals.
-        paths: ``(T + 1, K, d)`` positions of the robots from now on [m]; those of ``changed`` are not read.
-        changed: ``(K,)`` robots whose paths are planned.
-        seed: Of the robots that may have to yield, and of how leisurely they drive.
-
-    Returns:
-        ``(H + 1, K, d)`` future positions of all robots [m]; ``None`` if no paths were found.
+    They go around all others on their ``paths`` ``(T + 1, K, d)`` from now on [m], who yield only where there is no
+    other path; ``None`` if none were found. The seed is of those that may have to yield, and of how leisurely they
+    drive.
     """
     compile_path_finding(problem)
     num_robots, d = problem.num_robots, problem.dimension

@@ -53,12 +53,9 @@ class Roadmap(NamedTuple):
 def lay_roadmap(problem: Problem, fineness: float = 1.0, *, narrow: bool = False) -> Roadmap:
     """The roadmap of a team's world.
 
-    Nodes of the lattice are so far apart that a robot at one leaves room on the diagonals around it.
-
-    Args:
-        problem: The team, its starts and goals, and the world.
-        fineness: By how much nearer to each other nodes are than that, at most: in large worlds they are farther apart.
-        narrow: Whether robots' own shortest paths are part of it, however narrow the gaps that they lead through.
+    Nodes of the lattice are so far apart that a robot at one leaves room on the diagonals around it, or by ``fineness``
+    nearer at most: in large worlds they are farther apart. If ``narrow``, robots' own shortest paths are part of it,
+    however narrow the gaps that they lead through.
     """
     d, radius = problem.dimension, np.asarray(problem.team.radius, np.float64)
     spread = 2 * radius.max() + problem.margin + PAIR_SLACK * problem.team.largest_radius

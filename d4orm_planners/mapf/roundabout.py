@@ -49,16 +49,10 @@ class Bends(NamedTuple):
 
 
 def drive_roundabout(problem: Problem, engine: Engine, side: int) -> FloatArray | None:
-    """Controls ``(H, K, m)`` of a team in a roundabout.
+    """Controls ``(H, K, m)`` of a team that passes the middle to the left of it, side 1, or to the right, side -1.
 
-    Args:
-        problem: The team.
-        engine: Engine for rollouts.
-        side: 1 to pass the middle to the left of it, -1 to the right.
-
-    Returns:
-        ``None`` in space, where paths do not cross, where a robot begins or ends within the roundabout, or comes within
-        the margin of anything.
+    ``None`` in space, where paths do not cross, where a robot begins or ends within the roundabout, or comes within the
+    margin of anything.
     """
     if problem.dimension != 2 or problem.num_robots < 2:
         return None

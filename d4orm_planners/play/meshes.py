@@ -100,17 +100,11 @@ def edges(bounds: Points) -> Points:
 def polylines(
     path: Numbers, colors: Numbers, paper: int, shares: tuple[float, float], knots: Sequence[NDArray[np.intp]]
 ) -> tuple[Points, Colors]:
-    """Segments along the paths of a team.
+    """``(N, 2, 3)`` segments along the paths ``(T, K, d)`` of a team, and their colours, of ``colors`` ``(K, 3)`` up to
+    255.
 
-    Args:
-        path: ``(T, K, d)`` positions.
-        colors: ``(K, 3)`` up to 255.
-        paper: Brightness of what they are drawn on, up to 255.
-        shares: Share of its colour that a path has at its beginning and its end; the rest is paper.
-        knots: Points of its path that each robot's line goes through.
-
-    Returns:
-        ``(N, 2, 3)`` ends and their colours.
+    ``shares`` of these a path has at its beginning and its end; the rest is the brightness of the ``paper``. ``knots``
+    are points of its path that each robot's line goes through.
     """
     positions, share = in_space(path), np.linspace(shares[0], shares[1], len(path))[:, None]
     points, tones = [NO_LINES[0]], [NO_LINES[1].astype(np.float64)]

@@ -148,9 +148,8 @@ class MessageValidator:
     def checked(self, client: int, data: str | bytes) -> bytes:
         """Return a client's message, encoded anew.
 
-        Raises:
-            msgspec.DecodeError: If it is no message of a page, or one with fields of other types or sizes.
-            ValueError: If it asks for what the page does not offer.
+        A DecodeError if it is no message of a page, or of other types or sizes, a ValueError if the page does not offer
+        that.
         """
         if isinstance(data, str):
             raise msgspec.DecodeError("text where a page sends bytes")
@@ -241,8 +240,7 @@ class OriginCheck:
     def installed(self) -> Iterator[None]:
         """Have a server of web sockets that is started meanwhile ask first; viser starts one and has no option for it.
 
-        Raises:
-            RuntimeError: If none was started, so that nothing would be checked.
+        Raises RuntimeError if none was started, so that nothing would be checked.
         """
         serve, started = websockets.asyncio.server.serve, False
 

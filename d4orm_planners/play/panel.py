@@ -274,11 +274,7 @@ def status_text(frames: Sequence[Frame]) -> str:
 
 
 def read_scene(content: bytes) -> Problem:
-    """A scenario file that a page sent.
-
-    Raises:
-        ValueError: If it is too large, not text, or no scenario.
-    """
+    """A scenario file that a page sent. Raises ValueError if it is too large, not text, or no scenario."""
     if len(content) > LARGEST_UPLOAD:
         raise ValueError(f"the file has {len(content)} bytes; a scene has at most {LARGEST_UPLOAD}")
     try:

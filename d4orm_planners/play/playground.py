@@ -137,12 +137,9 @@ def _bad_camera_left_alone() -> Iterator[None]:
 
 
 def view_from(limits: Points, dimension: int, aspect: float) -> tuple[Vector, Vector]:
-    """Return camera and target for all between two corners to be seen beside the controls.
+    """Camera and target for all between corners ``(2, 3)`` to be seen beside the controls in a window of this shape.
 
-    Args:
-        limits: ``(2, 3)`` corners.
-        dimension: 2 for a view from above, 3 for one from the side.
-        aspect: Width over height of the window.
+    In the plane it is seen from above, in space from the side.
     """
     size = np.ptp(limits, axis=0).astype(np.float64)
     if dimension == 2:
@@ -227,11 +224,7 @@ class Playground:
         self._stopping = threading.Event()
 
     def run(self, seconds: float | None = None) -> None:
-        """Show the session until Ctrl-C or :meth:`stop`, or for so long.
-
-        Raises:
-            BaseException: The error that ended the session, if any.
-        """
+        """Show the session until Ctrl-C or :meth:`stop`, or for so long; an error that ended it is raised."""
         end = None if seconds is None else time.perf_counter() + seconds
         self.session.start()
         due = time.perf_counter()
@@ -267,11 +260,7 @@ class Playground:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return that port, or any that is free for 0.
-
-    Raises:
-        ValueError: If it is taken, or the host is not one of this machine's.
-    """
+    """Return that port, any that is free for 0; ValueError if it is taken, or the host is not one of this machine's."""
     if not host:  # which would be every address
         raise ValueError(
             "cannot listen at no host; give --host an address, as 127.0.0.1, or 0.0.0.0 for all of this machine's"

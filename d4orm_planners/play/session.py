@@ -115,14 +115,11 @@ class Session:
 
     @queued()
     def push(self, robot: int | None, velocity: ArrayLike, viewport: int = 0) -> None:
-        """Give a robot a velocity on top of its own at the next step's beginning, in all that drive side by side.
+        """Give a robot a velocity ``(d,)`` on top of its own at the next step's beginning [m/s], in all that drive side
+        by side.
 
-        The policies are not told, and have to find out.
-
-        Args:
-            robot: Its number; ``None`` is the one of this viewport that is farthest from its goal.
-            velocity: ``(d,)`` [m/s].
-            viewport: Whose robot has to be under way.
+        ``None`` is the one of this viewport that is farthest from its goal. The policies are not told, and have to find
+        out.
         """
         given = np.asarray(velocity, np.float32)
         leader = self._viewports[min(viewport, len(self._viewports) - 1)]

@@ -97,11 +97,8 @@ class EpisodeBuffer:
         return len(self._snapshots)
 
     def add(self, *snapshot: np.ndarray) -> None:
-        """Remember a snapshot.
-
-        Args:
-            *snapshot: States ``(K, n)``, goals ``(K, d)``, ``(K,)`` who has arrived, who has collided and who has come
-                too close, and ``(N, 2 d + 1)`` what moves about and is no robot.
+        """Remember a snapshot: states ``(K, n)``, goals ``(K, d)``, ``(K,)`` who has arrived, collided and come too
+        close, and ``(N, 2 d + 1)`` what moves about and is no robot.
         """
         with self._lock:
             self._snapshots.append(snapshot)
@@ -222,10 +219,8 @@ class Viewport:
     def push(self, robot: int, velocity: FloatArray) -> None:
         """Give a robot a velocity ``(d,)`` [m/s] on top of its own, which the policy is not told of.
 
-        As with :class:`~d4orm_env.disturbances.Push`, none becomes faster than it may be.
-
-        Raises:
-            ValueError: If it is at its goal for good.
+        As with :class:`~d4orm_env.disturbances.Push`, none becomes faster than it may be. One at its goal for good is
+        refused.
         """
         joint, problem = self._joint, self._scene
         check_robot(problem, robot)

@@ -112,11 +112,7 @@ class Algorithm:
         raise NotImplementedError
 
     def checked(self, tuned: Mapping[str, float]) -> dict[str, float]:
-        """``learner_settings``, values for :attr:`tunable`: whole where those here are.
-
-        Raises:
-            ValueError: For a keyword that is not one of them, or a value that makes no sense.
-        """
+        """``learner_settings``, values for :attr:`tunable`, whole where those here are; ValueError for others."""
         values: dict[str, float] = {}
         for keyword, value in tuned.items():
             if keyword not in self.tunable:
@@ -180,12 +176,9 @@ ALGORITHMS: Mapping[str, Algorithm] = MappingProxyType({"ppo": _PPO(), "sac": _S
 
 
 def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: VecNormalize) -> Network:
-    """The deterministic policy of a Stable-Baselines3 model.
+    """The deterministic policy of a PPO or SAC model with fully connected layers, and its normalisation.
 
-    Args:
-        header: Fields of :class:`~d4orm_planners.rl.network.Header` that the model does not tell.
-        model: A PPO or SAC model with fully connected layers.
-        normalization: Its ``VecNormalize``.
+    ``header`` are fields of :class:`~d4orm_planners.rl.network.Header` that the model does not tell.
     """
     arrays = {name: parameter.detach().numpy() for name, parameter in _parameters(model).items()}
     arrays["reward_variance"] = normalization.ret_rms.var
@@ -207,8 +200,7 @@ def network_of(header: Mapping[str, Any], model: BaseAlgorithm, normalization: V
 def set_network(model: BaseAlgorithm, normalization: VecNormalize, network: Network) -> None:
     """Have a model act as a network does, in its own normalisation; what it thinks of states is left as it is.
 
-    Raises:
-        ValueError: If it is another kind of network; the message says which is wanted.
+    Another kind of network is a ValueError that says which is wanted.
     """
     arrays, parameters, sets = network.arrays, _parameters(model), _set_extractor(model)
     theirs_kind, mine_kind = network.header.encoder or "flat", "flat" if sets is None else "sets"

@@ -169,11 +169,7 @@ class Checkpoint:
 
     @classmethod
     def read(cls, folder: Path) -> Checkpoint:
-        """Read what is small.
-
-        Raises:
-            ValueError: If it cannot be read.
-        """
+        """Read what is small. Raises ValueError if it cannot be read."""
         with _readable(folder):
             state = json.loads((folder / "state.json").read_text())
             evaluations = TypeAdapter(list[Evaluation]).validate_python(state["evaluations"])
@@ -182,10 +178,8 @@ class Checkpoint:
             return cls(folder, evaluations)
 
     def restore(self, env: VecNormalize, model: BaseAlgorithm, fresh: bool) -> None:
-        """Put a new environment, and the model if it is fresh, into the checkpoint's state.
-
-        Raises:
-            ValueError: If it cannot be read, or has numbers of other shapes.
+        """Put a new environment, and the model if it is fresh, into the checkpoint's state; ValueError if that cannot
+        be.
         """
         with _readable(self.folder):
             numbers = self._numbers(model, env, fresh)

@@ -233,18 +233,11 @@ class _ImitationRun:
 def record_samples(
     env: ParallelEnv, expert: Policy, seed: int, learner: Driver | None = None, *, goal_headings: bool = False
 ) -> Samples:
-    """Run an episode and ask the expert at every step what to do.
+    """What the robots of a team of one model saw until they arrived, and what the expert said they should do.
 
-    Args:
-        env: A :mod:`d4orm_env.navigation_v0` parallel environment of a team of one model.
-        expert: Policy that is asked.
-        seed: Seeds both.
-        learner: Policy that drives, as ``(observations (N, D), limits (N, m)) -> controls (N, m)``; by default the
-            expert. With a learner the expert is asked where that has led the team.
-        goal_headings: Whether the samples and the learner have goal headings, zeros where there are none.
-
-    Returns:
-        What the robots saw until they arrived, and what the expert said.
+    The expert drives, or a ``learner``, ``(observations (N, D), limits (N, m)) -> controls (N, m)``: then it is asked
+    where that has led the team. With ``goal_headings`` the samples and the learner have these, zeros where there are
+    none.
     """
     observations, _ = env.reset(seed=seed)
     expert.reset(env, seed=seed)

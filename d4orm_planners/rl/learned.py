@@ -227,14 +227,8 @@ class Detours:
         self._alone: dict[int, Problem] = {}
 
     def goals(self, joint: JointState, positions: FloatArray) -> FloatArray:
-        """Return where robots should head: their goals, or along their paths where an arrived robot is in the way.
-
-        Args:
-            joint: The team.
-            positions: ``(K, d)`` where the robots are [m].
-
-        Returns:
-            ``(K, d)`` [m].
+        """``(K, d)`` where robots at ``positions`` ``(K, d)`` should head [m]: their goals, or along their paths where
+        an arrived robot is in the way.
         """
         if (joint.arrived != self._arrived).any():
             self._arrived, self._alone, world = joint.arrived, {}, self._problem.world

@@ -126,8 +126,7 @@ class Network:
     def controls(self, observations: FloatArray, limits: FloatArray) -> FloatArray:
         """``(N, m)`` most likely controls for ``(N, D)`` observations of robots with limits ``(N, m)``.
 
-        Raises:
-            ValueError: If the observations have another size than the policy takes.
+        Observations of another size are a ValueError.
         """
         features = self.features_for(observations.shape[1])
         if features is None:
@@ -148,24 +147,14 @@ class Network:
         return np.clip((features - mean) / np.sqrt(variance + EPSILON), -CLIP, CLIP)
 
     def save(self, path: str | Path) -> None:
-        """Write a policy file.
-
-        Raises:
-            ValueError: If the name does not end in ``.safetensors``.
-            OSError: If it cannot be written.
-        """
+        """Write a policy file, whose name ends in ``.safetensors``."""
         with replaced_when_done(checked_path(path, "a network"), (SUFFIX,)) as temporary:
             # As bytes, because the library's own files are for the owner's eyes only.
             temporary.write_bytes(save(dict(self.arrays), metadata={"d4orm": self.header.text()}))
 
 
 def load_network(path: str | Path) -> Network:
-    """Read a policy file.
-
-    Raises:
-        ValueError: If it is no policy file, too large, of another version, or does not fit together.
-        OSError: If it cannot be read.
-    """
+    """Read a policy file; ValueError for another file, too large, of another version, or that does not fit together."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"policy file {path} does not exist; train one with 'd4orm train'")

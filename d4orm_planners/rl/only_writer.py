@@ -15,11 +15,7 @@ except ImportError:  # Windows: nobody is kept off
 
 @contextmanager
 def only_writer(folder: Path) -> Iterator[None]:
-    """Keep others that ask likewise from writing to a folder meanwhile; the system ends it for a process that dies.
-
-    Raises:
-        OSError: If somebody else writes to it.
-    """
+    """Keep others that ask likewise from writing to a folder meanwhile; the system ends it for a process that dies."""
     if fcntl is None:
         yield
         return

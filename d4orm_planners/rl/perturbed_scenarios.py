@@ -19,17 +19,11 @@ _ROOM = 1.1
 def perturbed(
     seed: int, num_robots: int, *, base: str = "circle", shift: float = 0.3, shrink: float = 0.2, **settings: Any
 ) -> Problem:
-    """Another scenario in the plane, turned and shrunk at random, every start and goal moved a little.
+    """Another scenario in the plane, ``base``, turned and shrunk at random, every start and goal moved a little.
 
-    Obstacles stay where they are; a scenario with some must leave the room that starts and goals are moved in.
-
-    Args:
-        seed: Of what is drawn.
-        num_robots: Size of the team.
-        base: The scenario.
-        shift: Positions move by so much at most on either axis [m]; less where robots would be too close to each other.
-        shrink: Up to so large a share is taken off distances from the origin.
-        **settings: Of the scenario.
+    Obstacles stay where they are; a scenario with some must leave the room that starts and goals are moved in: on
+    either axis by ``shift`` at most [m], less where robots would be too close. Up to a share ``shrink`` is taken off
+    distances from the origin.
     """
     random = np.random.default_rng(seed)
     problem = make_problem(base, num_robots=num_robots, **settings)
@@ -45,18 +39,10 @@ def perturbed(
 def clutter(
     seed: int, num_robots: int, *, positions: int = 0, obstacles: int = 6, size: float = 5.0, **settings: Any
 ) -> Problem:
-    """Random starts and goals in a square with round obstacles, which are the same for every seed.
+    """Random starts and goals in a square with round obstacles, which ``positions`` seeds: they are the same for every
+    seed.
 
-    Args:
-        seed: Of starts and goals.
-        num_robots: Size of the team.
-        positions: Seed of the obstacles.
-        obstacles: Number of obstacles.
-        size: Side of the square [m].
-        **settings: Of scenario ``random``.
-
-    Raises:
-        ValueError: If the robots do not fit.
+    Raises ValueError if the robots do not fit.
     """
     problem = make_problem("random", num_robots=num_robots, size=size, **settings)
     fixed = np.random.default_rng(positions)

@@ -171,11 +171,10 @@ class RobotVecEnv(SharedVecEnv):
         return self._masked(observations, [])
 
     def drive(self, controls: FloatArray) -> FloatArray:
-        """Step the worlds with controls ``(B * K, m)`` in physical units.
+        """What the robots see ``(B * K + E, .)`` after a step with controls ``(B * K, m)`` in physical units, for
+        :meth:`encoded`.
 
-        Returns:
-            What the robots see ``(B * K + E, .)``, for :meth:`encoded`: after all others the ``E`` whose episodes have
-            ended, who saw that last.
+        After all others come the ``E`` whose episodes have ended, who saw that last.
         """
         observations, _, terminated, truncated, infos = self._env.step(controls.reshape(self._shape[0], -1))
         ended, acting = terminated | truncated, self._acting

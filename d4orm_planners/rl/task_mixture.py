@@ -108,12 +108,9 @@ class TrainTask:
 
     @classmethod
     def parse(cls, text: str) -> TrainTask:
-        """Parse a scenario, a team size, and settings ``name=value``, separated by blanks.
+        """Parse a scenario, a team size, and settings ``name=value``, separated by blanks; ValueError for all else.
 
         ``max_observed=4`` and ``disturb.delay=2``, with any disturbance's name and level, are among the settings.
-
-        Raises:
-            ValueError: If it is something else.
         """
         scenario, *rest = text.split() or [""]
         if not rest or not rest[0].isdecimal() or not 1 <= int(rest[0]) <= 1000:
@@ -164,14 +161,8 @@ class TrainTask:
         model: str | None = None,
         **options: Any,
     ) -> RobotVecEnv:
-        """Worlds to train in.
-
-        Args:
-            max_observed: Of each, in place of :attr:`max_observed`.
-            seed: Of the first.
-            instances: To choose among at every reset.
-            model: Robot model; ``None`` is the scenario's own.
-            **options: Further arguments of the environment.
+        """Worlds to train in, each with a value of ``max_observed``, the first with this seed, and ``instances`` to
+        choose among.
         """
         if self.disturbances:
             options["disturbances"] = disturbances_at(self.disturbances)
@@ -208,11 +199,7 @@ class Instances:
 
 
 def parse_mixture(texts: Sequence[str]) -> tuple[TrainTask, ...]:
-    """The parts of a mixture: texts as :meth:`TrainTask.parse` takes them, and names of :data:`MIXTURES`.
-
-    Raises:
-        ValueError: If one is neither.
-    """
+    """The parts of a mixture: texts as :meth:`TrainTask.parse` takes them, and names of :data:`MIXTURES`."""
     return tuple(TrainTask.parse(part) for text in texts for part in MIXTURES.get(text.strip(), (text,)))
 
 

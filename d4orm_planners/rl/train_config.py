@@ -96,11 +96,7 @@ class TrainConfig(CheckedSettings):
         return self.model if scenario == self.scenario else self._example().team.models[0]
 
     def validation(self) -> RobotVecEnv | MixedVecEnv:
-        """Worlds to judge by.
-
-        Raises:
-            ValueError: If one policy cannot be learned for the team.
-        """
+        """Worlds to judge by. Raises ValueError if one policy cannot be learned for the team."""
         task = self.task(self.scenario, self.num_robots)
         options = {**self.options, "goal_headings": self.goal_headings}
         return task.validation(self.validation_worlds, VALIDATION_SEED, self.model, **options)

@@ -18,10 +18,7 @@ from d4orm_planners.baselines.mmd.path_frame import PathFrame
 def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> IntArray:
     """``(B, 2)`` numbers of other robots that each of some paths conflicts with, and of steps at which it does.
 
-    Args:
-        positions: ``(B, T, 3)`` the paths [m].
-        others: ``(S, T, 3)`` where the others are [m].
-        distances: ``(S,)`` to keep from each [m].
+    Paths are ``(B, T, 3)``, the others' ``(S, T, 3)``, and ``distances`` to keep from each ``(S,)`` [m].
     """
     steps = _too_near(positions[:, None] - others, distances[:, None]).sum(axis=2)
     return np.stack([(steps > 0).sum(axis=1), steps.sum(axis=1)], axis=1)
@@ -30,9 +27,7 @@ def count_conflicts(positions: Floats, others: Floats, distances: Floats) -> Int
 def first_conflict(positions: Floats, distances: Floats) -> tuple[int, int, tuple[int, int]]:
     """Number of pairs in conflict, and the step and the robots of the earliest conflict; robots are -1 for none.
 
-    Args:
-        positions: ``(K, T, 3)`` [m].
-        distances: ``(K, K)`` to keep [m].
+    Paths are ``(K, T, 3)``, and ``distances`` to keep ``(K, K)`` [m].
     """
     one, other = np.tril_indices(len(positions), -1)
     near = _too_near(positions[one] - positions[other], distances[one, other, None])

@@ -86,13 +86,8 @@ def world_space(problem: Problem) -> Space:
 
 
 def make_frame(problem: Problem, robot: int, space: Space, turn: Floats) -> PathFrame | None:
-    """The frame of a robot, or ``None`` if it has no path to its goal.
-
-    Args:
-        problem: The team and its world.
-        robot: The robot's number.
-        space: The world, of :func:`world_space`.
-        turn: ``(3,)`` any vector, by which the axes are chosen in space.
+    """The frame of a robot, ``None`` if it has no path to its goal; in space ``turn`` ``(3,)``, any vector, chooses its
+    axes.
     """
     corners = problem.shortest_paths.path(robot)
     if not len(corners):

@@ -56,11 +56,7 @@ class Prior(NamedTuple):
 
 @cache
 def load_prior(path: Path = WEIGHTS) -> Prior:
-    """The model that was trained.
-
-    Raises:
-        ValueError: If the file does not hold one, or one of other sizes.
-    """
+    """The model that was trained. Raises ValueError if the file does not hold one, or one of other sizes."""
     with np.load(path, allow_pickle=False) as file:
         missing = [name for name in Prior._fields if name not in file]
         if missing:
@@ -91,11 +87,8 @@ def level_features(signal: FloatArray | Floats) -> FloatArray:
 def posterior(now: float, then: float) -> tuple[float, float, float]:
     """Return the mean's shares of a clean and of a noisier motion in a less noisy one, and its deviation.
 
-    Ho, Jain and Abbeel, *Denoising diffusion probabilistic models* (NeurIPS 2020), equations 6 and 7.
-
-    Args:
-        now: ``alpha_bar`` of the noisier motion.
-        then: Of the less noisy one.
+    ``now`` and ``then`` are ``alpha_bar`` of the noisier one and of the less noisy one (Ho, Jain and Abbeel, *Denoising
+    diffusion probabilistic models*, NeurIPS 2020, equations 6 and 7).
     """
     ratio = now / then
     of_clean = np.sqrt(then) * (1 - ratio) / (1 - now)
@@ -168,15 +161,8 @@ def drive_motions(
 ) -> TrackedMotions:
     """Drive a robot along each of some motions, as if it were alone: by the clock, and then straight to its goal.
 
-    Args:
-        problem: The team.
-        robot: The robot's number.
-        frame: Its path.
-        sines: ``(POINTS + 1, MODES)``.
-        deviation: ``(2 MODES,)`` of the modes.
-        space: The world, of :func:`~d4orm_planners.baselines.mmd.path_frame.world_space`.
-        durations: ``(B,)`` how long the motions take [s].
-        motions: ``(B, 2 MODES)`` float32 whitened modes.
+    ``deviation`` is ``(2 M,)`` of the modes, ``durations`` are ``(B,)`` [s], ``motions`` ``(B, 2 M)`` float32 whitened
+    modes.
     """
     count, horizon = len(motions), problem.horizon
     driven = TrackedMotions(
@@ -214,15 +200,11 @@ class Denoiser:
     def denoise(
         self, robot: int, frame: PathFrame, surroundings: PathSurroundings, seed: int, before: FloatArray | None = None
     ) -> Batch:
-        """Motions of a robot that mind its surroundings, as well as guidance achieves it.
+        """Motions of a robot that mind its surroundings, as well as guidance achieves it; the seed is of noise and
+        durations.
 
-        Args:
-            robot: Its number.
-            frame: Its path.
-            surroundings: Constraints on the motion.
-            seed: Of the noise and the durations.
-            before: ``(B, SIZE)`` motions to begin with, which get the noise of the last ``reuse_steps`` again; noise by
-                default.
+        They begin with noise, or with motions ``before`` ``(B, SIZE)``, which get the noise of the last ``reuse_steps``
+        again.
         """
         config, count = self._config, self._config.num_samples
         draw = _Draws(seed)

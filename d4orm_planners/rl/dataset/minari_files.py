@@ -106,11 +106,7 @@ class DatasetFiles:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    """Return the metadata of a storage.
-
-    Raises:
-        ValueError: If it cannot be read.
-    """
+    """Return the metadata of a storage. Raises ValueError if it cannot be read."""
     path = folder / METADATA
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -188,11 +184,7 @@ class Samples:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` has written.
-
-        Raises:
-            ValueError: If it is something else.
-        """
+        """Read what :meth:`save` has written. Raises ValueError if it is something else."""
         try:
             with path.open("rb") as stream, ArrayArchive(stream, _ARRAYS) as archive:
                 return cls(*(archive.array(name, MAX_BYTES) for name in _ARRAYS))
@@ -204,12 +196,7 @@ _ARRAYS = tuple(field.name for field in fields(Samples))
 
 
 def dataset_samples(path: str, model: str, size: int) -> list[Samples]:
-    """The episodes of a Minari dataset of ``d4orm dataset``, of a team or of robots.
-
-    Raises:
-        ValueError: If there is no such dataset, or its robots or observations are others.
-        ImportError: If Minari is not installed.
-    """
+    """The episodes of a Minari dataset of ``d4orm dataset``, of a team or of robots; ValueError if these are others."""
     dataset = _open_dataset(path)
     env, metadata = _environment(dataset, path)
     team = env.unwrapped.problem.team
