@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples.studies.mmd_prior import draw_examples, modes_of
 from hypothesis import given
 from hypothesis import strategies as st
 from planner_support import assert_solves, hop_problem, walled_in_problem
@@ -42,7 +43,6 @@ from d4orm_planners.baselines.mmd.prior import (
     posterior,
     predict,
 )
-from d4orm_planners.baselines.mmd.prior_training import draw_examples, modes_of
 
 # The network.
 
@@ -67,7 +67,7 @@ def test_the_network_is_a_residual_perceptron() -> None:
 @pytest.mark.slow
 def test_training_writes_what_the_planner_reads(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from d4orm_planners.baselines.mmd.prior_training import Examples, save_prior, train
+    from examples.studies.mmd_prior import Examples, save_prior, train
 
     random = np.random.default_rng(0)
     # Motions that follow from what the network is told: only one that has learned comes near to them.

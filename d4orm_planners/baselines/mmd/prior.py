@@ -60,14 +60,12 @@ def load_prior(path: Path = WEIGHTS) -> Prior:
     with np.load(path, allow_pickle=False) as file:
         missing = [name for name in Prior._fields if name not in file]
         if missing:
-            raise ValueError(
-                f"{path} has no {missing[0]}; train it anew: python -m d4orm_planners.baselines.mmd.prior_training"
-            )
+            raise ValueError(f"{path} has no {missing[0]}; train it anew: python -m examples.studies mmd_prior")
         prior = Prior(*(np.ascontiguousarray(file[name], np.float32) for name in Prior._fields))
     if prior.into.shape[0] != SIZE + LEVELS or prior.context.shape[0] != FEATURES:
         raise ValueError(
             f"{path} is a model of {prior.into.shape[0] - LEVELS} modes and {prior.context.shape[0]} features; it must "
-            f"be of {SIZE} and {FEATURES}: train it anew: python -m d4orm_planners.baselines.mmd.prior_training"
+            f"be of {SIZE} and {FEATURES}: train it anew: python -m examples.studies mmd_prior"
         )
     return prior
 

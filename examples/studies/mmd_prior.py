@@ -1,4 +1,9 @@
-"""Training of the diffusion model on plans of single robots among obstacles that it does not observe."""
+"""Train MMD's diffusion model on plans of single robots among obstacles that it does not observe.
+
+    python -m examples.studies mmd_prior --out weights.npz
+
+The weights that come with the package are of the defaults. Needs ``pip install -e '.[rl]'``.
+"""
 
 from __future__ import annotations
 
@@ -219,7 +224,7 @@ def save_prior(prior: Prior, path: Path) -> None:
 
 def main() -> None:
     """Draw examples, train and write the weights."""
-    parser = argparse.ArgumentParser(description="Train MMD's diffusion model on plans of single robots.")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--examples", type=int, default=3772, help="two per plan")
     parser.add_argument("--steps", type=int, default=6000, help="minibatches")
     parser.add_argument("--seed", type=int, default=100_000, help="of maps, plans and training")
@@ -228,15 +233,11 @@ def main() -> None:
 
     def drawn(done: int) -> None:
         if done % 400 == 0:
-            print(f"{done} examples", flush=True)  # noqa: T201
+            print(f"{done} examples", flush=True)
 
     def trained(step: int, loss: float) -> None:
         if step % 500 == 0:
-            print(f"step {step}: loss {loss:.3f}", flush=True)  # noqa: T201
+            print(f"step {step}: loss {loss:.3f}", flush=True)
 
     prior = train(draw_examples(given.examples, given.seed, drawn), given.steps, given.seed, progress=trained)
     save_prior(prior, given.out)
-
-
-if __name__ == "__main__":
-    main()
