@@ -10,6 +10,8 @@ from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
+from sphinx.pycode import ModuleAnalyzer
+
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))  # for what lies beside this file
 # What is collected is worth less than the looking for it, in which JAX, once imported, takes part.
@@ -81,9 +83,12 @@ html_title = "d4orm-env"
 
 
 def _skip_described_field(app: Any, what: str, name: str, member: Any, skip: bool, options: Any) -> bool | None:
-    """Leave out a NamedTuple's ``Alias for field number 0``: the class's own docstring describes the field."""
-    is_alias = str(getattr(member, "__doc__", "")).startswith("Alias for field number")
-    return True if is_alias else None
+    """Leave out a NamedTuple's ``Alias for field number 0``, unless the field is described beside itself."""
+    if not str(getattr(member, "__doc__", "")).startswith("Alias for field number"):
+        return None
+    analyzer = ModuleAnalyzer.for_module(app.env.temp_data["autodoc:module"])
+    analyzer.analyze()
+    return None if (app.env.temp_data["autodoc:class"], name) in analyzer.attr_docs else True
 
 
 def _read_report(app: Any, page: str, source: list[str]) -> None:

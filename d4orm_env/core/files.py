@@ -143,12 +143,7 @@ HEADER_BYTES = 16_384
 
 
 class ArrayArchive(zipfile.ZipFile):
-    """An ``.npz`` file with the arrays of these names, and no others.
-
-    Raises:
-        ValueError: If it holds others.
-        zipfile.BadZipFile: If it is no such file.
-    """
+    """An ``.npz`` file with the arrays of these names; a ValueError if it holds others."""
 
     def __init__(self, stream: IO[bytes], names: Collection[str]) -> None:
         super().__init__(stream)

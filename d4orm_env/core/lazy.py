@@ -10,13 +10,7 @@ from typing import Any
 class LazyModule:
     """A module that is imported when an attribute of it is asked for.
 
-    Args:
-        name: Its full name.
-        user: What needs it, for the message if it is missing; empty for a module that is always there.
-        extra: Extra of this package that has it.
-
-    Raises:
-        ImportError: If the library of an extra is missing, when an attribute is asked for.
+    One of an ``extra`` of this package that is missing then is an ImportError, which says that its ``user`` needs it.
     """
 
     def __init__(self, name: str, user: str = "", extra: str = "") -> None:

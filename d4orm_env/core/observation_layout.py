@@ -22,21 +22,13 @@ _NEVER_NEGATIVE = ("time_left", "arrived", "present", "length")
 
 
 class BoundsSlack(NamedTuple):
-    """Room beyond what robots and their observations keep to by themselves.
+    """Room beyond what robots and their observations keep to by themselves."""
 
-    Attributes:
-        distance: Between where a robot is and where it is seen [m].
-        speed: Beyond the speed limit, in what is seen [m/s].
-        heading: Between true and seen [rad].
-        drift: Speed at which a robot may be moved in addition to its own motion [m/s].
-        radius: Of what is seen and is no robot [m].
-    """
-
-    distance: float = 0.0
-    speed: float = 0.0
-    heading: float = 0.0
-    drift: float = 0.0
-    radius: float = 0.0
+    distance: float = 0.0  #: Between where a robot is and where it is seen [m]
+    speed: float = 0.0  #: Beyond the speed limit, in what is seen [m/s]
+    heading: float = 0.0  #: Between true and seen [rad]
+    drift: float = 0.0  #: Speed at which a robot may be moved in addition to its own motion [m/s]
+    radius: float = 0.0  #: Of what is seen and is no robot [m]
 
     def joined(self, other: BoundsSlack) -> BoundsSlack:
         """Room for both."""
@@ -186,18 +178,13 @@ class ObservationSlices:
 
 @dataclass(frozen=True, eq=False)
 class ObservationLayout(ObservationSlices):
-    """The same with the finite bounds that observations stay in.
+    """The same with the finite bounds that observations stay in."""
 
-    Attributes:
-        low: ``(D,)`` float32 lower bounds.
-        high: ``(D,)`` float32 upper bounds.
-        communication_range: Distance of centres beyond which neighbours are not observed [m].
-        line_of_sight: Whether neighbours behind obstacles are not observed either.
-    """
-
-    low: FloatArray
-    high: FloatArray
+    low: FloatArray  #: ``(D,)`` float32 lower bounds
+    high: FloatArray  #: ``(D,)`` float32 upper bounds
+    #: Distance of centres beyond which neighbours are not observed [m]
     communication_range: float = field(default=np.inf, kw_only=True)
+    #: Whether neighbours behind obstacles are not observed either
     line_of_sight: bool = field(default=False, kw_only=True)
 
     @classmethod

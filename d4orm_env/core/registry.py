@@ -28,14 +28,10 @@ _NAME = re.compile(r"[\w][\w.-]*")
 
 
 class Registry(Mapping[str, T]):
-    """Things by name: registered in this process, or entry points of installed packages; loaded when looked up.
+    """Things by name: registered in this process, or entry points, of a ``group``, of packages; loaded when looked up.
 
-    Args:
-        what: Kind of thing, for messages.
-        group: Group of the entry points.
-        admit: ``(name, thing) -> `` what is handed out under the name; it raises ``ValueError`` for what does not
-            belong here.
-        identity: Two things of equal identity are the same one, defined anew as in a notebook.
+    ``admit`` gives what is handed out under a name, or refuses it. Two things of equal identity are the same one,
+    defined anew as in a notebook. Messages call them ``what``.
     """
 
     def __init__(

@@ -117,23 +117,14 @@ def _compiled(num_drones: int, drone: str) -> tuple[Any, Any]:
 
 @dataclass(frozen=True, eq=False)
 class FlightRecord:
-    """Figures of a team's flight.
+    """Figures of a team's flight."""
 
-    Attributes:
-        largest_error: ``(K,)`` largest distance of each drone from its setpoints [m].
-        mean_squared_error: ``(K,)`` mean square of it [m^2].
-        least_gap: ``(K,)`` least gap between a drone's sphere and another's [m].
-        least_clearance: ``(K,)`` least gap between it and obstacles or bounds [m].
-        fallen: ``(K,)`` bool: was on the floor, or out of control.
-        samples: Moments that the mean is of.
-    """
-
-    largest_error: Floats
-    mean_squared_error: Floats
-    least_gap: Floats
-    least_clearance: Floats
-    fallen: BoolArray
-    samples: int
+    largest_error: Floats  #: ``(K,)`` largest distance of each drone from its setpoints [m]
+    mean_squared_error: Floats  #: ``(K,)`` mean square of it [m^2]
+    least_gap: Floats  #: ``(K,)`` least gap between a drone's sphere and another's [m]
+    least_clearance: Floats  #: ``(K,)`` least gap between it and obstacles or bounds [m]
+    fallen: BoolArray  #: ``(K,)`` bool: was on the floor, or out of control
+    samples: int  #: Moments that the mean is of
 
     @classmethod
     def empty(cls, num_robots: int) -> FlightRecord:

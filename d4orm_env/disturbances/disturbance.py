@@ -36,28 +36,17 @@ class Kept(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """The worlds as a disturbance finds them; nothing of it may be changed.
+    """The worlds as a disturbance finds them; nothing of it may be changed."""
 
-    Attributes:
-        problem: Team, time step and obstacles; starts and goals may be those of another world.
-        max_cycles: Steps in an episode.
-        start: ``(B, K, n)`` where the robots began.
-        goal: ``(B, K, d)`` present goals [m].
-        states: ``(B, K, n)`` true states.
-        controls: ``(B, K, m)`` executed last.
-        arrived: ``(B, K)`` bool.
-        steps: ``(B,)`` int64 steps taken since the episode began.
-        bodies: ``(B, N, 2 d + 1)`` what moves among the robots and is none, as it truly is, see :class:`Observed`.
-    """
-
-    problem: Problem
-    max_cycles: int
-    start: FloatArray
-    goal: FloatArray
-    states: FloatArray
-    controls: FloatArray
-    arrived: BoolArray
-    steps: NDArray[np.int64]
+    problem: Problem  #: Team, time step and obstacles; starts and goals may be those of another world
+    max_cycles: int  #: Steps in an episode
+    start: FloatArray  #: ``(B, K, n)`` where the robots began
+    goal: FloatArray  #: ``(B, K, d)`` present goals [m]
+    states: FloatArray  #: ``(B, K, n)`` true states
+    controls: FloatArray  #: ``(B, K, m)`` executed last
+    arrived: BoolArray  #: ``(B, K)`` bool
+    steps: NDArray[np.int64]  #: ``(B,)`` int64 steps taken since the episode began
+    #: ``(B, N, 2 d + 1)`` what moves among the robots and is none, as it truly is, see :class:`Observed`
     bodies: FloatArray
 
     def of(self, worlds: NDArray[np.intp]) -> Scene:
@@ -89,34 +78,24 @@ class Scene(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """The worlds as they are seen, in observations and in ``env.state()``.
+    """The worlds as they are seen, in observations and in ``env.state()``."""
 
-    Attributes:
-        states: ``(B, K, n)`` of the robots.
-        controls: ``(B, K, m)`` executed last; what first-order robots' speed is read from.
-        bodies: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is
-            none; a radius of zero for one that is not seen.
-    """
-
-    states: FloatArray
-    controls: FloatArray
+    states: FloatArray  #: ``(B, K, n)`` of the robots
+    controls: FloatArray  #: ``(B, K, m)`` executed last; what first-order robots' speed is read from
+    #: ``(B, N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is none; a
+    #: radius of zero for one that is not seen
     bodies: FloatArray
 
 
 class DisturbanceEffect(NamedTuple):
-    """Effect of a disturbance, for evaluators and pictures; ``None`` for what it never does.
+    """Effect of a disturbance, for evaluators and pictures; ``None`` for what it never does."""
 
-    Attributes:
-        pushed: ``(B, K, d)`` velocity that the last step gave to robots [m/s].
-        stalled: ``(B, K)`` bool: does not obey.
-        lost: ``(B, K)`` bool: will not obey again, so that it need not arrive for the episode to be a success.
-        bodies: ``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`Observed`. Contact with one
-            is a collision.
-    """
-
-    pushed: FloatArray | None = None
-    stalled: BoolArray | None = None
+    pushed: FloatArray | None = None  #: ``(B, K, d)`` velocity that the last step gave to robots [m/s]
+    stalled: BoolArray | None = None  #: ``(B, K)`` bool: does not obey
+    #: ``(B, K)`` bool: will not obey again, so that it need not arrive for the episode to be a success
     lost: BoolArray | None = None
+    #: ``(B, N, 2 d + 1)`` what moves among the robots and is none, see :class:`Observed`. Contact with one is a
+    #: collision.
     bodies: FloatArray | None = None
 
     def copy(self) -> DisturbanceEffect:

@@ -38,16 +38,12 @@ class Features:
     ray, from the frame's first axis on. For each neighbour: presence, direction (``d``), two functions of the gap,
     relative velocity (``d``), and, with velocities kept as they are, when the two come closest and how close. For each
     obstacle: presence, direction (``d``), two functions of the gap.
-
-    Attributes:
-        slices: Slices of an observation.
-        turned: Whether controls are vectors of the world.
-        frame: ``"goal"`` or ``"heading"``: where the first axis of a robot's frame points; with rays and without a
-            heading along the ray nearest to the goal, so that rays of one frame are those of any other.
     """
 
-    slices: ObservationSlices
-    turned: bool
+    slices: ObservationSlices  #: Slices of an observation
+    turned: bool  #: Whether controls are vectors of the world
+    #: ``"goal"`` or ``"heading"``: where the first axis of a robot's frame points; with rays and without a heading
+    #: along the ray nearest to the goal, so that rays of one frame are those of any other
     frame: Frame = "goal"
 
     @classmethod

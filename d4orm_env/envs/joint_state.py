@@ -38,22 +38,14 @@ __all__ = ["JointState", "join_state", "split_state"]
 
 
 class JointState(NamedTuple):
-    """A joint state, taken apart.
+    """A joint state, taken apart."""
 
-    Attributes:
-        states: ``(K, n)`` states of the robots.
-        goals: ``(K, d)`` present goals [m].
-        controls: ``(K, m)`` controls executed in the last step.
-        arrived: ``(K,)`` bool, docked robots.
-        steps: Steps taken since the reset.
-        bodies: ``(N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is none.
-    """
-
-    states: FloatArray
-    goals: FloatArray
-    controls: FloatArray
-    arrived: BoolArray
-    steps: int
+    states: FloatArray  #: ``(K, n)`` states of the robots
+    goals: FloatArray  #: ``(K, d)`` present goals [m]
+    controls: FloatArray  #: ``(K, m)`` controls executed in the last step
+    arrived: BoolArray  #: ``(K,)`` bool, docked robots
+    steps: int  #: Steps taken since the reset
+    #: ``(N, 2 d + 1)`` position [m], velocity [m/s] and radius [m] of what moves among the robots and is none
     bodies: FloatArray = frozen_array((), "bodies", (0,))
 
 

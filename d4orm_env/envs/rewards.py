@@ -26,38 +26,22 @@ class RewardInput:
     Every array is a read-only copy with the leading axes ``...``: none in the PettingZoo and the joint environment, so
     that ``(..., K)`` is ``(K,)``, and ``(B,)`` in the batched one, so that it is ``(B, K)``. All robots are there,
     docked ones too. Distances are straight, or along the shortest paths where the environment says so.
-
-    Attributes:
-        previous_states: ``(..., K, n)`` before the step.
-        states: ``(..., K, n)`` after it.
-        controls: ``(..., K, m)`` as executed.
-        goals: ``(..., K, d)`` the goals during the step [m].
-        previous_distances: ``(..., K)`` to the goals before the step [m].
-        distances: ``(..., K)`` after it [m].
-        initial_distances: ``(..., K)`` where the path to the goal began, at least the goal radius [m].
-        previously_arrived: ``(..., K)`` bool: docked before the step.
-        arrived: ``(..., K)`` bool: docked after it; in lifelong mode, reached a goal in this step.
-        collided: ``(..., K)`` bool, hard contact.
-        margin_violated: ``(..., K)`` bool, within the margin of anything.
-        paper: ``(..., K)`` the paper's reward, to build upon.
-        team: The robots.
-        dt: Time step [s].
     """
 
-    previous_states: FloatArray
-    states: FloatArray
-    controls: FloatArray
-    goals: FloatArray
-    previous_distances: FloatArray
-    distances: FloatArray
-    initial_distances: FloatArray
-    previously_arrived: BoolArray
-    arrived: BoolArray
-    collided: BoolArray
-    margin_violated: BoolArray
-    paper: FloatArray
-    team: Team
-    dt: float
+    previous_states: FloatArray  #: ``(..., K, n)`` before the step
+    states: FloatArray  #: ``(..., K, n)`` after it
+    controls: FloatArray  #: ``(..., K, m)`` as executed
+    goals: FloatArray  #: ``(..., K, d)`` the goals during the step [m]
+    previous_distances: FloatArray  #: ``(..., K)`` to the goals before the step [m]
+    distances: FloatArray  #: ``(..., K)`` after it [m]
+    initial_distances: FloatArray  #: ``(..., K)`` where the path to the goal began, at least the goal radius [m]
+    previously_arrived: BoolArray  #: ``(..., K)`` bool: docked before the step
+    arrived: BoolArray  #: ``(..., K)`` bool: docked after it; in lifelong mode, reached a goal in this step
+    collided: BoolArray  #: ``(..., K)`` bool, hard contact
+    margin_violated: BoolArray  #: ``(..., K)`` bool, within the margin of anything
+    paper: FloatArray  #: ``(..., K)`` the paper's reward, to build upon
+    team: Team  #: The robots
+    dt: float  #: Time step [s]
 
     def __post_init__(self) -> None:
         for attribute in fields(self):

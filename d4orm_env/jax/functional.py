@@ -38,41 +38,25 @@ __all__ = ["State", "Step", "observe", "reset", "step"]
 
 
 class State(NamedTuple):
-    """State of a team.
+    """State of a team."""
 
-    Attributes:
-        states: ``(K, n)``.
-        arrived: ``(K,)`` bool, docked.
-        steps: ``()`` int32, steps taken.
-        controls: ``(K, m)`` executed last, zero after a reset: what the speed of first-order robots is read from.
-    """
-
-    states: jax.Array
-    arrived: jax.Array
-    steps: jax.Array
+    states: jax.Array  #: ``(K, n)``
+    arrived: jax.Array  #: ``(K,)`` bool, docked
+    steps: jax.Array  #: ``()`` int32, steps taken
+    #: ``(K, m)`` executed last, zero after a reset: what the speed of first-order robots is read from
     controls: jax.Array
 
 
 class Step(NamedTuple):
-    """Result of one step.
+    """Result of one step."""
 
-    Attributes:
-        rewards: ``(K,)``.
-        arrived: ``(K,)`` bool.
-        collided: ``(K,)`` bool, hard contact.
-        margin_violated: ``(K,)`` bool.
-        truncated: ``()`` bool, the horizon is reached.
-        controls: ``(K, m)`` as executed.
-        distances: ``(K,)`` to the goals [m].
-    """
-
-    rewards: jax.Array
-    arrived: jax.Array
-    collided: jax.Array
-    margin_violated: jax.Array
-    truncated: jax.Array
-    controls: jax.Array
-    distances: jax.Array
+    rewards: jax.Array  #: ``(K,)``
+    arrived: jax.Array  #: ``(K,)`` bool
+    collided: jax.Array  #: ``(K,)`` bool, hard contact
+    margin_violated: jax.Array  #: ``(K,)`` bool
+    truncated: jax.Array  #: ``()`` bool, the horizon is reached
+    controls: jax.Array  #: ``(K, m)`` as executed
+    distances: jax.Array  #: ``(K,)`` to the goals [m]
 
 
 def reset(problem: Problem, key: jax.Array) -> State:

@@ -34,41 +34,24 @@ MAX_INSTANCES = 1_000_000
 
 
 class EnvState(NamedTuple):
-    """A world in the middle of an episode.
+    """A world in the middle of an episode."""
 
-    Attributes:
-        team: State of the team.
-        instance: ``()`` int32, which of the instances it runs.
-        touched: ``(K,)`` bool: has been in contact.
-        ray_noise: ``(K, R)`` errors of what the range sensors measure now [m]; ``R`` is 0 without noise.
-    """
-
-    team: functional.State
-    instance: jax.Array
-    touched: jax.Array
-    ray_noise: jax.Array
+    team: functional.State  #: State of the team
+    instance: jax.Array  #: ``()`` int32, which of the instances it runs
+    touched: jax.Array  #: ``(K,)`` bool: has been in contact
+    ray_noise: jax.Array  #: ``(K, R)`` errors of what the range sensors measure now [m]; ``R`` is 0 without noise
 
 
 class Transition(NamedTuple):
-    """Result of one step.
+    """Result of one step."""
 
-    Attributes:
-        observations: ``(K, D)``; after the end of an episode those of the next one.
-        rewards: ``(K,)`` of all robots, arrived ones too, as ``robot_rewards`` of the batched environment.
-        acted: ``(K,)`` bool: was still under way when the step began.
-        finished: ``(K,)`` bool: is done, which is terminated.
-        done: ``()`` bool: the episode is over; all have finished, or the time is up.
-        success: ``()`` bool: all have arrived, and none was ever in contact.
-        step: Result of :func:`d4orm_env.jax.functional.step`.
-    """
-
-    observations: jax.Array
-    rewards: jax.Array
-    acted: jax.Array
-    finished: jax.Array
-    done: jax.Array
-    success: jax.Array
-    step: functional.Step
+    observations: jax.Array  #: ``(K, D)``; after the end of an episode those of the next one
+    rewards: jax.Array  #: ``(K,)`` of all robots, arrived ones too, as ``robot_rewards`` of the batched environment
+    acted: jax.Array  #: ``(K,)`` bool: was still under way when the step began
+    finished: jax.Array  #: ``(K,)`` bool: is done, which is terminated
+    done: jax.Array  #: ``()`` bool: the episode is over; all have finished, or the time is up
+    success: jax.Array  #: ``()`` bool: all have arrived, and none was ever in contact
+    step: functional.Step  #: Result of :func:`d4orm_env.jax.functional.step`
 
 
 class FunctionalEnv:

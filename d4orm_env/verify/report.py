@@ -9,20 +9,14 @@ from d4orm_env.verify.geometry import Floats
 
 @dataclass(frozen=True)
 class Violation:
-    """One thing wrong with a plan.
+    """One thing wrong with a plan."""
 
-    Attributes:
-        kind: ``"robot contact"``, ``"obstacle contact"``, ``"bounds contact"``, ``"control limit"``, ``"not arrived"``,
-            ``"non-finite"``, ``"not judged"`` or, of curves, ``"hitch limit"``.
-        robots: Indices of the robots concerned.
-        time: Time at which it first happens, contacts to within a sub-step [s].
-        detail: Description, with values and units.
-    """
-
+    #: ``"robot contact"``, ``"obstacle contact"``, ``"bounds contact"``, ``"control limit"``, ``"not arrived"``,
+    #: ``"non-finite"``, ``"not judged"`` or, of curves, ``"hitch limit"``
     kind: str
-    robots: tuple[int, ...]
-    time: float
-    detail: str
+    robots: tuple[int, ...]  #: Indices of the robots concerned
+    time: float  #: Time at which it first happens, contacts to within a sub-step [s]
+    detail: str  #: Description, with values and units
 
     def __str__(self) -> str:
         names = " and ".join(f"robot_{robot}" for robot in self.robots)

@@ -28,26 +28,17 @@ from d4orm_planners.base.policy import Policy, robot_indices
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Episode(DisplayMixin):
-    """Record of an episode.
+    """Record of an episode."""
 
-    Attributes:
-        problem: Problem of the environment.
-        trajectory: The executed motion, ``T`` steps long; ``T`` is at most the horizon.
-        metrics: The environment's own, see :func:`d4orm_env.envs.team_step.episode_metrics`, and
-            ``mean_squared_jerk``, see :func:`d4orm_env.core.trajectory.mean_squared_jerk`.
-        observations: Observations of all agents at the reset and after every step.
-        infos: Infos likewise.
-        goals: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode.
-        events: Its disturbances, for pictures; ``None`` without disturbances.
-    """
-
-    problem: Problem
-    trajectory: Trajectory
+    problem: Problem  #: Problem of the environment
+    trajectory: Trajectory  #: The executed motion, ``T`` steps long; ``T`` is at most the horizon
+    #: The environment's own, see :func:`d4orm_env.envs.team_step.episode_metrics`, and ``mean_squared_jerk``, see
+    #: :func:`d4orm_env.core.trajectory.mean_squared_jerk`
     metrics: dict[str, float]
-    observations: tuple[dict[str, FloatArray], ...]
-    infos: tuple[AgentInfos, ...]
-    goals: FloatArray
-    events: DisturbanceEvents | None = None
+    observations: tuple[dict[str, FloatArray], ...]  #: Observations of all agents at the reset and after every step
+    infos: tuple[AgentInfos, ...]  #: Infos likewise
+    goals: FloatArray  #: ``(T+1, K, d)`` where the robots were to go; it changes in lifelong mode
+    events: DisturbanceEvents | None = None  #: Its disturbances, for pictures; ``None`` without disturbances
 
     @property
     def title(self) -> str:

@@ -40,42 +40,26 @@ Status = Literal["solved", "iteration_limit", "time_limit", "stopped", "interrup
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """The state of a solve after one iteration.
+    """The state of a solve after one iteration."""
 
-    Attributes:
-        iteration: From 1.
-        wall_time: Seconds since the solve began, compilation not counted.
-        denoising_steps: Sample-score-update steps so far.
-        reward: Mean reward of this iteration's candidate.
-        solved: Whether this iteration's candidate is a solution.
-        num_failed: Robots that do not arrive or violate the margin.
-        num_margin_violated: Robots that come within the margin of anything, at any step.
-        num_not_arrived: Robots that are not at their goal at the horizon.
-        best_reward: Mean reward of the best candidate so far.
-        best_solved: Whether that one is a solution.
-        excluded: Samples of this iteration that were left out because their reward was not finite.
-        note: Remark of the method on how the iteration ended; ``ipopt`` has IPOPT's return status here,
-            ``d-d4orm`` the nodes that were lost and the messages that were dropped, and path finding why it found none.
-        unreachable: Robots for which path finding found no path to their goals.
-        controls: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history.
-        trajectory: Their rollout, likewise.
-    """
-
-    iteration: int
-    wall_time: float
-    denoising_steps: int
-    reward: float
-    solved: bool
-    num_failed: int
-    num_margin_violated: int
-    num_not_arrived: int
-    best_reward: float
-    best_solved: bool
-    excluded: int = 0
+    iteration: int  #: From 1
+    wall_time: float  #: Seconds since the solve began, compilation not counted
+    denoising_steps: int  #: Sample-score-update steps so far
+    reward: float  #: Mean reward of this iteration's candidate
+    solved: bool  #: Whether this iteration's candidate is a solution
+    num_failed: int  #: Robots that do not arrive or violate the margin
+    num_margin_violated: int  #: Robots that come within the margin of anything, at any step
+    num_not_arrived: int  #: Robots that are not at their goal at the horizon
+    best_reward: float  #: Mean reward of the best candidate so far
+    best_solved: bool  #: Whether that one is a solution
+    excluded: int = 0  #: Samples of this iteration that were left out because their reward was not finite
+    #: Remark of the method on how the iteration ended; ``ipopt`` has IPOPT's return status here, ``d-d4orm`` the nodes
+    #: that were lost and the messages that were dropped, and path finding why it found none
     note: str = ""
-    unreachable: tuple[int, ...] = ()
+    unreachable: tuple[int, ...] = ()  #: Robots for which path finding found no path to their goals
+    #: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history
     controls: FloatArray | None = field(default=None, repr=False, compare=False)
-    trajectory: Trajectory | None = field(default=None, repr=False, compare=False)
+    trajectory: Trajectory | None = field(default=None, repr=False, compare=False)  #: Their rollout, likewise
 
 
 @dataclass(frozen=True, eq=False, repr=False)

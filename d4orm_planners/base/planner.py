@@ -43,24 +43,16 @@ class PlannerConfig(CheckedSettings):
 
 @dataclass(frozen=True)
 class Iteration:
-    """Result of a planner's iteration.
+    """Result of a planner's iteration."""
 
-    Attributes:
-        controls: ``(H, K, m)`` the new candidate.
-        denoising_steps: Sample-score-update steps spent.
-        excluded: Samples left out because their reward was not finite.
-        note: Remark of the method on how the iteration ended, where it has a word for it.
-        evaluated: Result of :func:`~d4orm_planners.base.candidate.evaluate_controls` for these controls, if the
-            iteration asked; else the loop does.
-        unreachable: Robots for which path finding found no path to their goals.
-    """
-
-    controls: FloatArray
-    denoising_steps: int = 0
-    excluded: int = 0
-    note: str = ""
+    controls: FloatArray  #: ``(H, K, m)`` the new candidate
+    denoising_steps: int = 0  #: Sample-score-update steps spent
+    excluded: int = 0  #: Samples left out because their reward was not finite
+    note: str = ""  #: Remark of the method on how the iteration ended, where it has a word for it
+    #: Result of :func:`~d4orm_planners.base.candidate.evaluate_controls` for these controls, if the iteration asked;
+    #: else the loop does
     evaluated: Candidate | None = None
-    unreachable: tuple[int, ...] = ()
+    unreachable: tuple[int, ...] = ()  #: Robots for which path finding found no path to their goals
 
 
 class Planner(ABC):

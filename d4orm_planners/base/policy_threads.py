@@ -92,9 +92,7 @@ def driven_alone(method: Callable[..., Any]) -> Callable[..., Any]:
 class Background(Generic[Result]):
     """A job at a time in a thread of its own.
 
-    Args:
-        yielding: Whether it leaves other cores, and their threads, to others, which go first where threads have
-            priorities of their own.
+    If ``yielding``, it leaves other cores, and their threads, to others, which go first where threads have priorities.
     """
 
     def __init__(self, yielding: bool = False) -> None:

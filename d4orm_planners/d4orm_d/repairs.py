@@ -38,12 +38,8 @@ SHORTENINGS = 2
 
 
 class DeformedPlan(WorkingPlan):
-    """The team's plan, some robots' controls deformed around all others.
-
-    Args:
-        planner: Planner with the rules of deformations.
-        search: The search.
-        trajectory: The team's motion at first, by default that of the present candidate.
+    """The team's plan, by default that of the search's present candidate, some robots' controls deformed around all
+    others.
     """
 
     def __init__(self, planner: D4ormD, search: SolveRun, trajectory: Trajectory | None = None) -> None:

@@ -43,17 +43,10 @@ def import_ray(what: str) -> ModuleType:
 
 
 class RayConnection:
-    """A connection to Ray. One that this process has already is used, and left open.
+    """A connection to Ray for ``what``. One that this process has already is used, and left open.
 
-    Args:
-        address: ``"auto"`` for the cluster that this machine belongs to, an address, or ``"local"`` for a new instance
-            on this machine.
-        what: User of it, for the error without Ray.
-
-    Raises:
-        ValueError: If the address is none.
-        ImportError: If Ray is not installed.
-        ConnectionError: If there is no cluster.
+    Its address is ``"auto"`` for the cluster that this machine belongs to, an address, or ``"local"`` for a new
+    instance here. Raises ValueError if it is none, ImportError without Ray, ConnectionError if there is no cluster.
     """
 
     def __init__(self, address: str, what: str) -> None:
