@@ -78,35 +78,14 @@ class BenchmarkSettings(CheckedSettings):
 
 
 QUICK: Mapping[str, object] = {
-    "sections": tuple(section for section in SECTIONS if section not in {"robots", "startup"}),
-    "engines": ("cpu",),
-    "num_robots": (4, 8),
-    "models": ("holonomic2d", "differential_drive"),
-    "num_steps": 20,
-    "repetitions": 3,
-    "time_limit": 0.5,
-    "iteration_limit": 2.0,
-    "most_robots_slow": 8,
-    "env_steps": 500,
-    "num_worlds": 128,
-    "plan_robots": (4, 8),
-    "seeds": 2,
-    "plan_time_limit": 5.0,
-    "thread_robots": (8,),
-    "memory_robots": 16,
-    "obstacles": (4, 200),
-    "map_cells": (32,),
-    "big_random": (100,),
-    "big_warehouse": (16,),
-    "big_drives": (8,),
-    "big_boxes": (4,),
-    "big_free_boxes": (8,),
-    "big_seeds": 2,
-    "big_time_limit": 10.0,
-    "improved_robots": (8,),
-    "loop_robots": (16,),
-    "loops": 10,
-}
+    "sections": tuple(section for section in SECTIONS if section not in {"robots", "startup"}), "engines": ("cpu",),
+    "num_robots": (4, 8), "models": ("holonomic2d", "differential_drive"), "num_steps": 20, "repetitions": 3,
+    "time_limit": 0.5, "iteration_limit": 2.0, "most_robots_slow": 8, "env_steps": 500, "num_worlds": 128,
+    "plan_robots": (4, 8), "seeds": 2, "plan_time_limit": 5.0, "thread_robots": (8,), "memory_robots": 16,
+    "obstacles": (4, 200), "map_cells": (32,), "big_random": (100,), "big_warehouse": (16,), "big_drives": (8,),
+    "big_boxes": (4,), "big_free_boxes": (8,), "big_seeds": 2, "big_time_limit": 10.0, "improved_robots": (8,),
+    "loop_robots": (16,), "loops": 10,
+}  # fmt: skip
 """Settings of a benchmark of about a minute, for a first look; starts and controllers take as long by themselves."""
 
 
