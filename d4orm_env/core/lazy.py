@@ -8,10 +8,7 @@ from typing import Any
 
 
 class LazyModule:
-    """A module that is imported when an attribute of it is asked for.
-
-    One of an ``extra`` of this package that is missing then is an ImportError, which says that its ``user`` needs it.
-    """
+    """A module that is imported when an attribute of it is asked for; if an ``extra`` lacks, its ``user`` is told."""
 
     def __init__(self, name: str, user: str = "", extra: str = "") -> None:
         self._name, self._user, self._extra = name, user, extra

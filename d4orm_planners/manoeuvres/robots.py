@@ -113,9 +113,7 @@ def area_of(problem: Problem) -> Area:
 
 
 def distance_kept(problem: Problem, bent: BoolArray) -> float:
-    """Distance that robots keep from everything [m]; less where starts or goals leave less room, but for trailers that
-    are in a bend there.
-    """
+    """Distance that robots keep from everything [m]; less where starts or goals leave less, but for bent trailers."""
     team, usual = problem.team, problem.margin + problem.rounding + CLEARANCE * problem.stride
     goals = _at_goals(problem)
     for robot, model in enumerate(team.robot_models):

@@ -238,9 +238,8 @@ class OriginCheck:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Have a server of web sockets that is started meanwhile ask first; viser starts one and has no option for it.
-
-        Raises RuntimeError if none was started, so that nothing would be checked.
+        """Have the server of web sockets that viser, without an option for it, starts meanwhile ask first; it must
+        start one.
         """
         serve, started = websockets.asyncio.server.serve, False
 

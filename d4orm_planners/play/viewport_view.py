@@ -216,9 +216,8 @@ class ViewportView:
     def _follow_hand(
         self, node: Any, kind: str, moved: Moved, modifier: Literal["shift"] | None = None, numbers: Numbers = None
     ) -> None:
-        """Call ``moved(number, position, shift so far, ended)`` while one of a node's shapes is dragged.
-
-        The number is that of the shape, or what ``numbers`` has for it.
+        """Call ``moved(number, position, shift so far, ended)``, numbers perhaps of ``numbers``, while a shape is
+        dragged.
         """
         grips: dict[tuple[int, int], tuple[Points, Points]] = {}
 
