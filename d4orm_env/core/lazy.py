@@ -8,7 +8,7 @@ from typing import Any
 
 
 class LazyModule:
-    """A module that is imported when an attribute of it is asked for; if an ``extra`` lacks, its ``user`` is told."""
+    """A module that is imported when an attribute of it is asked for; an ImportError names ``user`` and ``extra``."""
 
     def __init__(self, name: str, user: str = "", extra: str = "") -> None:
         self._name, self._user, self._extra = name, user, extra
