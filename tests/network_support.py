@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from d4orm_planners.d_d4orm.transport import Transport
+from d4orm_planners.d_d4orm.zenoh_transport import ZenohTransport
 
 TIMEOUT = 120.0
 """Seconds that anything may take on a busy machine before a test gives up on it."""
@@ -27,6 +28,11 @@ def free_endpoint() -> str:
 
 def port_of(endpoint: str) -> int:
     return int(endpoint.rpartition(":")[2])
+
+
+def has_listeners(end: ZenohTransport) -> bool:
+    """Check whether any node would receive what is published now."""
+    return bool(end._publisher.matching_status.matching)
 
 
 def wait_until(condition: Callable[[], Any], what: str = "it", seconds: float = TIMEOUT) -> None:

@@ -53,9 +53,9 @@ def visitor(playground: Playground) -> ClientConnection:
     """A web socket of this machine's, and what it says to begin with."""
     port = playground._server.get_port()
     connection = opened(reached(port), f"127.0.0.1:{port}", None)
-    before = set(playground.clients)
+    before = set(playground._server.get_clients())
     say(connection, CAMERA)
-    until(lambda: set(playground.clients) - before)
+    until(lambda: set(playground._server.get_clients()) - before)
     return connection
 
 

@@ -149,7 +149,7 @@ LEVELS = {
 """Levels of x86-64, the newest first, and what a processor must have for each beyond the next."""
 SHIPPED = Path(__file__).parents[1] / "kernels"
 """Folder of a wheel with one of kernels for each level; a checkout has none."""
-_SHIPPED_STAMP = "shipped"
+SHIPPED_STAMP = "shipped"
 """In place of the time of a source file, which is that of the installation."""
 
 
@@ -181,7 +181,7 @@ class ShippedFiles(KernelFiles):
     """Index and data files of a level. What the wheel's record does not list, as it is, counts as missing."""
 
     def __init__(self, folder: Path, filename_base: str) -> None:
-        super().__init__(str(folder), filename_base, _SHIPPED_STAMP)
+        super().__init__(str(folder), filename_base, SHIPPED_STAMP)
 
     def _content(self, path: str) -> bytes | None:
         with suppress(OSError):
@@ -189,16 +189,3 @@ class ShippedFiles(KernelFiles):
             digest = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).decode().rstrip("=")
             return content if _record().get(Path(path).resolve()) == digest else None
         return None
-
-
-def ship(cache: Path, folder: Path) -> None:
-    """Put all kernels that are kept below one folder into that of a wheel, under keys without the processor."""
-    for index in cache.rglob("*.nbi"):
-        with index.open("rb") as file:
-            _, (stamp, _) = pickle.load(file), pickle.load(file)
-        kept, shipped = (
-            KernelFiles(str(path), index.stem, mark) for path, mark in ((index.parent, stamp), (folder, _SHIPPED_STAMP))
-        )
-        for key in kept._load_index():
-            sig, _, source_key = key
-            shipped.save((sig, source_key), kept.load(key))

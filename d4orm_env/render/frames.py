@@ -178,11 +178,6 @@ class WindowRenderer:
         self._last = -np.inf
         self._open_window(problem, size)
 
-    @property
-    def has_window(self) -> bool:
-        """True if there is a window: not without a display, nor after the user closed it."""
-        return self._manager is not None
-
     @own_style()
     def _open_window(self, problem: Problem, size: tuple[int, int]) -> None:
         canvas_class = backend_registry.load_backend_module(mpl.get_backend()).FigureCanvas

@@ -179,11 +179,6 @@ class ZenohTransport(Mailbox):
             while True:
                 self.put(self._subscriber.recv().payload.to_bytes())
 
-    @property
-    def has_listeners(self) -> bool:
-        """Check whether any node would receive what is published now."""
-        return bool(self._publisher.matching_status.matching)
-
 
 def zenoh_config(zenoh: ModuleType, settings: ZenohSettings) -> object:
     """Zenoh's own configuration."""

@@ -236,11 +236,6 @@ class Playground:
         """Let :meth:`run` come to its end."""
         self._stopping.set()
 
-    @property
-    def clients(self) -> dict[int, viser.ClientHandle]:
-        """Clients that look at the page, by number."""
-        return self._server.get_clients()
-
     def show(self) -> None:
         """Bring the page up to date."""
         self._view.update()

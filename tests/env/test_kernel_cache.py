@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 from numba.core import config
+from release.warm_wheel import ship
 
 from d4orm_env.engine import caching, kernel_files
 from d4orm_env.engine.caching import has_to_be_compiled
@@ -232,7 +233,7 @@ class TestKernelCache:
         kernels = tmp_path / "kernels"
         folder = kernels / kernel_files.levels_here()[0]
         folder.mkdir(parents=True)
-        kernel_files.ship(path.parent, folder)
+        ship(path.parent, folder)
         record = {file: record_digest(file.read_bytes()) for file in folder.iterdir()}
         monkeypatch.setattr(kernel_files, "SHIPPED", kernels)
         monkeypatch.setattr(kernel_files, "_record", lambda: record)

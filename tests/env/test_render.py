@@ -272,7 +272,7 @@ def test_window_renderer_draws_without_a_window_where_there_is_no_display(monkey
     problem = ring_problem(3)
     nobody = np.zeros(3, bool)
     window, frames = WindowRenderer(problem), FrameRenderer(problem)
-    assert not window.has_window
+    assert window._manager is None
     shown = window.draw(problem.start, nobody, nobody)
     np.testing.assert_array_equal(shown, frames.draw(problem.start, nobody, nobody))
     window.close()
@@ -311,7 +311,7 @@ def test_window_shows_each_frame_and_survives_being_closed_by_the_user(monkeypat
     nobody = np.zeros(3, bool)
     window = WindowRenderer(problem, size=(200, 200))
     manager = window._manager
-    assert window.has_window
+    assert window._manager is not None
     assert manager.shown == 1
     frame = window.draw(problem.start, nobody, nobody)
     np.testing.assert_array_equal(window._image.get_array(), frame)
@@ -319,7 +319,7 @@ def test_window_shows_each_frame_and_survives_being_closed_by_the_user(monkeypat
     first, second = manager.canvas.waits
     assert 0 < first < second <= 0.25
     manager.canvas.callbacks.process("close_event", None)
-    assert not window.has_window
+    assert window._manager is None
     window.draw(problem.start, nobody, nobody)
     assert len(manager.canvas.waits) == 2
     window.close()

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from network_support import TIMEOUT, FaultyTransport, Link, free_endpoint, wait_until
+from network_support import TIMEOUT, FaultyTransport, Link, free_endpoint, has_listeners, wait_until
 from planner_support import hop_problem, walled_in_problem
 
 from d4orm_env.core.problem import Problem
@@ -110,7 +110,7 @@ def attacker() -> Iterator[Callable[[str], ZenohTransport]]:
 
     def opened(endpoint: str) -> ZenohTransport:
         ends.append(ZenohTransport(ZenohSettings(connect=(endpoint,))))
-        wait_until(lambda: ends[-1].has_listeners)
+        wait_until(lambda: has_listeners(ends[-1]))
         return ends[-1]
 
     yield opened
@@ -247,7 +247,7 @@ def test_a_partition_that_heals(
     try:
         strong = Solve(CIRCLE, node=0, nodes=2, zenoh={"listen": [endpoint], "config_file": str(path)}, **STRONG)
         weak = Solve(CIRCLE, node=1, nodes=2, zenoh={"connect": [link.endpoint], "config_file": str(path)}, **WEAK)
-        wait_until(lambda: len(ends) == 2 and all(end.has_listeners for end in ends), "a connection")
+        wait_until(lambda: len(ends) == 2 and all(has_listeners(end) for end in ends), "a connection")
         link.cut()
         go.set()
         wait_until(lambda: strong.found, "a solution")

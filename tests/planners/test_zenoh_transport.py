@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from network_support import free_endpoint, wait_until
+from network_support import free_endpoint, has_listeners, wait_until
 
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings, ZenohTransport
 
@@ -39,7 +39,7 @@ def pair(join: Join) -> tuple[ZenohTransport, ZenohTransport]:
     """Two connected ends."""
     endpoint = free_endpoint()
     first, second = join(listen=[endpoint]), join(connect=[endpoint])
-    wait_until(lambda: first.has_listeners and second.has_listeners)
+    wait_until(lambda: has_listeners(first) and has_listeners(second))
     return first, second
 
 
@@ -75,7 +75,7 @@ def test_who_is_away_is_tried_again(join: Join) -> None:
     early.publish(b"to nobody")
     assert early.collect() == []
     late = join(listen=[endpoint])
-    wait_until(lambda: early.has_listeners)
+    wait_until(lambda: has_listeners(early))
     early.publish(b"to somebody")
     assert late.collect(timeout=60) == [b"to somebody"]
 
@@ -84,8 +84,8 @@ def test_two_solves_on_one_network_do_not_hear_each_other(join: Join) -> None:
     endpoint = free_endpoint()
     first = join(listen=[endpoint], namespace="team/1")
     other, second = join(connect=[endpoint], namespace="team/2"), join(connect=[endpoint], namespace="team/1")
-    wait_until(lambda: second.has_listeners)
-    assert not other.has_listeners
+    wait_until(lambda: has_listeners(second))
+    assert not has_listeners(other)
     other.publish(b"stranger")
     second.publish(b"friend")
     assert first.collect(timeout=60) == [b"friend"]
@@ -123,7 +123,7 @@ def test_multicast_finds_others_on_this_machine(join: Join) -> None:
     # A namespace of its own, because nodes of other tests may be found as well.
     namespace = f"test/{uuid.uuid4()}"
     first, second = (join(multicast=True, namespace=namespace) for _ in range(2))
-    wait_until(lambda: first.has_listeners and second.has_listeners)
+    wait_until(lambda: has_listeners(first) and has_listeners(second))
     first.publish(b"found")
     assert second.collect(timeout=60) == [b"found"]
 

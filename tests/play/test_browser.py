@@ -131,7 +131,7 @@ def pixel(playground: Any, position: Sequence[float]) -> tuple[float, float]:
     """Where on the page a place of the plane, or of space, is."""
     from viser import transforms
 
-    camera = next(iter(playground.clients.values())).camera
+    camera = next(iter(playground._server.get_clients().values())).camera
     point = np.array([*position, 0.0])[:3]
     x, y, z = transforms.SO3(np.asarray(camera.wxyz)).inverse() @ (point - camera.position)
     scale = 0.5 * camera.image_height / np.tan(camera.fov / 2)
@@ -229,7 +229,7 @@ def pause_and_drag(page: Page, playground: Any, tmp_path: Path) -> None:
     page.evaluate("new Promise((done) => setTimeout(done, 500))")
     assert session.frame.status.number == number, "pause pauses"
 
-    wait_for(lambda: len(playground.clients) == 1)
+    wait_for(lambda: len(playground._server.get_clients()) == 1)
     goal = session.frame.goals[0]
     # By the corner of the diamond: a robot may stand on its middle.
     corner, end = pixel(playground, goal + np.array([0.0, 0.19])), pixel(playground, (0.4, 0.6))
@@ -255,7 +255,7 @@ def test_obstacles_are_dragged_and_scenes_and_replays_saved(page: Page, tmp_path
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         look_at(page, playground, "circle, 2 robots, go-to-goal")
         tick(page, "Paused")
-        wait_for(lambda: session.frame.status.state == "paused" and len(playground.clients) == 1)
+        wait_for(lambda: session.frame.status.state == "paused" and len(playground._server.get_clients()) == 1)
         start, end = pixel(playground, (0, 0)), pixel(playground, (0.9, 0.9))
         drag_until(lambda: session.frame.problem.world.boxes[0, 0] > 0, page, start, end)
         assert np.abs(session.frame.problem.world.boxes[0] - [0.7, 0.7, 1.1, 1.1]).max() < 0.3
@@ -276,7 +276,7 @@ def test_a_robot_that_is_dragged_with_shift_is_pushed(page: Page, tmp_path: Path
         session = playground.session
         session.pause(True)
         look_at(page, playground, "circle, 3 robots, go-to-goal: paused")
-        wait_for(lambda: len(playground.clients) == 1)
+        wait_for(lambda: len(playground._server.get_clients()) == 1)
         page.frames(8)
         before = session.frame.states
         begin = before[0, :2]
@@ -297,13 +297,13 @@ def test_goals_are_dragged_in_space(page: Page) -> None:
         session = playground.session
         session.pause(True)
         look_at(page, playground, "sphere, 3 robots, go-to-goal: paused")
-        wait_for(lambda: len(playground.clients) == 1)
+        wait_for(lambda: len(playground._server.get_clients()) == 1)
         page.frames(8)
         goal, wanted = session.frame.goals[0], pixel(playground, np.zeros(3))
         drag_until(lambda: not np.array_equal(session.frame.goals[0], goal), page, pixel(playground, goal), wanted)
         moved = session.frame.goals[0]
         assert np.abs(np.array(pixel(playground, moved)) - wanted).max() < 30, "it is where it was let go"
-        eye = next(iter(playground.clients.values())).camera.position
+        eye = next(iter(playground._server.get_clients().values())).camera.position
         assert np.linalg.norm(moved - eye) == pytest.approx(np.linalg.norm(goal - eye), rel=0.2), "and as far away"
         np.testing.assert_array_equal(session.frame.goals[1:], session.frame.problem.goal[1:])
 
@@ -316,7 +316,7 @@ def test_policies_are_ticked_and_drive_side_by_side(page: Page, tmp_path: Path) 
         session.pause(True)  # nobody stands on a goal yet
         page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         look_at(page, playground, "circle, 3 robots, go-to-goal: paused")
-        wait_for(lambda: len(playground.clients) == 1)
+        wait_for(lambda: len(playground._server.get_clients()) == 1)
         click(page, "Who drives")
         tick(page, "D4orm-C2F")
         wait_for(lambda: session.policies == ("go-to-goal", "d4orm-c2f"))
@@ -345,7 +345,7 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
         look_at(page, playground, "circle, 3 robots, go-to-goal: paused")
         with browser(tmp_path) as other:
             look_at(other, playground, "circle, 3 robots, go-to-goal: paused")
-            wait_for(lambda: len(playground.clients) == 2)
+            wait_for(lambda: len(playground._server.get_clients()) == 2)
             tick(other, "Lifelong goals")
             lifelong = beside("Lifelong goals", "input[type=checkbox]")
             page.until(f"{lifelong}.checked")
@@ -372,7 +372,7 @@ def test_two_browsers_play_with_one_team(page: Page, tmp_path: Path) -> None:
             other.mouse("Pressed", *pixel(playground, session.frame.states[2, :2]))
             other.mouse("Moved", *pixel(playground, (0.1, 0.1)))
             other.frames(4)
-        wait_for(lambda: len(playground.clients) == 1)  # it is killed with the robot in its hand
+        wait_for(lambda: len(playground._server.get_clients()) == 1)  # it is killed with the robot in its hand
         wait_for(lambda: not playground._view._viewports[0]._held)
         session.pause(False)
         wait_for(lambda: session.frame.status.time > 0)
@@ -431,7 +431,7 @@ def test_elsewhere_the_playground_asks_for_its_token(page: Page) -> None:
         page.offline(False)
         page.open(playground.address.partition("?")[0])
         assert page.evaluate("document.body.textContent").startswith("open the address that d4orm play has printed")
-        assert not playground.clients
+        assert not playground._server.get_clients()
         page.open("about:blank")
         page.open(playground.address)
         page.until("document.body.textContent.includes('circle, 2 robots, go-to-goal')")

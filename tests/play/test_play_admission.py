@@ -74,7 +74,7 @@ def test_a_foreign_page_does_not(playground: Playground, host: str, origin: str 
     assert (
         asked(playground, "/", Host=host.format(port=port), **({} if origin is None else {"Origin": origin}))[0] == 403
     )
-    assert not playground.clients
+    assert not playground._server.get_clients()
     assert not playground._panel.paused.value
 
 

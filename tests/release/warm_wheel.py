@@ -9,6 +9,7 @@ is of. It needs what the package needs, and `wheel`.
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-from d4orm_env.engine.kernel_files import SHIPPED, levels_here, ship
+from d4orm_env.engine.kernel_files import SHIPPED, SHIPPED_STAMP, KernelFiles, levels_here
 
 
 def compile_kernels(package: Path, level: str) -> None:
@@ -36,6 +37,19 @@ def compile_kernels(package: Path, level: str) -> None:
         ship(Path(cache), folder)
     kept = list(folder.iterdir())
     print(f"{level}: {len(kept)} files, {sum(path.stat().st_size for path in kept) / 1e6:.0f} MB", flush=True)
+
+
+def ship(cache: Path, folder: Path) -> None:
+    """Put all kernels that are kept below one folder into that of a wheel, under keys without the processor."""
+    for index in cache.rglob("*.nbi"):
+        with index.open("rb") as file:
+            _, (stamp, _) = pickle.load(file), pickle.load(file)
+        kept, shipped = (
+            KernelFiles(str(path), index.stem, mark) for path, mark in ((index.parent, stamp), (folder, SHIPPED_STAMP))
+        )
+        for key in kept._load_index():
+            sig, _, source_key = key
+            shipped.save((sig, source_key), kept.load(key))
 
 
 def main() -> None:
