@@ -21,9 +21,9 @@ TIMEOUT = 60.0
 
 
 @contextmanager
-def running(problem: Problem, *policies: str, host: str = "127.0.0.1") -> Iterator[Playground]:
+def running(problem: Problem, *policies: str, **options: str) -> Iterator[Playground]:
     """A playground with its page."""
-    shown = Playground(problem, *policies, host=host)
+    shown: Any = Playground(problem, *policies, **options)
     thread = threading.Thread(target=shown.run, daemon=True)
     thread.start()
     try:
@@ -33,7 +33,7 @@ def running(problem: Problem, *policies: str, host: str = "127.0.0.1") -> Iterat
         thread.join()
         shown.close()
         del shown
-        gc.collect()
+        gc.collect()  # viser leaves an event loop open, of which this test may warn and no other
 
 
 def opened(

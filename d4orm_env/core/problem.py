@@ -187,7 +187,7 @@ class Problem(Frozen):
 
     @cached_property
     def rounding(self) -> float:
-        """Allowance for what float32 makes of distances [m]: a little of a radius, more where coordinates are large."""
+        """Allowance for what float32 makes of distances, a little of a radius, more where coordinates are large [m]."""
         farthest = max(np.abs(self.start[:, : self.dimension]).max(), np.abs(self.goal).max())
         return max(ROUNDING * self.team.largest_radius, GRAINS * float(np.spacing(farthest)))
 

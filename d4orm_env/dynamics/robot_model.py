@@ -109,11 +109,11 @@ class ModelFunctions(NamedTuple):
     limit_state: ModelFunction
     """``(x, limits, ops) -> x`` at no more than the speed limit. :class:`Model` has it unwind the angles too."""
     velocity: ModelFunction
-    """``(x, u, limits, ops) -> `` velocity vector in the world frame [m/s]."""
+    """``(x, u, limits, ops) -> velocity``, a vector in the world frame [m/s]."""
     rest: ModelFunction
     """``(x, zero) -> x`` at rest at the same position and heading."""
     approach: ModelFunction
-    """``(x, goal, limits, h, ops) -> `` fastest velocity straight to the goal from which it can stop there [m/s]."""
+    """``(x, goal, limits, h, ops) -> velocity``, the fastest straight to the goal that lets it stop there [m/s]."""
     track: ModelFunction
     """``(x, velocity, limits, h, ops) -> u`` that would bring it to that within a step; it may exceed the limits."""
     integrate: Any = None

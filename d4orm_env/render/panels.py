@@ -105,7 +105,8 @@ class Axes2D:
     Attributes:
         axes: Axes to draw on.
         spatial: Whether this is a view of space (mplot3d, orthographic, so that spheres are circles).
-        right, up: ``(2,)`` or ``(3,)`` unit vectors that span the plane of the picture.
+        right: ``(2,)`` or ``(3,)`` unit vector in the plane of the picture.
+        up: The other one.
     """
 
     def __init__(self, axes: Any, problem: Problem, limits: Array) -> None:

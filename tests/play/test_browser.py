@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -105,23 +104,12 @@ def test_a_hundred_robots_play(page: Page, tmp_path: Path) -> None:
     assert page.complaints == []
 
 
-@contextmanager
-def running(problem: Problem, *arguments: str, **options: str) -> Iterator[Any]:
+def running(problem: Problem, *policies: str, **options: str) -> AbstractContextManager[Any]:
     """A playground with its page."""
     pytest.importorskip("viser")
-    from d4orm_planners.play.playground import Playground
+    import play_support
 
-    playground = Playground(problem, *arguments, **options)
-    thread = threading.Thread(target=playground.run, daemon=True)
-    thread.start()
-    try:
-        yield playground
-    finally:
-        playground.stop()
-        thread.join()
-        playground.close()
-        del playground
-        gc.collect()  # viser leaves an event loop open, of which this test may warn and no other
+    return play_support.running(problem, *policies, **options)
 
 
 viser_leaves_loops = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
