@@ -41,8 +41,6 @@ Mode = Literal["nominal", "measured"]
 
 SAME_PERIOD = 0.5
 """Share of a period within which another call gets the same setpoint."""
-
-
 IN_TIME = 0.9
 """Share of a step's timeout that is a policy's deadline."""
 
@@ -60,7 +58,7 @@ class Controller:
 
     Numbers of measured states that are not finite are missing: where a robot's position or heading is, the reference
     takes its place, and what else is follows from its last state and control. Speeds and coordinates beyond what a
-    robot's model allows count as the limit. A late step delays the reference; it never leaps.
+    robot's model allows count as the limit. A late step delays the reference; it never leaps, nor when a clock is set.
 
     Args:
         policy: Anything that :func:`~d4orm_planners.make_policy` takes.
@@ -82,6 +80,7 @@ class Controller:
 
     Attributes:
         states: ``(K, n)`` the last measured states, completed.
+        clock_resets: Times that the clock was set back by half a period or more.
 
     Raises:
         ValueError: For a bad argument, or if there is no such policy.
@@ -115,7 +114,7 @@ class Controller:
         self._background: Background[Actions] = Background()
         self._env: Any = None
         self._observer: DisturbanceObserver
-        self._time, self._lead = np.inf, np.zeros(0)
+        self._time, self._lead, self.clock_resets = np.inf, np.zeros(0), 0
         self._ending: JointState | None = None  # the reference once the episode is over
 
     def __enter__(self) -> Self:
@@ -181,18 +180,17 @@ class Controller:
 
         Raises:
             RuntimeError: Before :meth:`begin`.
-            ValueError: If the states have another shape, or the time is before that of the last step.
+            ValueError: If the states have another shape, or the time is no number of seconds.
         """
         reference = self._joint.states
         measured, known = completed(self.problem, self._bounds, states, reference, self._expected)
         dt = self.problem.dt
         passed = (seconds(time) - self._time) / dt
-        if passed <= -SAME_PERIOD:
-            raise ValueError(f"time is {time!r} s, before the last step; give times of one clock, in seconds")
-        if passed >= SAME_PERIOD:
+        if abs(passed) >= SAME_PERIOD:
             self._setpoint = self._advance(measured, known)
             # Periods follow each other, so that frequent calls do not make the reference faster than the clock.
-            self._time = max(self._time + dt, float(time) - SAME_PERIOD * dt)
+            self._time = float(time) if passed < 0 else max(self._time + dt, float(time) - SAME_PERIOD * dt)
+            self.clock_resets += passed < 0
         return self._setpoint
 
     def reset(self, env: ParallelEnv, seed: int = 0) -> None:

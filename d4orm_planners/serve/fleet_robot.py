@@ -24,14 +24,22 @@ class FleetRobot:
     stand: Floats | None = None  #: ``(d,)`` where it is held, or braking to a halt, while the team does not drive [m]
     #: ``(3,)`` by the last two poses that are far enough apart, in the frame of all [m/s]
     velocity: Floats = field(default_factory=lambda: np.zeros(3))
-    #: Time by the robot's clock [s] and ``(3,)`` position of the later one [m]
-    posed: tuple[float, Floats] | None = None
+    #: Time by the robot's clock and by this process's [s], and ``(3,)`` position of the later one [m]
+    posed: tuple[float, float, Floats] | None = None
+    clock_resets: int = 0  #: Times that its clock was set back, or forward beyond the deadline
 
-    def take_pose(self, stamped: Any, base: float) -> None:
-        """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by ``base`` seconds at least."""
-        now, position = wire.time_of(stamped.header), position_of(stamped.pose.position)
-        passed = np.inf if self.posed is None else now - self.posed[0]
-        if passed < base and passed >= 0:
-            return
-        self.velocity = (position - self.posed[1]) / passed if self.posed and 0 < passed < np.inf else np.zeros(3)
-        self.posed = now, position
+    def take_pose(self, stamped: Any, now: float, base: float, deadline: float) -> None:
+        """Take the velocity from a ``geometry_msgs/PoseStamped`` and one that is older by ``base`` seconds at least.
+
+        Where the robot's clock was set in between it stays as it is.
+        """
+        stamp, position = wire.time_of(stamped.header), position_of(stamped.pose.position)
+        if self.posed is not None:
+            passed, waited = stamp - self.posed[0], now - self.posed[1]
+            if 0 <= passed < base:
+                return
+            if 0 < passed <= waited + deadline:
+                self.velocity = (position - self.posed[2]) / passed
+            else:
+                self.clock_resets += 1
+        self.posed = stamp, now, position

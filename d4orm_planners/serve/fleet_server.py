@@ -84,8 +84,7 @@ class FleetServer:
             raise ValueError(f"robots are called {', '.join(names)}; give each a name of its own")
         self.deadline = positive_number(deadline, "deadline", least=problem.dt)
         self._problem, self._controller, self._seed = problem, controller, seed
-        unknown = np.full(problem.state_size, np.nan, np.float32)
-        self._robots = [FleetRobot(name, unknown) for name in names]
+        self._robots = [FleetRobot(name, np.full(problem.state_size, np.nan, np.float32)) for name in names]
         self._odometry = [session.subscriber(f"{name}/odom", wire.ODOMETRY) for name in names]
         self._poses = [session.subscriber(f"{name}/pose", wire.POSE) for name in names]
         self._goals = [session.subscriber(f"{name}/goal", wire.POSE) for name in names]
@@ -162,7 +161,7 @@ class FleetServer:
                 self._hear(number, message.pose.pose, now, position_of(told.linear), told.angular.z)
             for message in self._poses[number].take():
                 if np.isfinite(position_of(message.pose.position)).all():
-                    robot.take_pose(message, BASE * self._problem.dt)
+                    robot.take_pose(message, now, BASE * self._problem.dt, self.deadline)
                     own = turned(robot.velocity, -wire.heading_of(message.pose.orientation))
                     self._hear(number, message.pose, now, own)
             for message in self._goals[number].take():
@@ -295,6 +294,7 @@ class FleetServer:
             "arrived": str(int(self._controller.arrived.sum())) if self.state == DRIVING else "",
             "longest loop [ms]": f"{1000 * max(self.loops):.1f}",
             "unreadable messages": str(refused),
+            "clocks set": ", ".join(robot.name for robot in self._robots if robot.clock_resets),
             "refused": self.refusal,
         }
         return wire.diagnostics(NODE, LEVELS[self.state], self.state, values)

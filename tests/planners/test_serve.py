@@ -457,10 +457,13 @@ def test_odometry_without_a_heading_is_not_taken(broken: tuple[float, ...]) -> N
 
 def test_velocities_are_taken_from_poses() -> None:
     robot, stamped = FleetRobot("a", np.zeros(4, np.float32)), pose_stamped()
-    for now, x, velocity in ((0.0, 1.0, 0.0), (0.01, 9.0, 0.0), (0.05, 1.1, 2.0), (0.06, 1.1, 2.0), (0.01, 3.0, 0.0)):
-        stamped.header.stamp.nanosec, stamped.pose.position.x = round(1e9 * now), x
-        robot.take_pose(stamped, 0.04)
+    rows = ((0.0, 1.0, 0.0), (0.01, 9.0, 0.0), (0.05, 1.1, 2.0), (0.06, 1.1, 2.0), (0.01, 3.0, 2.0), (0.06, 3.05, 1.0),
+            (0.9, 3.1, 1.0), (0.95, 3.2, 2.0))  # fmt: skip
+    for number, (stamp, x, velocity) in enumerate(rows):
+        stamped.header.stamp.nanosec, stamped.pose.position.x = round(1e9 * stamp), x
+        robot.take_pose(stamped, 0.05 * number, 0.04, DEADLINE)
         assert robot.velocity == pytest.approx([velocity, 0, 0])
+    assert robot.clock_resets == 2, "set back, and then forward"
 
 
 def test_types_are_those_of_ros() -> None:
