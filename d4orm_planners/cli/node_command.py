@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 
 from d4orm_env.core.arrays import duration, whole_number
+from d4orm_env.core.errors import unknown
 from d4orm_env.core.files import read_yaml
 from d4orm_env.core.problem import Problem
 from d4orm_env.scenarios import load_problem, make_problem
@@ -27,7 +28,7 @@ from d4orm_planners.cli.outputs import check_target
 from d4orm_planners.d_d4orm.planner import DD4orm
 from d4orm_planners.d_d4orm.zenoh_transport import ZenohSettings
 from d4orm_planners.serve.fleet_server import NODE, FleetServer
-from d4orm_planners.serve.wire import RosSession
+from d4orm_planners.serve.wire import WIRES, RosSession
 
 if TYPE_CHECKING:
     from d4orm_planners.base.plan import IterationRecord
@@ -185,7 +186,7 @@ def _events_as_lines() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-FIELDS = ("problem", "policy", "settings", "controller", "robots", "deadline", "domain", "seed", "zenoh")
+FIELDS = ("problem", "policy", "settings", "controller", "robots", "deadline", "domain", "seed", "zenoh", "wire")
 CONTROLLER = {"mode", "reserve", "timeout", "lag", "tracker"}
 """Settings of the controller."""
 SHARE = 0.9
@@ -203,6 +204,7 @@ class ServeTask:
     domain: int
     seed: int
     zenoh: ZenohSettings
+    wire: str
 
 
 def serve(
@@ -211,7 +213,7 @@ def serve(
     """Drive robots on a ROS 2 network over Zenoh: odometry in, velocities and setpoints out, until Ctrl-C."""
     task, over = read_task(config, FIELDS[:1], FIELDS[1:], _serve_task), threading.Event()
     # Robots are told to stand once it is set.
-    with on_signals(lambda *_: over.set()), RosSession(task.zenoh, task.domain, NODE) as session:
+    with on_signals(lambda *_: over.set()), RosSession(task.zenoh, task.domain, NODE, task.wire) as session:
         server = FleetServer(session, task.problem, task.controller, task.names, task.deadline, task.seed)
         typer.echo(f"serving {', '.join(task.names)} on domain {task.domain}; Ctrl-C ends it")
         server.run(over)
@@ -231,6 +233,8 @@ def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
             f"{wrong[0]!r} is in the wrong place; controller takes {', '.join(sorted(CONTROLLER))}, and settings what "
             "the policy takes"
         )
+    if (wire := fields.get("wire", WIRES[0])) not in WIRES:
+        raise unknown("wire", wire, WIRES)
     DisturbanceObserver(problem, own.get("lag", 0.0))  # refuses a lag for another team
     names = fields.get("robots", [f"robot_{robot}" for robot in range(problem.num_robots)])
     if not isinstance(names, list) or not all(isinstance(name, str) and name.isidentifier() for name in names):
@@ -243,4 +247,5 @@ def _serve_task(fields: Mapping[str, Any], folder: Path) -> ServeTask:
         domain=whole_number(fields.get("domain", 0), "domain", 0, 232),
         seed=whole_number(fields.get("seed", 0), "seed", 0),
         zenoh=ZenohSettings.of(zenoh),
+        wire=wire,
     )

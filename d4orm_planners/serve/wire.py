@@ -1,8 +1,11 @@
-"""ROS 2 topics over Zenoh, as rmw_zenoh maps them, and a team's states, goals and commands as messages.
+"""ROS 2 topics over Zenoh, as rmw_zenoh or zenoh-bridge-ros2dds maps them, and a team's states, goals and commands as
+messages.
 
-A topic is the key ``DOMAIN/NAME/TYPE/RIHS01_HASH``. With every message goes an attachment: its number and the time of
-sending [ns], 8 bytes each, little end first, and the 16 bytes of the publisher's identity after their number.
-Liveliness tokens below ``@ros2_lv`` tell ``ros2 topic list`` who is there (rmw_zenoh, docs/design.md).
+With rmw_zenoh a topic is the key ``DOMAIN/NAME/TYPE/RIHS01_HASH``. With every message goes an attachment: its number
+and the time of sending [ns], 8 bytes each, little end first, and the 16 bytes of the publisher's identity after their
+number.
+Liveliness tokens below ``@ros2_lv`` tell ``ros2 topic list`` who is there (rmw_zenoh, docs/design.md). With the bridge
+the key is ``NAME``, and there is nothing else (zenoh-plugin-ros2dds, examples/python).
 """
 
 from __future__ import annotations
@@ -29,6 +32,8 @@ _zenoh: Any = LazyModule("zenoh", "d4orm serve", "zenoh")
 _rosbags: Any = LazyModule("rosbags.typesys", "d4orm serve", "ros")
 
 BOOL, POSE, ODOMETRY = "std_msgs/msg/Bool", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+WIRES = ("rmw_zenoh", "bridge")
+"""Mappings of topics: rmw_zenoh's, and that of zenoh-bridge-ros2dds."""
 TWIST, TRAJECTORY = "geometry_msgs/msg/Twist", "trajectory_msgs/msg/MultiDOFJointTrajectory"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
@@ -50,16 +55,17 @@ class RosSession:
         settings: Network of the others.
         domain: ROS domain.
         node: Name of the node.
+        wire: One of :data:`WIRES`.
 
     Raises:
         ImportError: If zenoh or rosbags is not installed.
         ValueError: If zenoh refuses the settings.
     """
 
-    def __init__(self, settings: ZenohSettings, domain: int, node: str) -> None:
+    def __init__(self, settings: ZenohSettings, domain: int, node: str, wire: str = WIRES[0]) -> None:
         load(_rosbags)
         zenoh = load(_zenoh)
-        self._domain, self._node, self._tokens = domain, node, 0
+        self._domain, self._node, self._tokens, self._bridge = domain, node, 0, wire == "bridge"
         try:
             self._session = zenoh.open(zenoh_config(zenoh, settings))
         except zenoh.ZError as error:
@@ -80,11 +86,12 @@ class RosSession:
     def publisher(self, topic: str, kind: str) -> Publisher:
         """A publisher of messages of a type, such as :data:`TWIST`."""
         zenoh = load(_zenoh)
-        key = _key(self._domain, topic, kind)
+        key = topic if self._bridge else _key(self._domain, topic, kind)
         self._declare("MP", topic, kind)
         # A command that is late is worth nothing: rather lose it than wait for a slow link.
         drop = zenoh.CongestionControl.DROP
-        return Publisher(self._session.declare_publisher(key, congestion_control=drop, express=True))
+        declared = self._session.declare_publisher(key, congestion_control=drop, express=True)
+        return Publisher(declared, attached=not self._bridge)
 
     def subscriber(self, topic: str, kind: str, heard: Callable[[Subscriber], None] | None = None) -> Subscriber:
         """A subscriber to messages of a type.
@@ -93,11 +100,14 @@ class RosSession:
         """
         self._declare("MS", topic, kind)
         # Whatever the hash: ROS 2 Humble has none.
-        key, subscriber = _key(self._domain, topic, kind).rpartition("/")[0] + "/*", Subscriber(kind, heard)
+        key = topic if self._bridge else _key(self._domain, topic, kind).rpartition("/")[0] + "/*"
+        subscriber = Subscriber(kind, heard)
         self._open.append(self._session.declare_subscriber(key, subscriber.hear))
         return subscriber
 
     def _declare(self, entity: str, topic: str = "", kind: str = "") -> None:
+        if self._bridge:  # tells its own nodes only
+            return
         parts = ["@ros2_lv", str(self._domain), str(self._session.zid()), "0", str(self._tokens), entity]
         parts += ["%", "%", self._node]
         if kind:
@@ -109,15 +119,16 @@ class RosSession:
 class Publisher:
     """A topic to publish on."""
 
-    def __init__(self, publisher: Any) -> None:
+    def __init__(self, publisher: Any, *, attached: bool = True) -> None:
         self._publisher, self._number, self._identity = publisher, 0, secrets.token_bytes(16)
+        self._attached = attached
 
     def publish(self, message: Any) -> None:
         """Send a message."""
         self._number += 1
-        attachment = _ATTACHMENT.pack(self._number, time.time_ns(), len(self._identity), self._identity)
+        numbered = _ATTACHMENT.pack(self._number, time.time_ns(), len(self._identity), self._identity)
         content = ros.message_types().serialize_cdr(message, message.__msgtype__)
-        self._publisher.put(bytes(content), attachment=attachment)
+        self._publisher.put(bytes(content), attachment=numbered if self._attached else None)
 
 
 class Subscriber:

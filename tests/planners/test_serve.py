@@ -501,6 +501,32 @@ def test_states_and_velocities_are_in_the_robots_own_frame(model: str) -> None:
         assert command == pytest.approx((0.4, 0, 0, 0), abs=1e-6)
 
 
+def test_a_bridge_gets_plain_names_and_bytes(endpoint: str) -> None:
+    with RosSession(ZenohSettings(listen=(endpoint,)), 7, "d4orm", "bridge") as session:
+        config = zenoh.Config()
+        config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        publisher, subscriber = session.publisher("tb0/cmd_vel", TWIST), session.subscriber("tb0/odom", ODOMETRY)
+        heard: list[Any] = []
+        with zenoh.open(config) as bridge:
+            listening = bridge.declare_subscriber("**", heard.append)
+            told, odometry = ros.twist(np.array([0.2, 0.0, 0.0]), 0.5), odometry_of(np.array([1.0, 2.0]))
+
+            def arrives() -> bool:
+                publisher.publish(told)
+                bridge.put("tb0/odom", bytes(STORE.serialize_cdr(odometry, ODOMETRY)))
+                time.sleep(0.01)
+                return any(str(one.key_expr) == "tb0/cmd_vel" for one in heard) and bool(subscriber._samples)
+
+            until(arrives)
+            listening.undeclare()
+            assert not list(bridge.liveliness().get("@ros2_lv/**"))
+    said = next(one for one in heard if str(one.key_expr) == "tb0/cmd_vel")
+    floats = struct.pack("<6d", 0.2, 0, 0, 0, 0, 0.5)
+    assert (said.payload.to_bytes(), said.attachment) == (b"\0\1\0\0" + floats, None), "CDR, little end first"
+    assert subscriber.take()[-1].pose.pose.position.y == 2.0
+
+
 def test_strangers_bytes_are_counted(endpoint: str) -> None:
     with RosSession(ZenohSettings(listen=(endpoint,)), 0, "d4orm") as session:
         subscriber = session.subscriber("e_stop", BOOL)
@@ -523,6 +549,7 @@ def test_strangers_bytes_are_counted(endpoint: str) -> None:
         ("policy: orca", "field 'problem' is missing"),
         ("problem: {scenario: circle}\nspeed: 2", "unknown field 'speed'"),
         ("problem: {scenario: circle}\nzenoh: {namespace: a}", "zenoh has 'namespace'"),
+        ("problem: {scenario: circle}\nwire: dds", "wire 'dds' is unknown; choose one of rmw_zenoh, bridge"),
         ("problem: {scenario: circle}\nrobots: [a/b]", "robots is ['a/b']"),
         ("problem: {scenario: circle}\npolicy: nobody", "nobody"),
         ("problem: {scenario: circle}\nrobots: [a, b]", "there are 2 names for 8 robots"),
