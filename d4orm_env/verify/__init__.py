@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from d4orm_env.core import portable
+from d4orm_env.dynamics.robot_model import ACCELERATION
 from d4orm_env.verify.contact import BLOCKS, MAX_NUMBERS, Stretch
 from d4orm_env.verify.curves import CHORD_ERROR
 from d4orm_env.verify.docking import SPEED_ALLOWANCE, Docking, find_docking
@@ -210,9 +211,15 @@ def _left_out(problem: Problem, violations: list[Violation]) -> VerificationRepo
 
 def _braked_away(problem: Problem) -> Floats:
     """``(K,)`` what robots brake away in a step, and the allowance [m/s]; infinite for those without inertia."""
-    first_order = np.array([model.first_order for model in problem.team.robot_models])
-    braking = problem.team.max_acceleration * problem.dt + SPEED_ALLOWANCE * problem.team.max_speed
-    return np.where(first_order, np.inf, braking.astype(np.float64))
+    team, dt = problem.team, problem.dt
+    braking = team.max_acceleration * dt + SPEED_ALLOWANCE * team.max_speed
+    for robot, model in enumerate(team.robot_models):
+        if model.first_order:
+            braking[robot] = np.inf
+        elif ACCELERATION in dict(model.state_limits).values():  # it must end too, at a limited rate
+            rate = team.limits[robot, model.control_limits[0]]
+            braking[robot] = min(braking[robot], rate * dt * dt / 2 + SPEED_ALLOWANCE * team.max_speed[robot])
+    return braking.astype(np.float64)
 
 
 def _non_finite(controls: Floats, dt: float) -> list[Violation]:

@@ -37,8 +37,10 @@ class VerificationReport:
             does not dock in every reading.
         arrival_speeds: ``(K,)`` speed at which each robot then docked [m/s]; NaN where it does not dock, or is
             not stopped.
-        dynamics_ok: Whether each robot that docked could brake away that speed within the step: if so the plan obeys
+        dynamics_ok: Whether each robot that docked can brake away that speed in the step after: if so the plan obeys
             the model to its end. It does not where goals stop robots dead (an infinite goal speed, as in the paper).
+            Trajectories leave that step out: velocities are zero as robots dock, in which they change by up to twice
+            what robots brake away in a step, and real ones roll on by up to ``max_acceleration * dt**2 / 2``.
         violations: Everything wrong, by time; one entry for each pair, robot and obstacle, robot and side of the
             bounds, or robot and limit.
     """

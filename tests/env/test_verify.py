@@ -437,6 +437,15 @@ def test_a_robot_arrives_at_what_it_brakes_away_in_a_step(model):
     assert report.dynamics_ok
 
 
+@pytest.mark.parametrize(("speed", "stops"), [(0.0201, True), (0.021, False), (0.1, False)])
+def test_who_must_end_an_acceleration_brakes_less_away_in_a_step(speed, stops):
+    problem = make(["holonomic2d_jerk"], [(0, 0, speed, 0, -0.4, 0)], [(0.03, 0)], horizon=5)
+    ended = verify(problem.replace(start=[[0, 0, speed + 0.02, 0, -0.4, 0]]), hold(problem, (4, 0)))
+    assert ended.ok
+    assert ended.arrival_speeds == pytest.approx([speed], abs=1e-4)
+    assert ended.dynamics_ok == stops
+
+
 def test_a_robot_at_rest_is_slow_enough_for_any_goal_speed():
     problem = make(["velocity2d"], [(0, 0)], [(0.5, 0)], horizon=10, goal_speed=0.0)
     controls = hold(problem, (1, 0))
