@@ -3,8 +3,9 @@
     d4orm export plan.npz --format crazyswarm2 --height 1 --out flight
     python examples/robots/fly_crazyflies.py flight radio://0/80/2M/E7E7E7E701 radio://0/80/2M/E7E7E7E702
 
-It needs `pip install cflib`, drones that know where they are (motion capture, Lighthouse), and URIs in the order of the
-plan's robots. Each drone must stand below its start. Ctrl-C stops the motors. Try it with one drone, low, first.
+It needs `pip install cflib` (it was read beside 0.1.34), drones that know where they are (motion capture, Lighthouse),
+and URIs in the order of the plan's robots. Each drone must stand below its start. Ctrl-C stops the motors. Try it with
+one drone, low, first.
 """
 
 from __future__ import annotations
@@ -38,6 +39,11 @@ def upload(link: Any, pieces: list[list[float]]) -> None:
     link.cf.high_level_commander.define_trajectory(1, 0, len(pieces))
 
 
+def arm(link: Any) -> None:
+    """Allow the motors of a drone to turn, which brushless ones do not by themselves."""
+    link.cf.supervisor.send_arming_request(True)
+
+
 def command(link: Any, name: str, *values: float) -> None:
     """Give a drone's high-level commander a command."""
     getattr(link.cf.high_level_commander, name)(*values)
@@ -55,6 +61,8 @@ def fly(flight: dict[str, list[list[float]]]) -> None:
         swarm.reset_estimators()
         swarm.parallel_safe(upload, {uri: [pieces] for uri, pieces in flight.items()})
         try:
+            swarm.parallel_safe(arm)
+            time.sleep(SETTLE)
             swarm.parallel_safe(command, {uri: ["takeoff", z, TAKE_OFF] for uri, (_, _, z) in starts.items()})
             time.sleep(TAKE_OFF + SETTLE)
             swarm.parallel_safe(command, {uri: ["go_to", *start, 0.0, SETTLE] for uri, start in starts.items()})
