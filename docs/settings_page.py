@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from d4orm_env.core.robot_types import ROBOTS
 from d4orm_env.scenarios import describe_scenario, list_scenarios
 from d4orm_planners import list_policies
 from d4orm_planners.base.planner_registry import default_settings, find_policy, preset_names
@@ -71,10 +72,25 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
+def robots() -> str:
+    """The numbers of the robots that are known by name, and where each comes from."""
+    rows = [
+        [f"`{name}`", f"`{attribute}`", f"{getattr(robot, attribute):g}", sourced(source)]
+        for name, robot in ROBOTS.items()
+        for attribute, source in robot.sources.items()
+    ]
+    return "## Robots by name\n\n" + table(["robot", "attribute", "in SI units", "source"], rows)
+
+
+def sourced(text: str) -> str:
+    """Text whose addresses are links."""
+    return re.sub(r"https://[^\s,)]+", r"<\g<0>>", text)
+
+
 def write_settings(path: Path) -> None:
     """Write the page."""
     rows = [[f"`{name}`", plain(describe_scenario(name))] for name in list_scenarios()]
     scenarios = table(["name", "what it is"], rows)
     sections = filter(None, (section(name) for name in list_policies()))
     path.parent.mkdir(exist_ok=True)
-    path.write_text(HEAD + scenarios + "\n" + "\n".join(sections), encoding="utf-8")
+    path.write_text(HEAD + scenarios + "\n" + robots() + "\n" + "\n".join(sections), encoding="utf-8")

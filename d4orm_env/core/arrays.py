@@ -112,9 +112,9 @@ def frozen_array(
     return read_only(array)
 
 
-def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray:
-    """``value`` as ``(num_robots,)`` numbers from :data:`SMALLEST` to :data:`LARGEST`; a single one is given to every
-    robot.
+def frozen_per_robot(value: ArrayLike, name: str, num_robots: int, *, zero_allowed: bool = False) -> FloatArray:
+    """``value`` as ``(num_robots,)`` numbers from :data:`SMALLEST`, or zero, to :data:`LARGEST`; a single one is given
+    to every robot.
 
     Others are a ValueError that names the robot.
     """
@@ -124,8 +124,10 @@ def frozen_per_robot(value: ArrayLike, name: str, num_robots: int) -> FloatArray
     elif numbers.shape != (num_robots,):
         raise ValueError(f"{name} has shape {numbers.shape}; expected one number, or ({num_robots},)")
     array = frozen_array(numbers, name, (num_robots,))
-    refuse_robots(array <= 0, name, array, "positive")
-    refuse_robots((array < np.float32(SMALLEST)) | (array > LARGEST), name, array, f"from {SMALLEST:g} to {LARGEST:g}")
+    least = 0.0 if zero_allowed else SMALLEST
+    if not zero_allowed:
+        refuse_robots(array <= 0, name, array, "positive")
+    refuse_robots((array < np.float32(least)) | (array > LARGEST), name, array, f"from {least:g} to {LARGEST:g}")
     return array
 
 

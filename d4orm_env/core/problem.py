@@ -56,7 +56,7 @@ class Problem(Frozen):
         world: Obstacles and bounds; an empty open world of the team's dimension by default.
         dt: Time step [s], from 1e-6 to 1000.
         horizon: Number of steps ``H``, at most a million.
-        margin: Safety margin epsilon [m] that plans keep to everything.
+        margin: Safety margin epsilon [m] that plans keep to everything, by default the team's.
         goal_radius: A robot within it has arrived [m].
         goal_speed: ``(K,)`` speed at which each robot may still dock [m/s]; one number is for all. By default what it
             brakes away in a time step, ``max_acceleration * dt``, and infinite for first-order models. Infinite is the
@@ -104,7 +104,7 @@ class Problem(Frozen):
         world: World | None = None,
         dt: float = 0.1,
         horizon: int = 100,
-        margin: float = 0.05,
+        margin: float | None = None,
         goal_radius: float = 0.075,
         goal_speed: ArrayLike | None = None,
         name: str = "custom",
@@ -116,6 +116,7 @@ class Problem(Frozen):
     ) -> None:
         checks.check_is_team(team)
         world, size = world_of(world, team.dimension), team.num_robots
+        margin = team.margin if margin is None else margin
         numbers = checks.checked_numbers(dt, horizon, margin, goal_radius, collision_penalty, size)
         checks.check_arrival(arrival)
         self._set(

@@ -133,6 +133,8 @@ def digest_of(problem: Problem) -> str:
         sha.update(arrays.goal_direction[:, :columns].tobytes() + arrays.squared_goal_chord.tobytes())
     if problem.team.shapes:
         sha.update(repr(problem.team.shapes).encode())
+    if problem.team.lag.any():
+        sha.update(b"lag" + problem.team.lag.tobytes())
     if problem.collision_penalty != 1:
         sha.update(f"collision_penalty {problem.collision_penalty!r}".encode())
     return sha.hexdigest()

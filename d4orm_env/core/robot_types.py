@@ -9,14 +9,23 @@ from types import MappingProxyType
 from d4orm_env.core.arrays import whole_number
 from d4orm_env.core.errors import unknown
 from d4orm_env.core.team import Team
+from d4orm_env.footprints import Ellipsoid
 
-_BITCRAZE = "92 mm between motors, 47 mm propellers; not looked up, measure yours"
-_MEASURED = "flown in crazyflow 0.4.0 with the Mellinger controller: largest tracking error 0.06 m, 0.11 m with gusts"
+_CRAZYFLIE = "https://www.bitcraze.io/documentation/hardware/crazyflie_2_1/crazyflie_2_1-datasheet.pdf"
+_BRUSHLESS = "https://www.bitcraze.io/author/tobias/"
+_ROBOTIS = "https://emanual.robotis.com/docs/en/platform/turtlebot3/features/#specifications"
+_DJI = "https://www.dji.com/robomaster-ep/specs"
+_CLEARPATH = "https://github.com/jackal/jackal/blob/noetic-devel/jackal_control/config/control.yaml"
+_FLOWN = "ours, measured in crazyflow 0.4.0 (examples.studies zero_shot): "
+_GUESSED = "ours, not measured"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotType:
-    """A robot that can be bought. Numbers are those of everyday work in a team, not its records."""
+    """A robot that can be bought. Numbers are those of everyday work in a team, not its records.
+
+    Its goal speed is what it brakes away in a time step, as of all robots.
+    """
 
     model: str  #: Name of its model
     radius: float  #: Of the circle (sphere) around it [m]
@@ -25,13 +34,20 @@ class RobotType:
     max_turn_rate: float = 1.0  #: [rad/s]; of no use to models without a heading
     margin: float  #: Distance for what tracking is off [m]
     lag: float  #: Time constant of its actuators [s], for :class:`~d4orm_planners.base.controller.Controller`
+    downwash: float = 0.0  #: Half the height of an ellipsoid in whose like no other may be, above or below it [m]
     sources: Mapping[str, str]  #: Where the numbers come from, by attribute
 
-    @property
-    def settings(self) -> dict[str, object]:
-        """Arguments of scenarios for a team of these."""
-        limits = {name: getattr(self, name) for name in ("max_speed", "max_acceleration", "max_turn_rate")}
-        return {"model": self.model, "radius": self.radius, "margin": self.margin, **limits}
+    def settings(self, downwash: object = False) -> dict[str, object]:
+        """Arguments of scenarios for a team of these, as balls or with room for their downwash."""
+        if not isinstance(downwash, bool):
+            raise ValueError(f"downwash is {downwash!r}; it must be True or False")
+        if downwash and not self.downwash:
+            raise ValueError("downwash is True, and this robot has none; leave it out, or choose a drone as robot")
+        names = ("model", "max_speed", "max_acceleration", "max_turn_rate", "margin", "lag")
+        size = (
+            {"footprint": Ellipsoid(self.radius, self.radius, self.downwash)} if downwash else {"radius": self.radius}
+        )
+        return {name: getattr(self, name) for name in names} | size
 
 
 def _robot(model: str, **numbers: tuple[float, str]) -> RobotType:
@@ -43,45 +59,47 @@ def _robot(model: str, **numbers: tuple[float, str]) -> RobotType:
 ROBOTS: Mapping[str, RobotType] = MappingProxyType({
     "crazyflie": _robot(
         "holonomic3d",
-        radius=(0.07, f"Crazyflie 2.1+ {_BITCRAZE}; the air below it needs more"),
+        radius=(0.07, f"92 mm between motors, {_CRAZYFLIE}; propellers of 47 mm"),
         max_speed=(1.0, "ours, for indoor flight by motion capture"),
         max_acceleration=(2.0, "ours: a tilt of 11 degrees, which leaves thrust for the height with a low battery"),
-        margin=(0.1, _MEASURED),
-        lag=(0.2, "of accelerations in crazyflow 0.4.0, where 0.1 s left D4orm-C2F circling its goals"),
+        margin=(0.1, _FLOWN + "largest tracking error 0.06 m, 0.11 m with gusts"),
+        lag=(0.2, _FLOWN + "of accelerations; 0.1 s left D4orm-C2F circling its goals"),
+        downwash=(0.25, "ours: with the margin as the ellipsoid of 0.12 x 0.12 x 0.3 m usual for it, not flown"),
     ),
     "crazyflie_brushless": _robot(
         "holonomic3d",
-        radius=(0.08, "ours: about 50 mm to the motors, 55 mm propellers; measure yours"),
+        radius=(0.08, f"ours: about 50 mm to the motors; propellers of 55 mm, {_BRUSHLESS}"),
         max_speed=(1.5, "ours, for indoor flight by motion capture"),
         max_acceleration=(3.0, "ours: a tilt of 17 degrees"),
-        margin=(0.1, "as crazyflie, not measured"),
-        lag=(0.08, "ours, not measured"),
+        margin=(0.1, "ours: as crazyflie, not measured"),
+        lag=(0.08, _GUESSED),
+        downwash=(0.25, "ours: as crazyflie, not flown"),
     ),
     "turtlebot3_burger": _robot(
         "differential_drive",
-        radius=(0.105, "turtlebot3_navigation2: robot_radius 0.105 (138 x 178 mm, turning about the wheels' axle)"),
-        max_speed=(0.22, "ROBOTIS e-Manual, specifications: 0.22 m/s"),
+        radius=(0.105, f"robot_radius of turtlebot3_navigation2; 138 x 178 mm, {_ROBOTIS}"),
+        max_speed=(0.22, _ROBOTIS),
         max_acceleration=(0.5, "ours; turtlebot3_navigation allows 2.5"),
-        max_turn_rate=(1.8, "ours; the e-Manual has 2.84 rad/s at most"),
-        margin=(0.05, "ours, not measured"),
-        lag=(0.15, "ours: a loop at 10 Hz over ROS 2"),
+        max_turn_rate=(1.8, f"ours; 2.84 rad/s at most, {_ROBOTIS}"),
+        margin=(0.05, _GUESSED),
+        lag=(0.15, "ours, not measured: a loop at 10 Hz over ROS 2"),
     ),
     "robomaster": _robot(
         "holonomic2d",
-        radius=(0.2, "DJI RoboMaster S1/EP: 320 x 240 mm, half of the diagonal"),
-        max_speed=(1.0, "ours; DJI: 3.5 m/s forwards, 2.8 m/s sideways"),
-        max_acceleration=(1.0, "ours, for mecanum wheels without slip"),
-        margin=(0.05, "ours, not measured"),
-        lag=(0.1, "ours, not measured"),
+        radius=(0.2, f"half of the diagonal of 320 x 240 mm, {_DJI}"),
+        max_speed=(1.0, f"ours; 3.5 m/s forwards and 2.8 m/s sideways at most, {_DJI}"),
+        max_acceleration=(1.0, "ours, for mecanum wheels without slip, not measured"),
+        margin=(0.05, _GUESSED),
+        lag=(0.1, _GUESSED),
     ),
     "jackal": _robot(
         "differential_drive",
-        radius=(0.333, "Clearpath Jackal: 508 x 430 mm, half of the diagonal; not looked up"),
-        max_speed=(1.5, "ours; 2.0 m/s at most, not looked up"),
-        max_acceleration=(1.0, "ours, for skid steering"),
-        max_turn_rate=(1.5, "ours, not measured"),
-        margin=(0.1, "ours, not measured"),
-        lag=(0.2, "ours, not measured"),
+        radius=(0.333, "half of the diagonal of 508 x 430 mm, Clearpath's figures as others quote them"),
+        max_speed=(1.5, f"ours; 2.0 m/s at most, {_CLEARPATH}"),
+        max_acceleration=(1.0, "ours, for skid steering, not measured"),
+        max_turn_rate=(1.5, f"ours; 4.0 rad/s at most, {_CLEARPATH}"),
+        margin=(0.1, _GUESSED),
+        lag=(0.2, _GUESSED),
     ),
 })  # fmt: skip
 """The robots that are known by name."""
@@ -94,18 +112,19 @@ def find_robot(name: str) -> RobotType:
     return ROBOTS[name]
 
 
-def make_team(name: str, num_robots: int) -> Team:
-    """A team of robots that can be bought, with the radius and the limits that :data:`ROBOTS` has.
+def make_team(name: str, num_robots: int, *, downwash: bool = False) -> Team:
+    """A team of robots that can be bought, as :data:`ROBOTS` has them; scenarios take ``robot=name``.
 
-    Scenarios take ``robot=name``, which sets the margin too.
+    Its problems have their margin by default, and controllers their lag.
 
     Args:
         name: ``"crazyflie"``, ``"crazyflie_brushless"``, ``"turtlebot3_burger"``, ``"robomaster"`` or ``"jackal"``.
         num_robots: ``K``.
+        downwash: Whether drones are ellipsoids that keep others out of the air below them, in place of balls.
 
     Raises:
-        ValueError: If there is no such robot, or the number is not positive.
+        ValueError: If there is no such robot, it has no downwash, or the number is not positive.
     """
-    settings = find_robot(name).settings
-    models, _ = (settings.pop("model"),) * whole_number(num_robots, "num_robots", 1), settings.pop("margin")
+    settings = find_robot(name).settings(downwash)
+    models = (settings.pop("model"),) * whole_number(num_robots, "num_robots", 1)
     return Team(models, **settings)  # type: ignore[arg-type]

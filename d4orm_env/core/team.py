@@ -11,14 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from d4orm_env.core.arrays import FloatArray, Floats, Frozen, frozen_per_robot, read_only, short_repr, whole_number
+from d4orm_env.core.arrays import (
+    LARGEST,
+    FloatArray,
+    Floats,
+    Frozen,
+    frozen_per_robot,
+    positive_number,
+    read_only,
+    short_repr,
+    whole_number,
+)
 from d4orm_env.core.bodies import Body, FootprintArrays, as_arrays, body_poses, find_bodies
 from d4orm_env.dynamics.models import get_model
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED, STANDARD_LIMITS, TURN_RATE, Limit, Model
 from d4orm_env.footprints import Disc, Footprint, Train
 
-DEFAULT_RADIUS = 0.15
-"""Radius of a robot [m]."""
+DEFAULT_RADIUS, DEFAULT_MARGIN = 0.15, 0.05
+"""Radius of a robot and safety margin [m]."""
 DEFAULT_LIMITS = (1.0, 1.0, float(np.pi / 2))
 """Limits of speed [m/s], acceleration [m/s^2] and turn rate [rad/s]."""
 
@@ -39,6 +49,8 @@ class Team(Frozen):
             may turn in a time step is bounded; see :class:`~d4orm_env.core.problem.Problem`.
         own_limits: ``(K,)`` by name for every limit that a model of the team has for itself, such as the ``wheelbase``
             of a car; of use to its robots only. What is left out has the model's default.
+        lag: ``(K,)`` time constant of the actuators [s], for controllers of real robots: the simulation has none.
+        margin: Safety margin that its problems have where they are given none [m].
         shapes: ``K`` :mod:`footprints <d4orm_env.footprints>`, given as ``footprint``, one for all or one each; empty
             for discs.
 
@@ -54,6 +66,8 @@ class Team(Frozen):
     max_turn_rate: FloatArray
     own_limits: Mapping[str, FloatArray]
     shapes: tuple[Footprint, ...]
+    lag: FloatArray
+    margin: float
 
     def __init__(
         self,
@@ -64,6 +78,8 @@ class Team(Frozen):
         max_turn_rate: ArrayLike = DEFAULT_LIMITS[TURN_RATE],
         own_limits: Mapping[str, ArrayLike] = MappingProxyType({}),
         footprint: Footprint | Sequence[Footprint] | None = None,
+        lag: ArrayLike = 0.0,
+        margin: float = DEFAULT_MARGIN,
     ) -> None:
         if isinstance(models, str) or not isinstance(models, Sequence):
             raise ValueError(f"models must be a sequence of model names, not {short_repr(models)}")
@@ -74,6 +90,8 @@ class Team(Frozen):
         limits = zip(STANDARD_LIMITS, (max_speed, max_acceleration, max_turn_rate), strict=True)
         self._set(models=tuple(models), **{name: frozen_per_robot(value, name, len(models)) for name, value in limits})
         self._set(own_limits=self._complete_own_limits(own_limits))
+        self._set(margin=positive_number(margin, "margin", zero_allowed=True, most=LARGEST))
+        self._set(lag=frozen_per_robot(lag, "lag", len(models), zero_allowed=True))
         self._set_footprints(radius, footprint)
 
     def _set_footprints(self, radius: ArrayLike | None, given: Footprint | Sequence[Footprint] | None) -> None:
@@ -289,6 +307,8 @@ class Team(Frozen):
             **standard,
             own_limits={name: values[index] for name, values in self.own_limits.items() if name in own},
             footprint=[self.shapes[robot] for robot in index] if self.shapes else None,
+            lag=self.lag[index],
+            margin=self.margin,
         )
 
 

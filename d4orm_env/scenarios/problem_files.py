@@ -142,6 +142,8 @@ def _describe_robot(problem: Problem, robot: int) -> dict[str, object]:
         entry["radius"] = footprint.radius if team.shapes else _decimals(team.radius[[robot]])[0]
     for name in ("max_speed", "max_acceleration", "max_turn_rate"):
         (entry[name],) = _decimals(np.asarray(getattr(team, name))[[robot]])
+    if team.lag[robot]:
+        (entry["lag"],) = _decimals(team.lag[[robot]])
     if not np.isnan(problem.goal_heading[robot]):
         (entry["goal_heading"],) = _decimals(problem.goal_heading[[robot]])
     if "goal_heading" in entry or problem.goal_heading_tolerance[robot] != np.float32(DEFAULT_TOLERANCE):

@@ -163,7 +163,9 @@ def _built_in(
     own = tuple(inspect.signature(function).parameters)[1:]
     name = name or function.__name__
     generator = partial(_generate, function, name, own, defaults)
-    return Scenario(name, generator, about or function.__doc__ or "", draws, (*own, *COMMON_ARGUMENTS, "robot"))
+    return Scenario(
+        name, generator, about or function.__doc__ or "", draws, (*own, *COMMON_ARGUMENTS, "robot", "downwash")
+    )
 
 
 def _generate(
@@ -172,10 +174,12 @@ def _generate(
 ) -> Problem:  # fmt: skip
     arguments = {name: settings.pop(name) for name in own if name in settings}
     size = {} if num_robots is None else {"num_robots": num_robots}
-    robot = settings.pop("robot", None)
-    team = {} if robot is None else find_robot(robot).settings
+    robot, downwash = settings.pop("robot", None), settings.pop("downwash", False)
+    if robot is None and downwash:
+        raise ValueError("downwash is of robots by name; give robot, as 'crazyflie', or a footprint")
+    team = {} if robot is None else find_robot(robot).settings(downwash)
     common = {**defaults, **team, **size, **settings}
-    if "footprint" in settings:  # the radius follows
+    if "footprint" in common:  # the radius follows
         common["radius"] = settings.get("radius")
     # A value too large for float32 becomes infinite, and is then refused by name.
     with np.errstate(over="ignore"):

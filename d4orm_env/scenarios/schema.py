@@ -60,6 +60,7 @@ class RobotEntry(Entry):
     max_acceleration: Number = 1.0
     max_turn_rate: Number = float(np.float32(np.pi / 2))
     own_limits: dict[str, Number] = Field(default_factory=dict)
+    lag: Number = 0.0
     footprint: Annotated[Footprint, PlainValidator(parsed)] | None = None
     goal_heading: Number | None = None
     goal_heading_tolerance: Number = DEFAULT_TOLERANCE
@@ -177,11 +178,11 @@ class ProblemFile(Entry):
 
     def build(self) -> Problem:
         shaped = any(robot.footprint is not None for robot in self.robots)
-        limits = (*(() if shaped else ("radius",)), "max_speed", "max_acceleration", "max_turn_rate")
+        limits = (*(() if shaped else ("radius",)), "max_speed", "max_acceleration", "max_turn_rate", "lag")
         columns: dict[str, Any] = {name: [getattr(robot, name) for robot in self.robots] for name in limits}
         models = tuple(robot.model for robot in self.robots)
         shapes = [robot.footprint or Disc(robot.radius) for robot in self.robots] if shaped else None
-        team = Team(models, **columns, own_limits=self._own_limits(), footprint=shapes)
+        team = Team(models, **columns, own_limits=self._own_limits(), footprint=shapes, margin=self.margin)
         size = team.state_size  # asks every robot
         start = [state + [0.0] * (size - len(state)) for state in (robot.start_state for robot in self.robots)]
         names = set(type(self).model_fields) - {"version", "robots", "world"}

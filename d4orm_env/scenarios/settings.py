@@ -57,6 +57,7 @@ class Settings:
     max_turn_rate: ArrayLike = float(np.pi / 2)  #: Turn rate limit [rad/s], one or ``K``
     #: Limits that models have for themselves by name, each one or ``K``
     own_limits: Mapping[str, ArrayLike] = field(default_factory=dict)
+    lag: ArrayLike = 0.0  #: Time constant of the actuators [s], one or ``K``, for controllers of real robots
 
     def __post_init__(self) -> None:
         for name, minimum in (("num_robots", 1), ("seed", 0), ("num_obstacles", 0)):
@@ -90,7 +91,7 @@ class Settings:
         """The robots."""
         shapes = parsed(self.footprint) if isinstance(self.footprint, Mapping) else self.footprint
         limits = self.max_speed, self.max_acceleration, self.max_turn_rate, self.own_limits
-        return Team(self.models, self.radius, *limits, footprint=shapes)
+        return Team(self.models, self.radius, *limits, footprint=shapes, lag=self.lag, margin=self.margin)
 
     @property
     def spacing(self) -> float:

@@ -70,8 +70,8 @@ class Controller:
             answer is not used. A named policy with a ``deadline``, as D4orm-C2F, gets nine tenths of it.
         lag: Time constant of the robots' actuators [s], one or one per robot. The estimate of that allows for it, and
             setpoints come later by the largest: with it robots can drive as the reference does. In mode ``"measured"``
-            the policy sees robots as they would be without it. ``None`` is none but for robots driven by accelerations
-            in mode ``"measured"`` without a tracker, of which it is found as they drive.
+            the policy sees robots as they would be without it. By default it is the team's; of a team without one it is
+            found, as robots driven by accelerations drive in mode ``"measured"`` without a tracker.
         tracker: True if robots follow positions and velocities by a controller of their own, as drones do. Setpoints
             are shifted against a lasting distance from the reference, as a thrust that is too weak causes, up to the
             margin. In mode ``"measured"`` the reference goes towards what was measured by ``dt / (dt + 2 lag)`` of the
@@ -108,8 +108,7 @@ class Controller:
         self.policy: Policy = make_policy(policy, **settings)
         self.tracker = truth(tracker, "tracker")
         self._looks = mode == "measured" and not isinstance(self.policy, OpenLoop)
-        found = lag is None and self._looks and not self.tracker
-        self._given_lag = None if found else check_lag(0.0 if lag is None else lag)
+        self._given_lag = lag if lag is None else check_lag(lag)
         self._leads = self.tracker or not self._looks
         self._background: Background[Actions] = Background()
         self._env: Any = None
@@ -150,7 +149,10 @@ class Controller:
             raise
 
     def _begin(self, problem: Problem, states: ArrayLike, time: float, seed: int) -> None:
-        observer, lead = DisturbanceObserver(problem, self._given_lag), np.zeros_like(problem.goal, np.float64)
+        lag, known = self._given_lag, problem.team.lag
+        if lag is None and (known.any() or self.tracker or not self._looks):  # else it is found
+            lag = known
+        observer, lead = DisturbanceObserver(problem, lag), np.zeros_like(problem.goal, np.float64)
         if time >= self._time and self._observer.problem.team is problem.team:
             observer.go_on_from(self._observer)
             lead = self._lead
@@ -164,8 +166,8 @@ class Controller:
         self._open(problem.with_state(start, problem.goal, team=team), seed)
         self.policy.reset(self._env, seed=seed)
         # A tracker follows by itself, and what a policy looks at is as without a lag.
-        lag = ActuatorLag(self.lag * (not (self.tracker or self._looks)), problem.dt)
-        self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, lag)
+        own = ActuatorLag(self.lag * (not (self.tracker or self._looks)), problem.dt)
+        self._time, self._lagged = time - problem.dt, LaggedReference(problem, start, own)
         idle = self._joint.controls
         self._setpoint = self._described(Reference(start, start, idle, idle), held=False)
 

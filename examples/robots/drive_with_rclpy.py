@@ -28,8 +28,7 @@ class Team(Node):
     def __init__(self) -> None:
         super().__init__("d4orm")
         self.problem = make_problem("circle", 6, robot="turtlebot3_burger", diameter=3.0, horizon=400)
-        # The lag with which these robots follow cmd_vel, as measured.
-        self.controller = Controller("d4orm-c2f", mode="measured", timeout=0.9 * self.problem.dt, lag=0.15)
+        self.controller = Controller("d4orm-c2f", mode="measured", timeout=0.9 * self.problem.dt)  # the team has a lag
         self.states, self.heard = np.full(self.problem.start.shape, np.nan), np.full(6, -np.inf)
         self.begun, self.commands = False, [self.create_publisher(Twist, f"/robot_{k}/cmd_vel", 1) for k in range(6)]
         for k in range(6):

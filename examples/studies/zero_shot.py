@@ -19,7 +19,6 @@ import numpy as np
 from examples.common import grouped, require, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
-from d4orm_env.core.robot_types import find_robot
 from d4orm_planners import Controller, make_planner
 
 ROBOT, RATE, FIRST_SEED = "crazyflie", 100, 1000
@@ -77,7 +76,7 @@ def fly_plan(problem: Problem, seed: int, bodies: Any) -> Iterator[np.ndarray]:
 
 def fly_controller(problem: Problem, seed: int, bodies: Any, mode: Any) -> Iterator[np.ndarray]:
     """Robots in contact in each step of D4orm-C2F."""
-    with Controller("d4orm-c2f", mode=mode, tracker=True, lag=find_robot(ROBOT).lag, refine="sync") as controller:
+    with Controller("d4orm-c2f", mode=mode, tracker=True, refine="sync") as controller:
         last, step, calm = bodies.states, 0, 0
         controller.begin(problem, last, seed=seed)
         while calm < CALM:

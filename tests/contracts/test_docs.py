@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from d4orm_env.core.robot_types import ROBOTS
 from d4orm_planners import list_policies
 from d4orm_planners.cli.app import LazyCommands
 
@@ -132,7 +133,9 @@ def test_every_page_is_in_a_table_of_contents() -> None:
 def test_every_setting_is_described(tmp_path: Path) -> None:
     runpy.run_path(str(DOCS / "settings_page.py"))["write_settings"](tmp_path / "settings.md")
     text = (tmp_path / "settings.md").read_text(encoding="utf-8")
-    assert set(re.findall("^## (.+)$", text, re.MULTILINE)) - {"Scenarios"} <= set(list_policies())
+    assert set(re.findall("^## (.+)$", text, re.MULTILINE)) - {"Scenarios", "Robots by name"} <= set(list_policies())
+    for robot in ROBOTS.values():
+        assert all(source.partition("https")[0] in text for source in robot.sources.values())
     assert "|  |" not in text
 
 

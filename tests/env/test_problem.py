@@ -477,7 +477,7 @@ def test_copies_are_equal_and_as_read_only_as_the_original(duplicate: Any) -> No
     problem = two_robots()
     assert problem.arrays is problem.arrays
     twin = duplicate(problem)
-    assert len(all_arrays(twin)) == 17
+    assert len(all_arrays(twin)) == 18
     for array in all_arrays(twin):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0

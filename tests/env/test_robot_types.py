@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from d4orm_env import make_problem, make_team
+from d4orm_env import Problem, Team, load_problem, make_problem, make_team, save_problem
 from d4orm_env.core.robot_types import ROBOTS
-from d4orm_planners import make_planner
+from d4orm_env.footprints import Ellipsoid
+from d4orm_planners import Controller, make_planner
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_team_of_robots_by_name(name: str) -> None:
     team, robot = make_team(name, 3), ROBOTS[name]
     assert team.models == (robot.model,) * 3
-    for limit in ("radius", "max_speed", "max_acceleration", "max_turn_rate"):
+    for limit in ("radius", "max_speed", "max_acceleration", "max_turn_rate", "lag", "margin"):
         np.testing.assert_allclose(getattr(team, limit), getattr(robot, limit), rtol=1e-6)
 
 
@@ -51,9 +54,61 @@ def test_scenarios_take_robots_by_name(name: str) -> None:
     np.testing.assert_allclose(problem.goal_speed, ROBOTS[name].max_acceleration * problem.dt, rtol=1e-6)
 
 
+def test_what_a_team_knows_its_problems_and_files_know(tmp_path: Path) -> None:
+    team = make_team("turtlebot3_burger", 2)
+    problem = Problem(team, [[0, 0, 0, 0], [1, 0, 0, 0]], [[1, 1], [0, 1]])
+    assert problem.margin == ROBOTS["turtlebot3_burger"].margin
+    assert Problem(team, problem.start, problem.goal, margin=0.0).margin == 0
+    save_problem(problem, tmp_path / "team.yaml")
+    assert load_problem(tmp_path / "team.yaml") == problem
+    assert load_problem(tmp_path / "team.yaml").team == team
+    assert problem != problem.replace(team=team.replace(lag=0.0))
+    np.testing.assert_allclose(team.replace(lag=[0.0, 0.3]).select([1]).lag, 0.3)
+    (tmp_path / "short.yaml").write_text("{version: 1, scenario: circle, robot: turtlebot3_burger, num_robots: 2}")
+    np.testing.assert_allclose(load_problem(tmp_path / "short.yaml").team.lag, team.lag)
+
+
+@pytest.mark.parametrize(("mode", "tracker"), [("nominal", False), ("measured", False), ("measured", True)])
+def test_controllers_take_the_lag_of_the_team(mode: Any, tracker: bool) -> None:
+    problem = make_problem("circle", robot="turtlebot3_burger", num_robots=2)
+    for given, lag in ((None, 0.15), (0.3, 0.3), (0.0, 0.0)):
+        controller = Controller("go-to-goal", mode=mode, tracker=tracker, lag=given)
+        controller.begin(problem, problem.start)
+        np.testing.assert_allclose(controller.lag, lag)
+        assert controller.step(problem.start, 0.0).control.shape == problem.arrays.start[:, :2].shape
+
+
+def test_drones_leave_room_for_their_downwash_where_they_are_told_to() -> None:
+    team = make_team("crazyflie", 2, downwash=True)
+    assert team == make_problem("circle", 2, robot="crazyflie", downwash=True, height=1.0).team
+    drone = ROBOTS["crazyflie"]
+    assert team.footprint == (Ellipsoid(drone.radius, drone.radius, drone.downwash),) * 2
+    start, goal = np.zeros((2, 6)), np.zeros((2, 3))
+    start[1, 2], goal[:, 0], goal[1, 2] = 0.49, 1.0, 0.49
+    with pytest.raises(ValueError, match=r"robot_1 at .* overlap by"):
+        Problem(team, start, goal)
+    Problem(make_team("crazyflie", 2), start, goal)
+    with pytest.raises(ValueError, match="downwash is True, and this robot has none"):
+        make_team("jackal", 2, downwash=True)
+    with pytest.raises(ValueError, match="downwash is of robots by name; give robot"):
+        make_problem("circle", 2, downwash=True)
+    with pytest.raises(ValueError, match="downwash is 1; it must be True or False"):
+        make_problem("circle", 2, robot="crazyflie", downwash=1)
+
+
+def test_lags_that_make_no_sense_are_named() -> None:
+    with pytest.raises(ValueError, match="lag of robot_1 is -1; it must be from 0 to 1e"):
+        Team(("holonomic2d",) * 2, lag=[0.0, -1.0])
+    with pytest.raises(ValueError, match=r"lag has shape \(3,\); expected one number, or \(2,\)"):
+        make_problem("circle", num_robots=2, lag=[0.1] * 3)
+    with pytest.raises(ValueError, match="margin is -1; it must be zero or more"):
+        Team(("holonomic2d",), margin=-1)
+
+
 def test_what_is_given_counts() -> None:
-    problem = make_problem("circle", robot="jackal", num_robots=4, radius=0.4, margin=0.2, max_speed=1.0)
+    problem = make_problem("circle", robot="jackal", num_robots=4, radius=0.4, margin=0.2, max_speed=1.0, lag=0.0)
     assert problem.margin == 0.2
+    assert not problem.team.lag.any()
     np.testing.assert_allclose(problem.team.radius, 0.4)
     np.testing.assert_allclose(problem.team.max_speed, 1.0)
 
