@@ -234,7 +234,7 @@ class OriginCheck:
             passes = passes and _is_same(cookies.get(self._cookie, ""), self._token)
         if passes:
             return None
-        return _response(HTTPStatus.FORBIDDEN, {}, b"open the address that d4orm play has printed\n")
+        return _refusal(HTTPStatus.FORBIDDEN)
 
     @contextmanager
     def installed(self) -> Iterator[None]:
@@ -247,7 +247,13 @@ class OriginCheck:
             nonlocal started
             started = True
             options["max_size"] = _LARGEST_MESSAGE
-            first = lambda connection, request: self.answer(request) or process_request(connection, request)  # noqa: E731
+
+            def first(connection: ServerConnection, request: Request) -> Any:
+                try:
+                    return self.answer(request) or process_request(connection, request)
+                except OSError:  # no file can have that name
+                    return _refusal(HTTPStatus.NOT_FOUND)
+
             return serve(*given, process_request=first, **options)
 
         with patch.object(websockets.asyncio.server, "serve", checked_serve):
@@ -258,6 +264,10 @@ class OriginCheck:
 
 def _is_same(given: str, secret: str) -> bool:
     return secrets.compare_digest(given.encode(errors="replace"), secret.encode())
+
+
+def _refusal(status: HTTPStatus) -> Response:
+    return _response(status, {}, b"open the address that d4orm play has printed\n")
 
 
 def _response(status: HTTPStatus, headers: dict[str, str], body: bytes = b"") -> Response:

@@ -88,6 +88,11 @@ def asked(playground: Playground, path: str, **headers: str) -> tuple[int, str]:
     return answer.status, answer.getheader("Set-Cookie") or ""
 
 
+@pytest.mark.parametrize("path", ["/" + 7000 * "a", "/" + 256 * "%61", 3500 * "/a", "/assets", "/../secret", "/%00"])
+def test_what_is_no_page_is_not_found(playground: Playground, path: str) -> None:
+    assert asked(playground, path)[0] == 404
+
+
 elsewhere = pytest.mark.parametrize("playground", ["127.0.0.2"], indirect=True)
 
 
