@@ -31,6 +31,14 @@ def checked_path(path: object, what: str) -> Path:
     return Path(path)
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those that it is in, unless it is there; a ``ValueError`` says why it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"folder {str(folder)!r} cannot be made ({error.strerror}); choose another") from None
+
+
 def require_file(path: Path, kind: str) -> None:
     """Refuse a folder, a pipe or a device, whose reading may never end, in place of a ``kind``; without a file it
     passes.

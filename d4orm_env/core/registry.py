@@ -96,10 +96,10 @@ class Registry(Mapping[str, T]):
             raise unknown(self.what, name, self, remedy)
         return self[name]
 
-    def find(self, text: object) -> T:
-        """Return the thing that a name, or an import path, stands for."""
+    def find(self, text: object, others: str = "") -> T:
+        """Return the thing that a name, or an import path, stands for; ``others`` is what else the caller takes."""
         if not isinstance(text, str) or text in self or ":" not in text:
-            return self._known(text, f"give {FORMS}")
+            return self._known(text, f"give {others}{FORMS}")
         try:
             thing = load_reference(text)
         except ValueError as error:

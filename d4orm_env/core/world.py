@@ -71,14 +71,16 @@ class World(Frozen):
             raise ValueError(f"dimension of the world is {short_repr(dimension)}; it must be 2 or 3")
         if (lower is None) != (upper is None):
             raise ValueError("bounds need both lower and upper; give both, or neither for an open world")
+        lowest, highest = ([f"{end} {axis}" for axis in "xyz"[:dimension]] for end in ("least", "greatest"))
         rows = {
-            "circles": (circles, 3),
-            "spheres": (spheres, 4),
-            "cylinders": (cylinders, 3),
-            "boxes": (boxes, 2 * dimension),
+            "circles": (circles, ("x", "y", "radius")),
+            "spheres": (spheres, ("x", "y", "z", "radius")),
+            "cylinders": (cylinders, ("x", "y", "radius")),
+            "boxes": (boxes, (*lowest, *highest)),
         }
         tables = {
-            name: frozen_array(given, name, (None, width), largest=LARGEST) for name, (given, width) in rows.items()
+            name: frozen_array(given, name, (None, len(columns)), largest=LARGEST, columns=columns)
+            for name, (given, columns) in rows.items()
         }
         bounds = {
             name: None if given is None else frozen_array(given, f"bounds {name}", (dimension,), largest=LARGEST)

@@ -164,6 +164,8 @@ def plot(problem: Problem, trajectory: Trajectory | None = None, axes: Axes | No
         with own_style():
             figure = pyplot.figure(layout="constrained")
             axes = make_axes(figure, 111, "space" if problem.dimension == 3 else "plane")
+    elif not isinstance(axes, Axes):
+        raise ValueError(f"axes is {short_repr(axes)}; give axes of Matplotlib, as pyplot.subplots() returns")
     elif axes.name == "3d" and problem.dimension == 2:
         raise ValueError("the axes are spatial and the problem is planar; give axes without projection='3d'")
     return _plot_on(axes, problem, trajectory)

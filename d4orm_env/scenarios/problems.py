@@ -237,7 +237,12 @@ def describe_scenario(name: str) -> str:
 
 def _file(path: str | os.PathLike[str], seed: int = 0, num_robots: int | None = None) -> Problem:
     """A scenario file as a generator: the same problem for every seed."""
-    return problem_files.load_problem(path)
+    problem = problem_files.load_problem(path)
+    if num_robots not in (None, problem.num_robots):
+        raise ValueError(
+            f"{path} has {problem.num_robots} robots, and num_robots is {num_robots}; leave num_robots out"
+        )
+    return problem
 
 
 def is_scenario_file(scenario: object) -> TypeGuard[str | os.PathLike[str]]:
@@ -257,7 +262,7 @@ def find_scenario(scenario: ScenarioLike) -> Scenario:
         return Scenario(Path(scenario).stem, partial(_file, scenario))
     if callable(scenario):
         return Scenario(getattr(scenario, "__name__", type(scenario).__name__), scenario)
-    return SCENARIOS.find(scenario)
+    return SCENARIOS.find(scenario, "a .yaml file, ")
 
 
 def unknown_argument(scenario: ScenarioLike | None, names: Iterable[str], others: Iterable[str] = ()) -> str:

@@ -291,6 +291,9 @@ def _explain(error: ValidationError) -> str:
         message = f"expected the fields {', '.join(PARTS[names[-1]].model_fields)}, not {short_repr(first['input'])}"
     elif first["type"] == "value_error":
         message = str(first["ctx"]["error"])
+    elif first["type"] == "too_short":
+        message = f"{short_repr(first['input'])} has {first['ctx']['actual_length']} entries; give at least "
+        message += str(first["ctx"]["min_length"])
     else:
         message = f"{first['msg'][0].lower()}{first['msg'][1:]}, not {short_repr(first['input'])}"
     return f"{where}: {message}" if where else message

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from d4orm_env.core.arrays import duration, whole_number
-from d4orm_env.core.files import checked_path
+from d4orm_env.core.files import checked_path, make_folder
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
 from d4orm_planners.d_d4orm.ray_planner import import_ray
@@ -138,7 +138,7 @@ def run_study(
     if ray is not None:
         import_ray(RAY_USE)  # before there is a store
     folder = checked_path(out, "the folder of results")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     store = TrialStore(folder / STORE)
     for path in sorted(folder.glob(SHARD_STORES)):
         store.add(*TrialStore(path, alone=True).trials())
@@ -181,7 +181,7 @@ def run_shard(
     index = whole_number(shard[0], "shard", 1, count)
     jobs = [job for group in _checked_groups(study, trial_timeout, workers) for job in group][index - 1 :: count]
     folder = checked_path(out, "the folder of results")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     path = folder / SHARD_STORES.replace("*", f"{index}-of-{count}")
     store = TrialStore(path, alone=True)
     _complete(store, jobs, workers, None, trial_timeout, progress)

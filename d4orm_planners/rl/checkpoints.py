@@ -17,7 +17,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_set
 from stable_baselines3.common.vec_env import VecNormalize
 
 from d4orm_env.core.errors import first_line
-from d4orm_env.core.files import ArrayArchive, claim_folder, replaced_when_done
+from d4orm_env.core.files import ArrayArchive, claim_folder, make_folder, replaced_when_done
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.render import own_style
 from d4orm_planners.evaluation.tables import write_csv
@@ -118,7 +118,7 @@ class Checkpoints:
     def __init__(self, out: Path, settings: Mapping[str, object]) -> None:
         self.policy_path = out / f"policy{SUFFIX}"
         self._folder = out / "checkpoints"
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self._folder)
         remedy = f"learn on from its policy in another folder, with --start-from {self.policy_path}"
         claim_folder(out / "settings.json", settings, "a training", remedy)
 

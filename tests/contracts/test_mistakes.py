@@ -14,6 +14,7 @@ import pytest
 from d4orm_env import (
     Problem,
     Team,
+    World,
     load_dynobench,
     load_map,
     load_problem,
@@ -40,6 +41,8 @@ from d4orm_planners import (
     run_episode,
 )
 from d4orm_planners.base.adapters import SharedPolicy, from_sb3, from_torch
+from d4orm_planners.evaluation.evaluate import run_shard
+from d4orm_planners.evaluation.study import Study
 
 
 class Module:
@@ -141,6 +144,10 @@ PROBLEM = make_problem("circle", num_robots=2)
         (lambda: Team(np.zeros((9, 9))), "models must be a sequence of model names, not array"),
         (lambda: episode_plan().sample(max_acceleration=np.zeros((9, 9))), "max_acceleration must be one number or"),
         (lambda: episode_plan().export([], "out"), r"format \[\] is unknown; choose one of csv"),
+        (lambda: episode_plan().plot(3), "axes is 3; give axes of Matplotlib"),
+        (lambda: World(circles=[[0, 0]]), r"circles has shape \(1, 2\); expected \(any, 3\): x, y, radius"),
+        (lambda: World(boxes=[0, 0, 1]), r"expected \(any, 4\): least x, least y, greatest x, greatest y"),
+        (lambda: World(3, cylinders=[[0, 0, 0, 1]]), r"expected \(any, 3\): x, y, radius"),
     ],
 )
 def test_what_python_says(call: Callable[[], object], message: str) -> None:
@@ -174,6 +181,22 @@ def test_what_is_no_path_is_named(call: Callable[[Any], object], what: str, path
         call(path)
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda path: evaluate(policies=["go-to-goal"], scenarios=["circle"], seeds=[0], out=path),
+        lambda path: run_shard(Study(policies=["go-to-goal"], seeds=[0]), path, (1, 1)),
+    ],
+    ids=["evaluate", "run_shard"],
+)
+def test_a_folder_that_cannot_be_made_is_named(call: Callable[[Any], object], tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    with pytest.raises(ValueError, match=r"taken.* cannot be made \(.*\); choose another$"):
+        call(taken)
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
 def test_a_goal_too_far_for_the_horizon_is_told() -> None:
     problem = make_problem("circle", num_robots=2).replace(horizon=9)
     plan = make_planner("d4orm", max_iterations=1, num_samples=8).solve(problem)
@@ -184,6 +207,7 @@ def test_a_goal_too_far_for_the_horizon_is_told() -> None:
     ("text", "message"),
     [
         ("robots: []", "version: this field is missing; give version: 1"),
+        ("version: 1\nrobots: []", r"robots: \[\] has 0 entries; give at least 1$"),
         (
             "version: 1\nrobots: [{model: car, start: [0, 0], gaol: [1, 1]}]",
             "gaol: unknown field.* did you mean 'goal'",

@@ -104,6 +104,7 @@ def test_every_environment_takes_a_callable_and_a_file(make: str, tmp_path: Path
         ("json:lanes", "'json:lanes' names nothing: json has no 'lanes'"),
         ("json:", "scenario 'json:' is no import path; give package.module:Name"),
         (5, "scenario 5 is unknown; choose one of circle"),
+        ("team.txt", "or give a .yaml file, package.module:Name or folder/file.py:Name"),
     ],
 )
 def test_what_is_no_scenario_is_named(scenario: Any, message: str) -> None:
@@ -114,7 +115,7 @@ def test_what_is_no_scenario_is_named(scenario: Any, message: str) -> None:
 
 def test_a_file_has_its_own_team_and_imports_nothing(tmp_path: Path) -> None:
     save_problem(lanes(3, 2), tmp_path / "two.yaml")
-    with pytest.raises(ValueError, match="scenario 'two' returned a problem of 2 robots where num_robots is 3"):
+    with pytest.raises(ValueError, match=r"two\.yaml has 2 robots, and num_robots is 3; leave num_robots out"):
         make_problem(tmp_path / "two.yaml", num_robots=3)
     with pytest.raises(TypeError, match="takes no argument 'radius'"):
         make_problem(tmp_path / "two.yaml", radius=0.1)

@@ -312,6 +312,9 @@ def test_a_folder_with_another_dataset_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="holds a dataset with environment"):
         written(tmp_path, environment={"problem": problem})
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    (tmp_path / "taken").touch()
+    with pytest.raises(ValueError, match=r"taken.* cannot be made .*; choose another"):
+        written(tmp_path / "taken")
 
 
 def test_the_command_writes_where_minari_looks(d4orm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -203,6 +203,9 @@ def test_what_cannot_be_learned_is_refused_and_nothing_is_written(tmp_path: Path
     with pytest.raises(ValueError, match="mixes"):
         train(replace(TINY, scenario="heterogeneous"), tmp_path)
     assert not list(tmp_path.iterdir())
+    (tmp_path / "taken").touch()
+    with pytest.raises(ValueError, match=r"taken.* cannot be made .*; choose another"):
+        train(TINY, tmp_path / "taken")
 
 
 def test_two_trainings_into_one_folder_take_turns(trained: tuple[TrainingSettings, Path]) -> None:

@@ -21,7 +21,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from d4orm_env.core.arrays import plain_number, whole_number
 from d4orm_env.core.errors import describe
-from d4orm_env.core.files import checked_path, claim_folder
+from d4orm_env.core.files import checked_path, claim_folder, make_folder
 from d4orm_env.core.lazy import LazyModule
 from d4orm_env.core.registry import check_sendable
 from d4orm_env.engine.threads import available_cores
@@ -129,7 +129,7 @@ def write_dataset(
     folder = dataset_folder(name) if out is None else checked_path(out, "the folder of a dataset")
     folder = folder.absolute()  # Minari takes no other
     recording, files = Recording(folder / "recording"), dataset_files(demonstrations, folder / "data")
-    recording.folder.mkdir(parents=True, exist_ok=True)
+    make_folder(recording.folder)
     claim_folder(recording.folder / IDENTITY, demonstrations.identity, "a dataset")
     with only_writer(recording.folder):
         _record(demonstrations, recording, files.seeds(), workers, progress or (lambda what, done, total: None))
