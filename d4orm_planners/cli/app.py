@@ -215,6 +215,8 @@ def _given(error: Any) -> str:
     name = getattr(error, "option_name", "").lstrip("-").replace("-", "_")
     context = getattr(error, "ctx", None)
     known = {option for parameter in context.command.params for option in parameter.opts} if context else ()
+    if context and type(error).__name__ == "MissingParameter":
+        return f" See d4orm {context.info_name} --help."
     if "unexpected extra argument" in error.message and "--scenario" in known:
         return "; a scenario or its file goes by --scenario"
     if INSTEAD.get(name, ("",))[0] in known:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from d4orm_env import render
-from d4orm_env.core.files import target_of
+from d4orm_env.core.files import make_folder, target_of
 from d4orm_env.core.infeasibility import prove_infeasible
 from d4orm_env.core.summary_line import count
 from d4orm_planners.base.display import one_line
@@ -34,15 +35,15 @@ if TYPE_CHECKING:
 LOG_INTERVAL = 60.0
 """Seconds between lines of progress where there is no terminal."""
 
+MOST_REASONS = 20
+"""Robots of which it is told why they fail."""
+
 
 @contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
     """Make a folder, unless it is there; what was made is removed again where nothing was written to it."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"folder {str(folder)!r} cannot be made ({error.strerror}); choose another") from None
+    make_folder(folder)
     check_writable(folder)
     try:
         yield
@@ -156,8 +157,10 @@ def require_success(episode: Episode, problem: Problem) -> None:
 
 def _tell_reasons(what: str, reasons: Mapping[str, str]) -> None:
     typer.echo(what, err=True)
-    for robot, reason in reasons.items():
+    for robot, reason in islice(reasons.items(), MOST_REASONS):
         typer.echo(f"  {robot} {reason}", err=True)
+    if (others := len(reasons) - MOST_REASONS) > 0:
+        typer.echo(f"  and {count(others, 'other robot')}; Plan.failures has all", err=True)
 
 
 @contextmanager

@@ -10,10 +10,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
+import typer
 
 from d4orm_env import make_problem
 from d4orm_env.dynamics.models import MODELS
@@ -109,6 +110,16 @@ def test_what_samples_is_compiled_ahead_where_a_first_plan_samples(
         compile_ahead.compile_for_planning(make_planner(planner), problem, lambda: said.append("compiling"))
     # With all kernels missing something is always compiled, with none nothing.
     assert (len(sampled), len(said)) == (2 * samples, 1 + samples)
+
+
+def test_of_a_big_team_some_robots_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    failures = {f"robot_{robot}": "ends 5 m from its goal" for robot in range(400)}
+    plan: Any = SimpleNamespace(solved=False, status="time_limit", iterations=1, failures=failures)
+    with pytest.raises(typer.Exit):
+        outputs.require_solved(plan)
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 + outputs.MOST_REASONS + 1
+    assert said[-1] == "  and 380 other robots; Plan.failures has all"
 
 
 @pytest.mark.parametrize(
@@ -305,6 +316,7 @@ BAD = [
     (("leaderboard", "missing", "--out", "a.txt"), "'a.txt' must end in .md"),
     (("leaderboard", "missing", "--out", "a/b.md"), "does not exist; create it"),
     (("nonsense",), "nonsense"),
+    (("train",), "Missing argument 'algorithm'. See d4orm train --help."),
 ]  # fmt: skip
 
 
