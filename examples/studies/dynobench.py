@@ -90,9 +90,9 @@ def main() -> None:
 
 def beside_rival(rows: list[dict[str, Any]]) -> dict[str, str]:
     """Columns of what db-CBS did: solved, seconds of the processor, and our costs by its where both solved."""
-    instances = {row["instance"] for row in rows if row["benchmark"] == "db-CBS"}
+    instances = {(row["benchmark"], row["instance"]) for row in rows}
     with RIVAL.open(encoding="utf-8", newline="") as file:
-        runs = [run for run in csv.DictReader(file) if run["instance"] in instances]
+        runs = [run for run in csv.DictReader(file) if (run["benchmark"], run["instance"]) in instances]
     solved = [run for run in runs if run["solved"] == "True"]
     seconds = [float(run["seconds"]) for run in solved]
     costs = {run["instance"]: float(run["sum_of_costs"]) for run in solved}

@@ -21,13 +21,14 @@ from types import ModuleType
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import yaml
 from examples.common import save_table
-from examples.studies import lifelong, solve_rates
+from examples.studies import draw_dynobench, lifelong, solve_rates
 from examples.studies.settings_studies import irregular_circle
 from matplotlib.figure import Figure
 from PIL import Image
 
-from d4orm_env import make_problem, rollout
+from d4orm_env import load_dynobench, make_problem, rollout
 from d4orm_env.envs.joint_state import JointState
 from d4orm_planners import Plan
 from d4orm_planners.evaluation.tables import read_parquet
@@ -158,6 +159,25 @@ def test_cars_of_a_benchmark_are_planned(tmp_path: Path) -> None:
     (folder / "map_30by30_obst2_agents4_ex1.yaml").write_text(content.replace("[15, 5, 1.57]", "[10, 15, 0]"))
     (row,) = made("cl_mapf", tmp_path, "--csdo", str(tmp_path / "cars"))
     assert (row["benchmark"], row["instances"], row["solved"]) == ("CSDO", "30by30 m,   4 cars", "1 of 1")
+
+
+def test_instances_of_the_kinds_of_db_cbs_are_drawn_and_planned(tmp_path: Path) -> None:
+    """The same with the same seed, and others with another; all are valid and have paths."""
+    completed("draw_dynobench", tmp_path / "drawn")
+    example = tmp_path / "drawn" / "example"
+    assert {path.stem for path in example.iterdir()} == {name.format(0) for name in draw_dynobench.NAMES}
+    for name, (_, robots, _) in draw_dynobench.NAMES.items():
+        path = example / f"{name.format(0)}.yaml"
+        assert yaml.safe_load(path.read_text()) == draw_dynobench.drawn(name, 0) != draw_dynobench.drawn(name, 1)
+        problem = load_dynobench(path)
+        problem.check_reachable()
+        assert problem.num_robots == robots
+        if "swap" not in name:
+            path.unlink()
+    rows = made("dynobench", tmp_path, "--checkouts", str(tmp_path / "drawn"), "--seeds", "1")
+    assert {row["instances"]: row["solved"] for row in rows} == {
+        name.replace("_{}", ""): "1 of 1" for name in draw_dynobench.NAMES if "swap" in name
+    }
 
 
 def test_annealed_noise_beats_constant_noise_in_one_dimension(tmp_path: Path) -> None:
