@@ -26,6 +26,7 @@ from examples.common import (
     trials_parser,
 )
 from examples.studies import AS_IN_THE_PAPER, FIRST_SEED
+from examples.studies.paper import variants
 from examples.studies.tune_rivals import TEAMS as TUNED_ON
 
 from d4orm_env import Problem
@@ -267,7 +268,97 @@ def with_jerk(team: str, column: str, groups: dict[str, list[Trial]], reference:
     return [dict(shown) | {"jerk [m²/s⁶]": mean_text(jerks, ".3g")}]
 
 
+def algorithm_4() -> list[Block]:
+    """8 robots by Algorithm 4 as written, with one thing changed, and with fewer steps from kept or no controls."""
+    written = {"policy": "d4orm-c2f", "refine": "sync", "engine": "cpu", **PAPER}
+    reset = {"policy": f"{variants.__name__}:{variants.ForgetfulC2F.__name__}"}
+    changes: dict[str, dict[str, Any]] = {
+        "as written": {},
+        "guidance not refined": {"refine": "off"},
+        "guidance refined after every loop": {"refine_every": 1},
+        "window of 40": {"predict_horizon": 40},
+        "window of 40, subgoal 30 on": {"predict_horizon": 40, "subgoal_offset": 30},
+        "window of 80, subgoal 60 on": {"predict_horizon": 80, "subgoal_offset": 60},
+        "controls reset": reset,
+    }
+    blocks = [changes] + [
+        {f"{steps} steps": {"num_steps": steps}, f"{steps} steps, controls reset": {"num_steps": steps, **reset}}
+        for steps in (50, 20, 10, 5)
+    ]
+    return [
+        Block("paper_circle", 8, {label: written | own for label, own in block.items()}, next(iter(block)), 10)
+        for block in blocks
+    ]
+
+
+def executed(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
+    """A row per controller: successes and their travel times, and tests, where a failure counts twice the longest."""
+    times = [trial.travel_time or 0.0 for trials in groups.values() for trial in trials if trial.success]
+
+    def cost(trial: Trial) -> float:
+        return (trial.travel_time or 0.0) if trial.success else 2 * max(times, default=1.0)
+
+    rows = []
+    for label, trials in groups.items():
+        test = None if label == reference else paired(trials, groups[reference], cost)
+        done = [trial for trial in trials if trial.success]
+        rows.append(
+            {"team": team, column: label, **solved_columns(trials, lambda trial: trial.success),
+             "travel time [s]": mean_text([trial.travel_time for trial in done]),
+             "makespan [s]": mean_text([trial.makespan for trial in done]),
+             "p (solved)": test and test.success_p, "p (travel time)": test and test.cost_p}
+        )  # fmt: skip
+    return rows
+
+
+def ipopt_starts() -> list[Block]:
+    """One start of IPOPT from the motion without collisions, perturbed or not, on circles that differ or do not."""
+    counted = f"{variants.__name__}:{variants.CountedIpopt.__name__}"
+    kinds: Settings = {"ours": {}, "all pairs at once": PAPER}
+    noise = {"perturbed by 0.1": 0.1, "perturbed by 0.01": 0.01, "not perturbed": 0.0}
+    sets = {
+        kind: {f"{kind}, {word}": {"policy": counted, "engine": "cpu", "max_iterations": 1, **own, "perturbation": size}
+               for word, size in noise.items()}
+        for kind, own in kinds.items()
+    }  # fmt: skip
+    irregular = f"{__name__}:{irregular_circle.__name__}"
+    chosen = [("ours", 4, 20), ("ours", 8, 8), ("all pairs at once", 4, 12)]
+    blocks = [Block(irregular, size, sets[kind], f"{kind}, not perturbed", seeds) for kind, size, seeds in chosen]
+    for label, own in sets["all pairs at once"].items():  # on one circle those not perturbed are all the same
+        blocks.append(Block("paper_circle", 4, {label: own}, label, 1 if "not" in label else 12))
+    return blocks
+
+
+def solver_iterations(team: str, column: str, groups: dict[str, list[Trial]], reference: str) -> list[dict[str, Any]]:
+    """A row per start: solutions, IPOPT's own iterations, and tests, where a failure counts twice the most."""
+    counts = {id(trial): trial.progress[-1].steps or 0 for trials in groups.values() for trial in trials}
+    worst = max(counts.values())
+
+    def cost(trial: Trial) -> float:
+        return counts[id(trial)] if is_solved(trial) else 2 * worst
+
+    rows = []
+    for label, trials in groups.items():
+        test = None if label == reference else paired(trials, groups[reference], cost, is_solved)
+        rows.append(
+            {"team": team, column: label, **solved_columns(trials),
+             "iterations": mean_text([counts[id(trial)] for trial in trials], ".0f"),
+             "of the solved": mean_text([counts[id(trial)] for trial in trials if is_solved(trial)], ".0f"),
+             "p (solved)": test and test.success_p, "p (iterations)": test and test.cost_p}
+        )  # fmt: skip
+    return rows
+
+
 COMPARISONS: Mapping[str, Comparison] = {
+    "algorithm_4_parts": Comparison(
+        "D4orm-C2F by the paper's Algorithm 4 with one thing changed: refinement, the window, where loops begin.",
+        "controller", algorithm_4, quick={"coarse_samples": 64, "coarse_steps": 15, "num_samples": 32, "num_steps": 5},
+        first_seed=0, rows=executed,
+    ),
+    "ipopt_starts": Comparison(
+        "IPOPT's own iterations in one start that is perturbed, as in the paper, or not.",
+        "start", ipopt_starts, first_seed=2000, rows=solver_iterations,
+    ),
     "jerk_limits": Comparison(
         "D4orm with the paper's preset and limits on the jerk in the robots' dynamics.", "planner", limited_jerk,
         team="{0.num_robots} of {0.model}", rows=with_jerk,
