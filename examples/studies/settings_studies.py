@@ -172,6 +172,7 @@ def presets_head_to_head() -> list[Block]:
         Block("paper_circle", 16, by_preset["d4orm-d"], "d4orm-d, authors", 20),
         Block("paper_circle", 16, one_less, "d4orm-d, authors", 10),
         Block("paper_random", 64, by_preset["d4orm-d"], "d4orm-d, authors", 5),
+        Block("paper_random", 64, one_less, "d4orm-d, authors", 3),
         Block("paper_obstacles", 16, by_preset["d4orm-d"], "d4orm-d, authors", 10),
     ]
 

@@ -473,7 +473,7 @@ def test_defaults_and_the_paper_differ_by_one_setting_at_a_time(tmp_path: Path) 
 
 def test_the_paper_its_code_and_ours_meet_head_to_head(tmp_path: Path) -> None:
     out, rows = tmp_path / "out", made("head_to_head", tmp_path)
-    assert len({(row["team"], row["planner"]) for row in rows}) == len(rows) == 3 * 4 + 2 + 6
+    assert len({(row["team"], row["planner"]) for row in rows}) == len(rows) == 3 * 4 + 2 + 2 * 6
     trials = {trial.label: json.loads(trial.config) for trial in read_parquet(out / "head_to_head.parquet")}
     base = trials["d4orm-d, authors"]
     changed = {
