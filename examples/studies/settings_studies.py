@@ -358,7 +358,7 @@ COMPARISONS: Mapping[str, Comparison] = {
     ),
     "ipopt_starts": Comparison(
         "IPOPT's own iterations in one start that is perturbed, as in the paper, or not.",
-        "start", ipopt_starts, first_seed=2000, rows=solver_iterations,
+        "start", ipopt_starts, quick={}, first_seed=2000, rows=solver_iterations,
     ),
     "jerk_limits": Comparison(
         "D4orm with the paper's preset and limits on the jerk in the robots' dynamics.", "planner", limited_jerk,

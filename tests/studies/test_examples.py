@@ -17,6 +17,7 @@ from io import StringIO
 from itertools import combinations
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -24,13 +25,14 @@ import pytest
 import yaml
 from examples.common import save_table
 from examples.studies import draw_dynobench, dynobench, lifelong, solve_rates
+from examples.studies.paper.variants import CountedIpopt, ForgetfulC2F
 from examples.studies.settings_studies import irregular_circle
 from matplotlib.figure import Figure
 from PIL import Image
 
-from d4orm_env import load_dynobench, make_problem, rollout
+from d4orm_env import load_dynobench, make_problem, navigation_v0, rollout
 from d4orm_env.envs.joint_state import JointState
-from d4orm_planners import Plan
+from d4orm_planners import Plan, make_planner, make_policy, run_episode
 from d4orm_planners.evaluation.tables import read_parquet
 from d4orm_planners.sampling.settings import TUNED
 
@@ -336,6 +338,50 @@ def test_irregular_circles_differ_from_seed_to_seed(tmp_path: Path) -> None:
     assert (positions[0] == positions[1]).all()
     assert (positions[0] != positions[2]).all()
     assert np.linalg.norm(positions[0], axis=1) == pytest.approx(2.5, abs=0.15)
+
+
+def test_algorithm_4_has_one_thing_changed_at_a_time(tmp_path: Path) -> None:
+    rows = made("algorithm_4_parts", tmp_path)
+    configs = {
+        trial.label: json.loads(trial.config) for trial in read_parquet(tmp_path / "out/algorithm_4_parts.parquet")
+    }
+    assert [row["controller"] for row in rows] == list(configs)
+    changed = {
+        label: {key for key in config if config[key] != configs["as written"][key]} for label, config in configs.items()
+    }
+    assert changed["guidance not refined"] == {"refine"}
+    assert changed["window of 40"] == {"predict_horizon"}
+    assert changed["controls reset"] == set()
+    check_made_again("algorithm_4_parts", tmp_path, rows)
+
+
+def test_a_controller_that_forgets_begins_every_window_with_no_controls() -> None:
+    begun: list[float] = []
+
+    class Telling(ForgetfulC2F):
+        def _base(self, joint: JointState) -> Any:
+            begun.append(float(np.abs(base := super()._base(joint)).max()))
+            return base
+
+    policy = make_policy(Telling, preset="paper", refine="off", coarse_samples=64, num_samples=32, num_steps=5)
+    run_episode(navigation_v0.parallel_env(scenario="circle", num_robots=2), policy, seed=0)
+    assert begun[0] > 0, "the coarse plan's"
+    assert len(begun) > 2
+    assert not any(begun[1:])
+
+
+def test_ipopt_tells_its_own_iterations(tmp_path: Path) -> None:
+    pytest.importorskip("casadi")
+    rows = made("ipopt_starts", tmp_path)
+    assert [row["p (iterations)"] for row in rows] == 2 * ["1", "1", "-"] + ["-"] * 3
+    assert all(5 < int(row["iterations"]) < 500 for row in rows)
+    check_made_again("ipopt_starts", tmp_path, rows)
+    problem = make_problem("circle", num_robots=2)
+    counted, plain = (make_planner(name, solver_iterations=7, rounds=1).solve(problem, max_iterations=1)
+                      for name in (CountedIpopt, "ipopt"))  # fmt: skip
+    assert counted.history[0].note == "Maximum_Iterations_Exceeded"
+    assert counted.denoising_steps == 7, "no more than it may make"
+    assert (counted.controls == plain.controls).all()
 
 
 def test_p_values_are_corrected_for_their_number_in_the_table(tmp_path: Path) -> None:
