@@ -277,8 +277,8 @@ def algorithm_4() -> list[Block]:
         "as written": {},
         "guidance not refined": {"refine": "off"},
         "controls reset": reset,
-        "window of 40": {"predict_horizon": 40},
         "window of 40, subgoal 30 on": {"predict_horizon": 40, "subgoal_offset": 30},
+        "window of 80, subgoal 60 on": {"predict_horizon": 80, "subgoal_offset": 60},
     }
     blocks = [(8, changes), (16, {label: changes[label] for label in ("as written", "guidance not refined")})]
     for steps in (20, 10, 5):

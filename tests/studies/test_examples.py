@@ -349,7 +349,7 @@ def test_algorithm_4_has_one_thing_changed_at_a_time(tmp_path: Path) -> None:
     written = configs["as written"]
     changed = {label: {key for key in config if config[key] != written.get(key)} for label, config in configs.items()}
     assert changed["guidance not refined"] == {"refine"}
-    assert changed["window of 40"] == {"predict_horizon"}
+    assert changed["window of 80, subgoal 60 on"] == {"predict_horizon", "subgoal_offset"}
     assert changed["controls reset"] == {"source"}, "a class of the study's own"
     check_made_again("algorithm_4_parts", tmp_path, rows)
 
