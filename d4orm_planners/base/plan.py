@@ -57,6 +57,7 @@ class IterationRecord:
     #: that were lost and the messages that were dropped, and path finding why it found none
     note: str = ""
     unreachable: tuple[int, ...] = ()  #: Robots for which path finding found no path to their goals
+    denoising_time: float | None = None  #: Seconds of ``wall_time`` spent denoising; ``None`` in older versions' files
     #: ``(H, K, m)`` of this iteration's candidate, for callbacks; ``None`` in a plan's history
     controls: FloatArray | None = field(default=None, repr=False, compare=False)
     trajectory: Trajectory | None = field(default=None, repr=False, compare=False)  #: Their rollout, likewise
@@ -83,10 +84,10 @@ class Plan(DisplayMixin):
         history: One record per iteration.
         trajectory: Rollout of the controls.
         metrics: See :func:`d4orm_env.core.trajectory.trajectory_metrics`, which looks for contact at steps, where
-            ``solved`` and ``failures`` know of contact between them too; and ``"denoising_steps"`` and
-            ``"denoising_share"``, the share of the iterations that did some. ``d-d4orm`` adds ``"messages"`` and
-            ``"message_bytes"`` that its nodes sent, each to all others, and ``"waiting_share"``, the share of their
-            time that they waited for each other.
+            ``solved`` and ``failures`` know of contact between them too; and ``"denoising_steps"``,
+            ``"denoising_share"``, the share of the iterations that did some, and ``"denoising_time"``, the seconds of
+            ``wall_time`` that these steps took. ``d-d4orm`` adds ``"messages"`` and ``"message_bytes"`` that its nodes
+            sent, each to all others, and ``"waiting_share"``, the share of their time that they waited for each other.
         provenance: Preset, settings, version and machine; ``None`` for a plan of an older file.
 
     Raises:

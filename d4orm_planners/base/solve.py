@@ -88,6 +88,7 @@ class SolveRun:
         current: The candidate that the next iteration starts from.
         best: The best candidate so far.
         iteration: Iterations done.
+        denoising_time: Seconds that were spent denoising.
         state: State of the planner between its own iterations, of a type of its own; ``None`` before the first one.
         metrics: Numbers of the method's own that the plan's metrics will have.
         time_limit: Seconds that the solve may take, or ``None``.
@@ -128,6 +129,7 @@ class SolveRun:
         self._evaluate = evaluate or of_controls
         self.iteration = 0
         self.denoising_steps = 0
+        self.denoising_time = 0.0
         self.history: list[IterationRecord] = []
         self.state: State = None
         self._began = False
@@ -172,7 +174,17 @@ class SolveRun:
             self.engine.prepare(task, rules, noise_scale, num_samples)
         # Engines of others need not know of watchers.
         watched = {} if self.watcher is None else {"watcher": self._tell}
-        return self.engine.denoise(task, rules, mean, noise_scale, num_samples, seed, self.should_stop, **watched)
+        with self.denoising():
+            return self.engine.denoise(task, rules, mean, noise_scale, num_samples, seed, self.should_stop, **watched)
+
+    @contextmanager
+    def denoising(self) -> Iterator[None]:
+        """Count the time of the block as spent denoising."""
+        begin = self.watch.elapsed
+        try:
+            yield
+        finally:
+            self.denoising_time += self.watch.elapsed - begin
 
     def _tell(self, step: DenoisingStep) -> None:
         with self.watch.paused():
@@ -216,6 +228,7 @@ class SolveRun:
             excluded=iteration.excluded,
             note=iteration.note,
             unreachable=iteration.unreachable,
+            denoising_time=self.denoising_time,
         )
         self.history.append(record)
         return replace(record, controls=self.current.controls, trajectory=trajectory)
@@ -248,8 +261,12 @@ class SolveRun:
         )
 
     def _denoising(self) -> dict[str, float]:
-        """Denoising steps done, and the share of the iterations that did some."""
+        """Denoising steps done, the share of the iterations that did some, and the seconds that they took."""
         steps = [record.denoising_steps for record in self.history]
         denoised = np.diff(steps, prepend=0) > 0
         share = denoised.mean() if steps else 0.0
-        return {"denoising_steps": float(self.denoising_steps), "denoising_share": float(share)}
+        return {
+            "denoising_steps": float(self.denoising_steps),
+            "denoising_share": float(share),
+            "denoising_time": self.denoising_time,
+        }

@@ -72,6 +72,7 @@ class NodePool(ABC):
             node.search.time_limit = None if left is None else node.search.watch.elapsed + left
         candidates = self._round(time_left, search.planner.config.improve)
         search.watch.leave_out(compiling())
+        search.denoising_time = max(node.search.denoising_time for node in self._nodes)  # side by side
         if not candidates and not self.alive:
             self._check_alive()
         best = max(candidates, key=lambda candidate: candidate.rank, default=search.current)
@@ -126,10 +127,9 @@ class NodePool(ABC):
         excluded = sum(node.excluded for node in self._nodes)
         faults = sum((node.inbox.dropped for node in self._nodes), Counter[str]())
         faults["false claim"] = sum(node.inbox.false_claims for node in self._nodes)
-        new = faults - self._reported
         records = self._new_records()
         notes = self._notes + [record.note for record in records if record.note]
-        notes += [f"received {count} x {kind}" for kind, count in sorted(new.items())]
+        notes += [f"received {count} x {kind}" for kind, count in sorted((faults - self._reported).items())]
         unreachable = tuple(sorted({robot for record in records for robot in record.unreachable}))
         iteration = Iteration(
             best.controls, steps - self._spent, excluded - self._excluded, "; ".join(notes), best, unreachable

@@ -108,6 +108,7 @@ class ActorOutcome(NamedTuple):
 
     data: bytes  #: The candidate, a message
     denoising_steps: int  #: Spent on it
+    denoising_time: float  #: Seconds that these took
     excluded: int  #: See :class:`~d4orm_planners.base.planner.Iteration`
     compiling: float  #: Seconds of it that went into compiling
     process: int  #: The process that did it
@@ -142,11 +143,12 @@ class Worker:
         controls = decode(data, search.problem, self._num_nodes).controls
         search.iteration = iteration
         search.current = evaluate_controls(self._engine, search.problem, controls)
-        steps, compiling = search.denoising_steps, search.watch.paused_seconds
+        steps, seconds, compiling = search.denoising_steps, search.denoising_time, search.watch.paused_seconds
         record = search.advance()
         return ActorOutcome(
             _message(self._node, search),
             search.denoising_steps - steps,
+            search.denoising_time - seconds,
             record.excluded,
             search.watch.paused_seconds - compiling,
             os.getpid(),
@@ -183,6 +185,7 @@ class RayPlanner(Planner):
         with self._calling:
             outcome = self._outcome(search.iteration, _message(self._node, search), search.time_left)
         search.watch.leave_out(outcome.compiling)
+        search.denoising_time += outcome.denoising_time
         note = "" if outcome.process == self.process else f"the actor of node {self._node} was lost and restarted"
         self.process = outcome.process
         controls = decode(outcome.data, search.problem, self._num_nodes).controls

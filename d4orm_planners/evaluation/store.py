@@ -39,6 +39,7 @@ class BestSoFar(NamedTuple):
     solved: int  #: Whether it is a solution, 1 or 0
     reward: float  #: Its mean reward
     steps: int | None = None  #: Denoising steps done; ``None`` where it is not known
+    denoising: float | None = None  #: Share of the seconds that these took, likewise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +90,8 @@ class Trial:
     #: Seconds of training behind a learned policy, all before it included, where its file tells; else ``None``
     training_time: float | None = None
     elapsed: float | None = None  #: Seconds that the trial took, with the environment and the judge
-    #: Times in the solve at which the best plan so far changed, as JSON: a list of ``[seconds, solved (0 or 1), mean
-    #: reward, denoising steps]``, the last not in rows that older versions wrote; empty for a policy that executes no
-    #: plan. See :attr:`progress`.
+    #: Times in the solve at which the best plan so far changed, as JSON: a list of :attr:`progress`, without its last
+    #: two in rows that older versions wrote; empty for a policy that executes no plan.
     history: str = "[]"
     #: Candidates that the nodes of a distributed planner sent, each to all others; ``None`` for others
     messages: int | None = None
@@ -120,6 +120,11 @@ class Trial:
         """Denoising steps until the last better plan; ``None`` where they are not known."""
         return self.progress[-1].steps if self.progress else None
 
+    @property
+    def denoising_time_share(self) -> float | None:
+        """Share of the time until then that they took; ``None`` where it is not known."""
+        return 0.0 if self.denoising_steps == 0 else self.progress[-1].denoising if self.progress else None
+
 
 _NAMES = tuple(field.name for field in fields(Trial))
 _KEY = ", ".join(TrialKey._fields)
@@ -136,7 +141,7 @@ _JSON: Mapping[str, Callable[[Any], bool]] = {
     "config": lambda content: isinstance(content, dict),
     "versions": lambda content: isinstance(content, dict),
     "machine": lambda content: content == {} or (isinstance(content, dict) and content.keys() >= _MACHINE),
-    "history": lambda content: _are_lists(content, 3, 4),
+    "history": lambda content: _are_lists(content, 3, 4, 5),
     "disturbances": lambda content: _are_lists(content, 2) and all(isinstance(levels, dict) for _, levels in content),
 }
 """Checks of the columns that must be JSON."""

@@ -83,6 +83,8 @@ class SuccessRate(Compared):
     #: Median denoising steps until the last better plan; ``None`` where no plan is executed
     denoising_steps: float | None
     denoising_share: float | None  #: Mean share of the iterations that denoised, where it is known
+    #: Mean share of the time until then that was spent denoising; ``None`` unless it is known of all plans
+    denoising_time_share: float | None
     #: Median seconds of planning, or of choosing all actions, in a trial; ``None`` if all raised errors
     wall_time: float | None
     #: Median seconds of choosing the actions of one step, without what came before the first one; ``None`` if all
@@ -144,6 +146,7 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
     stretch = [trial.stretch for trial in successes if trial.stretch is not None]
     steps = [trial.denoising_steps for trial in trials if trial.denoising_steps is not None]
     shares = [trial.denoising_share for trial in trials if trial.denoising_share is not None]
+    of_time = [trial.denoising_time_share for trial in trials if trial.progress]
     timed = [(trial.wall_time, trial.steps * trial.dt) for trial in trials if trial.wall_time is not None]
     compute = mean_interval([seconds / motion for seconds, motion in timed if motion > 0])
     judged = [trial.verified for trial in trials if trial.verified is not None]
@@ -159,6 +162,7 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         stretch=float(np.mean(stretch)) if stretch else None,
         denoising_steps=float(np.median(steps)) if steps else None,
         denoising_share=float(np.mean(shares)) if shares else None,
+        denoising_time_share=mean_if_known(of_time),
         wall_time=float(np.median([seconds for seconds, _ in timed])) if timed else None,
         decision=float(np.median(choosing)) if choosing else None,
         training_time=max((trial.training_time for trial in trials if trial.training_time is not None), default=None),
@@ -166,6 +170,12 @@ def success_rate(trials: Sequence[Trial], label: str | None = None) -> SuccessRa
         compute_lower=compute[1],
         compute_upper=compute[2],
     )
+
+
+def mean_if_known(values: Sequence[float | None]) -> float | None:
+    """The mean of some values; ``None`` for none, or where one of them is not known."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known and len(known) == len(values) else None
 
 
 def solved_after(trial: Trial) -> float | None:

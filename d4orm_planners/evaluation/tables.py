@@ -30,8 +30,8 @@ LATER = {"denoising_share"}
 """Columns that files of earlier versions do not have."""
 PARQUET_HINT = "trials.parquet is not written, which needs pyarrow; install it with: pip install 'd4orm-env[evaluate]'"
 HEADER = ("policy", "noise", "success", "95% interval", "verified", "contact", "not in time", "errors",
-          "travel time, s", "stretch", "denoising steps", "denoising", "planning, s", "decision, ms", "training, min",
-          "computing per s of motion, s")  # fmt: skip
+          "travel time, s", "stretch", "denoising steps", "denoising, iterations", "denoising, time", "planning, s",
+          "decision, ms", "training, min", "computing per s of motion, s")  # fmt: skip
 
 
 def write_results(folder: str | os.PathLike[str], rates: Sequence[SuccessRate]) -> list[Path]:
@@ -159,6 +159,7 @@ def _cells(rate: SuccessRate, disturbed: bool) -> tuple[str, ...]:
         "-" if rate.stretch is None else f"{rate.stretch:.2f}",
         "-" if rate.denoising_steps is None else f"{rate.denoising_steps:g}",
         "-" if rate.denoising_share is None else f"{rate.denoising_share:.0%}",
+        "-" if rate.denoising_time_share is None else f"{rate.denoising_time_share:.0%}",
         "-" if rate.wall_time is None else f"{rate.wall_time:.2f}",
         "-" if rate.decision is None else f"{1e3 * rate.decision:.2f}",
         "-" if rate.training_time is None else f"{rate.training_time / 60:.0f}",

@@ -207,10 +207,12 @@ def _verdict(problem: Problem, episode: Episode) -> dict[str, object]:
 
 def compact_history(history: tuple[IterationRecord, ...]) -> str:
     """The iterations of a solve after which the best plan was another, as :attr:`Trial.history` keeps them."""
-    points: list[list[float]] = []
+    points: list[list[Any]] = []
     for record in history:
         seconds, reward = round(record.wall_time, 6), float(f"{record.best_reward:.6g}")
-        point = [seconds, int(record.best_solved), reward, record.denoising_steps]
+        point: list[Any] = [seconds, int(record.best_solved), reward, record.denoising_steps]
+        if record.denoising_time is not None and record.wall_time > 0:
+            point.append(round(record.denoising_time / record.wall_time, 4))
         if not points or points[-1][1:3] != point[1:3]:
             points.append(point)
     return json.dumps(points, separators=(",", ":"))

@@ -440,7 +440,7 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         trial(
             0,
             denoising_share=0.5,
-            history="[[0.1,1,0.5,40]]",
+            history="[[0.1,1,0.5,40,0.75]]",
             wall_time=0.25,
             preparation=0.1,
             travel_time=4.0,
@@ -456,13 +456,21 @@ def test_the_table_row_by_row(tmp_path: Path) -> None:
         "### circle, 2 robots, holonomic2d",
         "",
         "| policy | noise | success | 95% interval | verified | contact | not in time | errors | travel time, s | "
-        "stretch | denoising steps | denoising | planning, s | decision, ms | training, min | "
-        "computing per s of motion, s |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "stretch | denoising steps | denoising, iterations | denoising, time | planning, s | decision, ms | "
+        "training, min | computing per s of motion, s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|",
         # The interval of two values, 4 and 6: half of it is 12.7062 * sqrt(2) / sqrt(2).
-        "| d4orm | 0 | 2 of 3 (67%) | 21% to 94% | 2 | 1 | 0 | 0 | 5.00 (-7.71 to 17.71) | 1.50 | 40 | 50% | 0.50 | "
-        "2.50 | 20 | 0.069 (0.010 to 0.129) |",
+        "| d4orm | 0 | 2 of 3 (67%) | 21% to 94% | 2 | 1 | 0 | 0 | 5.00 (-7.71 to 17.71) | 1.50 | 40 | 50% | 75% | "
+        "0.50 | 2.50 | 20 | 0.069 (0.010 to 0.129) |",
     ]
+
+
+def test_the_share_of_the_time_is_told_where_all_plans_tell_it() -> None:
+    told, older = trial(0, history="[[0.1,0,0.4,20,0.5],[0.2,1,0.5,40,0.25]]"), trial(1, history="[[0.1,1,0.5,40]]")
+    searched = trial(2, history="[[0.1,1,0.5,0]]")
+    assert [one.denoising_time_share for one in (told, older, searched, trial(3))] == [0.25, None, 0, None]
+    assert success_rate([told, searched, trial(3)]).denoising_time_share == 0.125
+    assert success_rate([told, older]).denoising_time_share is None
 
 
 # The leaderboard.

@@ -6,6 +6,7 @@ The search decides which robot plans again, and under which constraints.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -85,10 +86,11 @@ class Planning:
     """Planner of one robot around the others of a problem; all that changes is in nodes."""
 
     def __init__(
-        self, problem: Problem, config: MMDConfig, denoiser: Denoiser, frames: tuple[PathFrame, ...], space: Space
-    ) -> None:
+        self, problem: Problem, config: MMDConfig, denoiser: Denoiser, frames: tuple[PathFrame, ...], space: Space,
+        denoising: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:  # fmt: skip
         self._problem, self._config, self._denoiser = problem, config, denoiser
-        self._frames, self._space = frames, space
+        self._frames, self._space, self._denoising = frames, space, denoising
         radius, self._slack = np.asarray(problem.team.radius, np.float64), SLACK * problem.team.largest_radius
         self._distances: Floats = radius[:, None] + radius + problem.margin + self._slack
         self.steps = 0
@@ -173,7 +175,8 @@ class Planning:
             radii=distances * config.constraint_radius,
             pull=config.soft_pull,
         )
-        batch = self._denoiser.denoise(robot, frame, surroundings, seed, before)
+        with self._denoising():
+            batch = self._denoiser.denoise(robot, frame, surroundings, seed, before)
         self.steps += batch.steps
         return self._choose(batch, paths, distances, frame.safety_distance)
 
@@ -208,7 +211,7 @@ class MMD(Planner):
             return state, state.explained(Iteration(search.current.controls))
         problem = search.problem
         denoiser = Denoiser(problem, self.config, search.should_stop)
-        planning = Planning(problem, self.config, denoiser, state.frames, state.space)
+        planning = Planning(problem, self.config, denoiser, state.frames, state.space, search.denoising)
         if not state.nodes:
             root = planning.root(_seeds(search, problem.num_robots), search.should_stop)
             if root is None:
