@@ -6,7 +6,7 @@ import argparse
 import csv
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
@@ -23,6 +23,7 @@ from d4orm_env import Problem
 from d4orm_env.core.files import replaced_when_done
 from d4orm_env.envs.joint_state import JointState
 from d4orm_env.render import FrameRenderer
+from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.base.provenance import commit, describe_machine
 from d4orm_planners.evaluation.comparison import paired
 from d4orm_planners.evaluation.evaluate import run_study
@@ -32,6 +33,7 @@ from d4orm_planners.evaluation.summary import mean_interval, wilson_interval
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
 
 Row = TypeVar("Row", bound=Mapping[str, Any])
+Key = TypeVar("Key", bound=Hashable)
 
 COLOURS = {"d4orm": "#0072B2", "default": "#56B4E9", "mppi": "#D55E00", "cem": "#009E73", "i-mbd": "#CC79A7"}
 """One colour per method in every plot, told apart by the colour-blind too."""
@@ -119,6 +121,35 @@ def steps_to_solution(trial: Trial) -> int | None:
     return steps_spent(trial) if trial.status == "solved" else None
 
 
+def denoising_time_share(trial: Trial) -> float | None:
+    """Share of the time to the first solution, or to the last better plan, that denoising took, where it is told."""
+    first = next((best for best in trial.progress if best.solved), None)
+    if first is None:
+        return trial.denoising_time_share
+    return 0.0 if first.steps == 0 else first.denoising
+
+
+def denoising_of(history: Sequence[IterationRecord]) -> dict[str, float | None]:
+    """For the row of a solve: denoising steps to its first solution, or all, and the share of the time they took."""
+    if not history:
+        return {"denoising_steps": 0, "denoising_time_share": 0.0}
+    last = next((record for record in history if record.solved), history[-1])
+    seconds = last.denoising_time
+    return {
+        "denoising_steps": last.denoising_steps,
+        "denoising_time_share": None if seconds is None else seconds / last.wall_time,
+    }
+
+
+def denoising_columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Median of the denoising steps, and mean share of the time that they took; dashes where not all rows tell them."""
+    steps, shares = ([row.get(name) for row in rows] for name in ("denoising_steps", "denoising_time_share"))
+    return {
+        "denoising steps": "-" if None in steps or not steps else f"{np.median(steps):g}",
+        "denoising, time": "-" if None in shares or not shares else f"{np.mean(shares):.0%}",
+    }
+
+
 def is_solved(trial: Trial) -> bool:
     """Check whether a sampling planner found a solution: all arrive, the margin is kept and ``verify()`` agrees."""
     return trial.status == "solved" or any(best.solved for best in trial.progress)
@@ -159,14 +190,32 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(value) for value in corrected]
 
 
+def is_ours(label: str) -> bool:
+    """Check whether a label says that the row is of no method of the paper's."""
+    return "ours" in label.replace(",", " ").split()
+
+
+def holm_by_family(tests: Mapping[Key, tuple[str, float]]) -> dict[Key, float]:
+    """P values by what has them, of labels and p values, corrected among the rows that are ours, and among the others.
+
+    So further rows of ours do not weaken the tests of the paper's methods.
+    """
+    found: dict[Key, float] = {}
+    for ours in (False, True):
+        family = [key for key, (label, _) in tests.items() if is_ours(label) == ours]
+        found |= zip(family, holm([tests[key][1] for key in family]), strict=True)
+    return found
+
+
 def _with_corrected_tests(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows whose p values, numbers or ``None`` in columns that "p" begins, are corrected for how many there are."""
     tests = [(number, name) for number, row in enumerate(rows) for name in row if name.partition(" ")[0] == "p"]
-    values = [rows[number][name] for number, name in tests]
-    corrected = iter(holm([value for value in values if value is not None]))
-    found = {
-        place: "-" if value is None else f"{next(corrected):.2g}" for place, value in zip(tests, values, strict=True)
-    }
+    values = {(number, name): rows[number][name] for number, name in tests}
+    labels = [next((text for text in map(str, row.values()) if is_ours(text)), "") for row in rows]
+    corrected = holm_by_family(
+        {(number, name): (labels[number], value) for (number, name), value in values.items() if value is not None}
+    )
+    found = {place: f"{corrected[place]:.2g}" if place in corrected else "-" for place in values}
     return [{name: found.get((number, name), value) for name, value in row.items()} for number, row in enumerate(rows)]
 
 
@@ -302,9 +351,12 @@ def save_gif(frames: Sequence[Any], path: Path, interval: float) -> None:
 def save_table(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Write rows of equal keys to ``path`` (``.csv``) and beside it as Markdown, and print the latter.
 
-    P values are corrected for the number of tests in the table (Holm).
+    P values are corrected for the number of tests in the table (Holm), those of rows of ours among themselves. Columns
+    of denoising are left out where no row tells them.
     """
     rows = _with_corrected_tests(rows)
+    untold = {name for name in denoising_columns([]) if all(row.get(name) == "-" for row in rows)}
+    rows = [{name: value for name, value in row.items() if name not in untold} for row in rows]
     path.parent.mkdir(parents=True, exist_ok=True)
     names = list(rows[0])
     markdown = [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]

@@ -16,6 +16,7 @@ from unittest.mock import patch
 
 import matplotlib.pyplot as plt
 from examples.common import argument_parser
+from examples.studies.paper.paper_figures import FIGURES as PAPER_FIGURES
 from examples.studies.settings_studies import COMPARISONS
 from examples.studies.settings_studies import main as compare
 
@@ -35,7 +36,7 @@ FURTHER = {
     "algorithm_4": ("coarseness",), "ipopt_preset": ("ipopt",), "big-teams_seconds": ("big-teams",),
 }  # fmt: skip
 """Further trials of these, few: of the paper's presets, and for seconds of one machine."""
-TIMED = ("big-teams_seconds", "coarseness", "ipopt")
+TIMED = ("algorithm_4", "big-teams_seconds", "coarseness", "ipopt")
 """Trials of one machine in one go, whose seconds can be compared."""
 
 
@@ -67,6 +68,10 @@ def make_all() -> None:
         times = () if name in TIMED else ("--no-times",)
         for figure in figures:
             run("paper", figure, "--trials", DATA / f"{name}.parquet", *times, "--out", out / name)
+    # Of Algorithm 4 trials of big teams are of one machine in one go, but for the one of a hundred robots.
+    panels = [f"--section={section.title}" for section in PAPER_FIGURES["big-teams"].sections[:-1]]
+    chosen = ("--trials", DATA / "big-teams.parquet", "--policy", "d4orm-c2f", *panels)
+    run("paper", "big-teams", *chosen, "--out", out / "algorithm_4")
     d4orm(["leaderboard", str(DATA / "leaderboard.parquet"), "--out", str(out / "leaderboard.md")])
 
 

@@ -15,7 +15,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from examples.common import grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import denoising_columns, denoising_of, grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem
 from d4orm_env.core.trajectory import accelerations
@@ -47,6 +47,7 @@ def row_of(label: str, problem: Problem, seed: int, planner: Any) -> Row:
         "scenario": problem.name, "robots": problem.num_robots, "planner": label, "seed": seed, "solved": plan.solved,
         "iterations": plan.iterations, "processor_seconds": spent, "travel_time": plan.metrics["travel_time"],
         "jerk": plan.metrics["mean_squared_jerk"], "acceleration": float((moving**2).sum(axis=1).mean()),
+        **denoising_of(plan.history),
     }  # fmt: skip
 
 
@@ -76,6 +77,7 @@ def summary(rows: Sequence[Row]) -> list[Row]:
         seconds = [row["processor_seconds"] if row["solved"] else np.inf for row in own]
         table.append(
             {"team": f"{scenario}, {robots}", "planner": planner, "solved": f"{len(solved)} of {len(own)}",
+             **denoising_columns(own),
              "processor [s], median": f"{np.median(seconds):.2f}".replace("inf", "never"),
              "travel time [s]": travel, "jerk [m²/s⁶]": jerk, "acceleration [m²/s⁴]": moving}
         )  # fmt: skip

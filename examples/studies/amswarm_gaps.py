@@ -11,13 +11,22 @@ mean makespan of the solutions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from examples.common import is_solved, mean_text, save_table, solved_columns, study_trials, trials_parser
+from examples.common import (
+    is_solved,
+    mean_text,
+    save_table,
+    solved_columns,
+    steps_to_solution,
+    study_trials,
+    trials_parser,
+)
 
 from d4orm_env import Problem, make_problem
+from d4orm_planners.evaluation.store import Trial
 from d4orm_planners.evaluation.study import Study
 
 PAPER: Mapping[str, object] = {"preset": "paper"}
@@ -52,6 +61,12 @@ def gap(problem: Problem) -> tuple[float, float]:
     return float(free), float(2 * (np.max(problem.team.radius) + problem.margin))
 
 
+def median_steps(trials: Sequence[Trial]) -> str:
+    """Median of the denoising steps to the first solution, of which there are never enough where there is none."""
+    steps = [np.inf if (found := steps_to_solution(trial)) is None else found for trial in trials]
+    return f"{np.median(steps):g}".replace("inf", "never")
+
+
 def main() -> None:
     """Run every variant, and write the table."""
     arguments = trials_parser(__doc__, seeds=10).parse_args()
@@ -68,6 +83,7 @@ def main() -> None:
             {"cylinders": name, "gap [m]": f"{free:.2f}", "a robot needs [m]": f"{needed:.2f}",
              **solved_columns(mine),
              "iterations": f"{np.median([trial.iterations for trial in mine if trial.iterations is not None]):g}",
+             "denoising steps": median_steps(mine),
              "makespan [s]": mean_text(makespans)}
         )  # fmt: skip
     save_table(rows, arguments.out / "amswarm_gaps.csv")

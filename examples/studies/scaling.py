@@ -11,7 +11,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import COLOURS, count, each_row, grouped, plt, save_figure, save_table, study_parser, study_rows
+from examples.common import (
+    COLOURS,
+    count,
+    denoising_columns,
+    denoising_of,
+    each_row,
+    grouped,
+    plt,
+    save_figure,
+    save_table,
+    study_parser,
+    study_rows,
+)
 
 from d4orm_env import make_problem
 from d4orm_planners import make_planner
@@ -37,7 +49,7 @@ def solve(time_limit: float, robots: int, seed: int) -> dict[str, Any]:
     problem = make_problem("random", num_robots=robots, seed=seed, size=(robots * AREA) ** 0.5)
     plan = make_planner("hybrid", max_iterations=1000).solve(problem, seed=seed, time_limit=time_limit)
     outcome = {"solved": plan.solved, "iterations": plan.iterations, "seconds": plan.wall_time}
-    return {"robots": robots, "seed": seed, **outcome}
+    return {"robots": robots, "seed": seed, **outcome, **denoising_of(plan.history)}
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -51,6 +63,7 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "side [m]": f"{(robots * AREA) ** 0.5:.1f}",
                 "solved": f"{sum(row['solved'] for row in team)} of {len(team)}",
                 "iterations, median": f"{np.median([row['iterations'] for row in team]):g}",
+                **denoising_columns(team),
                 "seconds, median": f"{np.median(seconds):.2f}",
                 "seconds, most": f"{max(seconds):.2f}",
                 "ms per robot": f"{1000 * np.median(seconds) / robots:.1f}",

@@ -251,7 +251,7 @@ def irregular_circle(seed: int, num_robots: int) -> Problem:
 
 def irregular_circles() -> list[Block]:
     """8, 12 and 16 robots by the paper's presets, on circles that differ from seed to seed."""
-    settings = {name: d4orm(name, **PAPER) for name in ("d4orm", "mppi", "cem")}
+    settings = {name: d4orm(name, **PAPER) for name in ("d4orm", "mppi", "cem", "d4orm-d")}
     return [Block(f"{__name__}:{irregular_circle.__name__}", size, settings, "d4orm") for size in (8, 12, 16)]
 
 

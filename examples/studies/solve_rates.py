@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from examples.common import grouped, save_table, study_parser, study_rows
+from examples.common import denoising_columns, denoising_of, grouped, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem, verify
 from d4orm_env.dynamics.robot_model import ACCELERATION, SPEED
@@ -162,6 +162,7 @@ def measure(chosen: Mapping[str, Cases], seeds: int, preset: str | None, improve
                             "travel": float(plan.metrics["travel_time"]),
                             "makespan": float(plan.metrics["makespan"]),
                             "least": least_travel_time(problem),
+                            **denoising_of(plan.history),
                         }
                     )
                 print(name, planner_name, case.label, f"{sum(row['solved'] for row in rows[-seeds:])} of {seeds}")
@@ -181,6 +182,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "planner": planner,
                 "solved": f"{len(solved)} of {len(plans)}",
                 "iterations (median, most)": f"{np.median(iterations):g}, {max(iterations)}",
+                **denoising_columns(plans),
                 "first plan [s] (median, most)": f"{np.median(seconds):.2f}, {max(seconds):.2f}",
                 "travel time [s]": f"{np.mean([row['travel'] for row in solved] or [np.inf]):.2f}",
                 "least [s]": f"{np.mean([row['least'] for row in plans]):.2f}",
@@ -214,6 +216,7 @@ def main() -> None:
         save_table(summary(own), arguments.out / f"solve_rates_{name}.csv")
     shown = [row for row in rows if row["team"] in README.get(row["set"], ())]
     if shown:
-        columns = ("team", "planner", "solved", "first plan [s] (median, most)", "travel time [s]", "least [s]")
+        columns = ("team", "planner", "solved", "denoising steps", "denoising, time", "first plan [s] (median, most)",
+                   "travel time [s]", "least [s]")  # fmt: skip
         table = [{name: row[name] for name in columns} for row in summary(shown)]
         save_table(table, arguments.out / "solve_rates.csv")

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from examples.common import grouped, mean_text, save_table, study_parser, study_rows
+from examples.common import denoising_columns, denoising_of, grouped, mean_text, save_table, study_parser, study_rows
 
 from d4orm_env import Problem, make_problem, navigation_v0
 from d4orm_planners import make_planner, make_policy, run_episode
@@ -34,7 +34,8 @@ def solve(planner: str, problem: Problem, seed: int, guess: str | None) -> dict[
         initial = run_episode(navigation_v0.parallel_env(problem=problem), guess, seed=seed).controls
     plan = make_planner(planner).solve(problem, seed=seed, time_limit=LIMIT, initial_controls=initial)
     seconds, travel = time.perf_counter() - begin, float(plan.metrics["travel_time"])
-    return {"solved": plan.solved, "iterations": plan.iterations, "seconds": seconds, "travel": travel}
+    outcome = {"solved": plan.solved, "iterations": plan.iterations, "seconds": seconds, "travel": travel}
+    return outcome | denoising_of(plan.history)
 
 
 def drive(problem: Problem, seed: int, guess: str | None) -> dict[str, Any]:
@@ -42,7 +43,8 @@ def drive(problem: Problem, seed: int, guess: str | None) -> dict[str, Any]:
     policy: Any = make_policy("d4orm-c2f", refine="sync", warm_start=guess)
     metrics = run_episode(navigation_v0.parallel_env(problem=problem), policy, seed=seed).metrics
     travel = float(metrics["travel_time"])
-    return {"solved": bool(metrics["success"]), "iterations": None, "seconds": policy.coarse_time, "travel": travel}
+    return {"solved": bool(metrics["success"]), "iterations": None, "seconds": policy.coarse_time, "travel": travel,
+            "denoising_steps": None, "denoising_time_share": None}  # fmt: skip
 
 
 def measure(planners: Sequence[str], cases: Sequence[tuple[str, int]], seeds: int) -> list[dict[str, Any]]:
@@ -76,6 +78,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 **dict(zip(columns, key, strict=True)),
                 "solved": f"{len(times)} of {len(runs)}",
                 "iterations, median": "" if None in iterations else f"{np.median(iterations):g}",
+                **denoising_columns(runs),
                 "seconds, median": f"{np.median([row['seconds'] for row in runs]):.3f}",
                 "travel time [s]": mean_text(times, none=""),
             }

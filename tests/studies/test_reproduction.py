@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 import trial_support
-from examples.common import steps_to_solution, study_trials
+from examples.common import (
+    _with_corrected_tests,
+    denoising_columns,
+    denoising_of,
+    save_table,
+    steps_to_solution,
+    study_trials,
+)
 from examples.studies.paper import main
 from examples.studies.paper.figure import Figure, Group, Section, grouped
 from examples.studies.paper.figure_report import markdown, write_figure
@@ -23,6 +30,7 @@ from examples.studies.paper.plots import PLOTS, add_legend, best_reward
 from matplotlib.figure import Figure as Canvas
 
 from d4orm_planners import list_planners
+from d4orm_planners.base.plan import IterationRecord
 from d4orm_planners.evaluation import evaluate
 from d4orm_planners.evaluation.store import Trial, TrialStore
 from d4orm_planners.evaluation.tables import read_parquet, write_parquet
@@ -324,6 +332,22 @@ def test_denoising_steps_are_counted_where_rows_tell_them(tmp_path: Path) -> Non
     assert write_figure(tmp_path, by_steps, groups)
 
 
+def test_denoising_has_columns_where_a_row_tells_of_it(tmp_path: Path) -> None:
+    def record(number: int, solved: bool) -> IterationRecord:
+        return IterationRecord(number, 2.0 * number, 50 * number, 0.5, solved, 0, 0, 0, 0.5, solved, denoising_time=1.0)
+
+    history = [record(1, False), record(2, True), record(3, True)]
+    rows = [denoising_of(history), denoising_of(history[:1]), denoising_of([])]
+    assert rows[0] == {"denoising_steps": 100, "denoising_time_share": 0.25}, "to the first solution"
+    assert denoising_columns(rows) == {"denoising steps": "50", "denoising, time": "25%"}
+    untold = {"denoising steps": "-", "denoising, time": "-"}
+    assert denoising_columns([*rows, {}]) == untold
+    table = [{"planner": "a", **denoising_columns(rows)}, {"planner": "b", **untold}]
+    for shown, head in ((table, "planner,denoising steps,"), (table[1:], "planner\n")):
+        save_table(shown, tmp_path / "table.csv")
+        assert (tmp_path / "table.csv").read_text().replace("\r", "").startswith(head)
+
+
 def test_what_is_never_can_be_drawn(tmp_path: Path) -> None:
     solved, never = trial(0, history="[[0.5,1,0.5]]"), trial(1, history="[]", status="time_limit")
     drawn = figure(plots=("runtime", "survival"))
@@ -382,7 +406,7 @@ def test_the_papers_rows_stand_below_ours_and_its_other_methods_too() -> None:
 
 
 def test_the_papers_numbers_stand_beside_ours_where_policies_are_the_rows() -> None:
-    paper = {("Circle", "d4orm", "runtime"): {"d4orm": "0.13"}}
+    paper = {("Circle", "d4orm", "runtime"): {"d4orm": "0.13"}, ("Circle", "d4orm-d", "success"): {"d4orm-d": "1"}}
     page = markdown(figure(across="policy", paper=paper), [Group("Circle", "d4orm", [trial()])])
     assert "| policy | success | runtime, s | runtime, s (the paper) |" in page
     assert "| d4orm | 1 of 1 (21% to 100%) | 1.50 (1.50-1.50) | 0.13 |" in page
@@ -410,6 +434,27 @@ def test_policies_are_compared_with_the_reference_trial_by_trial() -> None:
     page = markdown(figure(reference="d4orm", compared_by="travel_time", across="policy"), groups)
     assert "| mppi | 6 | 0 | 0 | 1 | +0.50 | 0.062 |" in page
     assert "the median difference in travel time [s]" in page
+
+
+def test_rows_of_ours_do_not_weaken_the_tests_of_the_papers_methods() -> None:
+    ours = [trial(seed, history=f"[[{seconds},1,0.5]]") for seed, seconds in enumerate((1, 2, 3, 4, 5, 6))]
+    rival = [trial(seed, history=f"[[{2 * seconds},1,0.5]]") for seed, seconds in enumerate((1, 2, 3, 4, 5, 6))]
+    groups = [Group("Circle", "d4orm", ours), Group("Circle", "mppi", rival)]
+    lines = [line for line in markdown(figure(reference="d4orm"), groups).splitlines() if line.startswith("| mppi | 8")]
+    both = [*groups, *(Group("Circle", f"d4orm {name}, ours", rival) for name in "ab")]
+    page = markdown(figure(reference="d4orm"), both)
+    assert lines == ["| mppi | 8 | 6 | 0 | 0 | 1 | +3.50 | 0.062 |"]
+    assert lines[0] in page, "as without them"
+    assert page.count("| 8 | 6 | 0 | 0 | 1 | +3.50 | 0.12 |") == 2, "two of ours are a family of four tests"
+    rows = [{"planner": "d4orm", "p": 0.01}, {"planner": "d4orm, ours", "p": 0.01}, {"planner": "ours, f=1", "p": 0.02}]
+    assert [row["p"] for row in _with_corrected_tests(rows)] == ["0.01", "0.02", "0.02"]
+
+
+def test_seeds_are_told_and_those_of_labels_that_have_others() -> None:
+    few, many = [trial(seed) for seed in (0, 1, 2, 7)], [trial(seed) for seed in range(3)]
+    assert "- Seeds: 0 to 2.\n" in markdown(figure(), [Group("Circle", "d4orm", many)])
+    groups = [Group("Circle", "d4orm", many), Group("Circle", "mppi", few), Group("Square", "mppi", many)]
+    assert "- Seeds: 0 to 2 of `d4orm`; 0 to 2, 7 or 0 to 2 of `mppi`.\n" in markdown(figure(), groups)
 
 
 @pytest.mark.parametrize("name", FIGURES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from examples.common import holm, steps_to_solution
+from examples.common import holm_by_family, steps_to_solution
 from examples.studies.paper.figure import Figure, Group
 from examples.studies.paper.numbers import METRICS, Measured, column, first_solution, is_time, measured
 from examples.studies.paper.plots import draw
@@ -26,7 +26,8 @@ trials."""
 PAIRS = """\
 The same problems and seeds, trial by trial: how often only the one or the other succeeded, with McNemar's exact test;
 the median difference in {cost}, with Wilcoxon's signed-rank test. A trial that failed counts twice the longest that
-either needed. P values are corrected for all tests of this page by Holm's method."""
+either needed. P values are corrected for all tests of this page by Holm's method, those of rows that say `ours` among
+themselves."""
 _COSTS = {
     "runtime": "seconds to the first solution",
     "travel_time": "travel time [s]",
@@ -40,8 +41,7 @@ def markdown(figure: Figure, groups: Sequence[Group]) -> str:
     rows = [measured(group) for group in groups]
     draw_table = _transposed if figure.across == "policy" else _across
     blocks = [f"# {figure.title}", f"The paper: {figure.source}. {INTRODUCTION}"]
-    if figure.remarks:
-        blocks.append("\n".join(f"- {remark}" for remark in figure.remarks))
+    blocks.append("\n".join(f"- {remark}" for remark in (*figure.remarks, _seeds(groups))))
     sections = tuple(dict.fromkeys(row.section for row in rows))
     blocks.append("## What was measured")
     blocks += [draw_table(figure, title, [row for row in rows if row.section == title]) for title in sections]
@@ -52,6 +52,27 @@ def markdown(figure: Figure, groups: Sequence[Group]) -> str:
         blocks += _deadlines(figure, groups)
     blocks += errors((row.label, row.error) for row in rows)
     return "\n\n".join([*blocks, origin([trial for group in groups for trial in group.trials])]) + "\n"
+
+
+def _seeds(groups: Sequence[Group]) -> str:
+    """Return the seeds of the rows as a sentence; where labels differ, or panels of one, each has its own."""
+    found: dict[str, dict[str, None]] = {}
+    for group in groups:
+        found.setdefault(group.label, {})[_ranges(sorted({trial.seed for trial in group.trials}))] = None
+    labels: dict[str, list[str]] = {}
+    for label, seeds in found.items():
+        labels.setdefault(" or ".join(seeds), []).append(f"`{label}`")
+    told = [f"{seeds} of {', '.join(own)}" for seeds, own in labels.items()] if len(labels) > 1 else list(labels)
+    return f"Seeds: {'; '.join(told)}."
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Rising numbers as text, those that follow each other as ``0 to 49``."""
+    firsts = [number for number in numbers if number - 1 not in numbers]
+    lasts = [number for number in numbers if number + 1 not in numbers]
+    return ", ".join(
+        f"{first} to {last}" if last > first else f"{first}" for first, last in zip(firsts, lasts, strict=True)
+    )
 
 
 def _across(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
@@ -77,7 +98,7 @@ def _across(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
 def _transposed(figure: Figure, title: str, rows: Sequence[Measured]) -> str:
     """Policies from top to bottom, metrics from left to right, each with the paper's beside it if there is one."""
     # One scenario and team size: every policy is a row.
-    known = {metric for section, _, metric in figure.paper if section == title}
+    known = {name for name in figure.metrics if any(_said(figure, row, name) for row in rows)}
     header, lines = ["policy"], []
     for name in figure.metrics:
         header += [METRICS[name].title] + [f"{METRICS[name].title} (the paper)"] * (name in known)
@@ -112,13 +133,19 @@ def _pairs(figure: Figure, groups: Sequence[Group], reference: str | None) -> li
             continue
         cost = _cost(figure, [*trials, *others])
         tests[section, where, label] = paired(trials, others, cost, lambda one: first_solution(one) is not None)
-    p_values = iter(holm([p for test in tests.values() for p in (test.success_p, test.cost_p)]))
+    p_values = holm_by_family(
+        {
+            (*key, what): (key[-1], p)
+            for key, test in tests.items()
+            for what, p in (("success", test.success_p), ("cost", test.cost_p))
+        }
+    )
     blocks: dict[str, list[tuple[str, ...]]] = {}
     for (section, where, label), test in tests.items():
         counts = (str(count) for count in (test.pairs, test.only_first, test.only_second))
         blocks.setdefault(section, []).append(
-            (label, *[where] * (not one_column), *counts, f"{next(p_values):.2g}", f"{test.difference:+.2f}",
-             f"{next(p_values):.2g}")
+            (label, *[where] * (not one_column), *counts, f"{p_values[section, where, label, 'success']:.2g}",
+             f"{test.difference:+.2f}", f"{p_values[section, where, label, 'cost']:.2g}")
         )  # fmt: skip
     header = ("policy", *[figure.across] * (not one_column), "pairs", "only it", f"only {reference}", "p",
               "difference", "p")  # fmt: skip
@@ -158,6 +185,8 @@ def _is_told(figure: Figure, name: str) -> bool:
     """Check whether a table of numbers has an attribute of :class:`Measured`."""
     if name.startswith("first_steps"):
         return "first_steps" in figure.metrics
+    if name == "denoising_time_share":
+        return name in figure.metrics
     return figure.timed or not is_time(name)
 
 

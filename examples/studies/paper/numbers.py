@@ -9,11 +9,11 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from examples.common import steps_spent, steps_to_solution
+from examples.common import denoising_time_share, steps_spent, steps_to_solution
 from examples.studies.paper.figure import TIMES, Figure, Group
 
 from d4orm_planners.evaluation.store import Trial
-from d4orm_planners.evaluation.summary import Compared
+from d4orm_planners.evaluation.summary import Compared, mean_if_known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +35,7 @@ class Measured(Compared):
     first_steps_lower: float | None  # and quartiles
     first_steps_upper: float | None
     first_steps_restricted: float | None  # mean over all trials, of which those that failed count all their steps
+    denoising_time_share: float | None  # of the time to the first solution, or of all spent, where all trials tell it
     iterations: float | None  # none of policies that execute no plan
     iterations_restricted: float | None  # mean over all trials, of which those that failed count all that they made
     reward: float | None  # of the last best plan, per step of the horizon and robot, over all trials
@@ -91,6 +92,7 @@ def measured(group: Group) -> Measured:
         runtime_restricted=_restricted(times, [trial.wall_time for trial in trials]),
         first_steps=steps, first_steps_lower=fewer, first_steps_upper=more,
         first_steps_restricted=_restricted(all_steps, [steps_spent(trial) for trial in trials]),
+        denoising_time_share=mean_if_known([denoising_time_share(trial) for trial in trials if trial.progress]),
         iterations_restricted=_restricted([trial.iterations for trial in trials], times),
         reward=float(np.mean(rewards)) if rewards else None,
         jerk=mean("mean_squared_jerk"),
@@ -173,6 +175,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType({
     "mean_runtime": Metric("runtime, s", _mean_runtime),
     "first_steps": Metric("denoising steps", _steps),
     "first_steps_restricted": Metric("denoising steps, restricted mean", _number("first_steps_restricted", 0)),
+    "denoising_time_share": Metric("denoising, % of time", _number("denoising_time_share", 0, 100)),
     "iterations": Metric("iterations", _number("iterations", 1)),
     "iterations_restricted": Metric("iterations, restricted mean", _number("iterations_restricted", 1)),
     "reward": Metric("reward", _number("reward", 3)),

@@ -119,7 +119,8 @@ def _ipopt() -> Figure:
 
 
 BIG_TEAMS_METRICS = (
-    "success", "runtime", "runtime_restricted", "first_steps", "first_steps_restricted", "travel_time", "step_time"
+    "success", "runtime", "runtime_restricted", "first_steps", "first_steps_restricted", "denoising_time_share",
+    "travel_time", "step_time",
 )  # fmt: skip
 
 
@@ -233,7 +234,7 @@ def _noise_schedule() -> Figure:
         source="appendix C-A, figure of the schedule",
         sections=_sections(policies, DRIVES, PLANE, SPACE, num_robots=(8,), time_limit=20.0),
         across="policy",
-        metrics=("success", "runtime", "iterations", "iterations_restricted", "travel_time"),
+        metrics=("success", "runtime", "first_steps", "iterations", "iterations_restricted", "travel_time"),
         plots=("runtime", "success"),
         reference="beta_1=0.0001, beta_T=0.01",
         remarks=("The paper gives no numbers in its text: it finds little variation, most in differential drive.",),
@@ -263,7 +264,7 @@ def _amswarm() -> Figure:
             Section(title=title, policies=policies, scenarios=scenarios, quick_robots=(None,), time_limit=60.0),
         ),
         across="scenario",
-        metrics=(*metrics, "success", "first_steps", "first_steps_restricted"),
+        metrics=(*metrics, "success", "first_steps", "first_steps_restricted", "denoising_time_share"),
         plots=metrics,
         reference="d4orm-d",
         paper={
@@ -320,7 +321,8 @@ def _distributed() -> tuple[Figure, Figure]:
 
 
 DISTRIBUTED_METRICS = (
-    "success", "iterations", "iterations_restricted", "runtime", "waiting_share", "messages", "message_bytes"
+    "success", "iterations", "iterations_restricted", "first_steps", "runtime", "waiting_share", "messages",
+    "message_bytes",
 )  # fmt: skip
 DISTRIBUTED_REMARKS = (
     "The paper shows iterations to the first solution, in a plot without numbers in its text. The policies without "
